@@ -1,0 +1,79 @@
+"""The perceived box around the vehicle and the bird's-eye-view grid laid over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.geometry.namespace import namespace
+
+
+@dataclass(frozen=True)
+class PerceptionRange:
+    """Axis-aligned box in the ego frame, metres: R_p of TF-Lane (section 3.2).
+
+    Attributes:
+        x, y, z: (low, high) per axis.
+    """
+
+    x: tuple[float, float] = (-50.0, 50.0)
+    y: tuple[float, float] = (-25.0, 25.0)
+    z: tuple[float, float] = (-2.3, 1.7)
+
+    def low(self, dims: int = 3) -> tuple[float, ...]:
+        """Lower corner of the first `dims` axes."""
+        return tuple(axis[0] for axis in (self.x, self.y, self.z)[:dims])
+
+    def size(self, dims: int = 3) -> tuple[float, ...]:
+        """Extent of the first `dims` axes."""
+        return tuple(axis[1] - axis[0] for axis in (self.x, self.y, self.z)[:dims])
+
+    def normalise(self, points: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+        """Map metres to [0, 1] inside the box (d = 2 or 3)."""
+        xp, d = namespace(points), points.shape[-1]
+        return (points - xp.asarray(self.low(d), points.dtype)) / xp.asarray(self.size(d), points.dtype)
+
+    def denormalise(self, points: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+        """Map [0, 1] inside the box to metres (d = 2 or 3)."""
+        xp, d = namespace(points), points.shape[-1]
+        return xp.asarray(self.low(d), points.dtype) + points * xp.asarray(self.size(d), points.dtype)
+
+    def contains(self, points: Float[Array, "*b d"]) -> Bool[Array, "*b"]:
+        """True where x and y lie inside the box, border included (z is not looked at)."""
+        inside_x = (points[..., 0] >= self.x[0]) & (points[..., 0] <= self.x[1])
+        return inside_x & (points[..., 1] >= self.y[0]) & (points[..., 1] <= self.y[1])
+
+
+@dataclass(frozen=True)
+class BevGrid:
+    """BEVFormer's grid over a range: rows run along y, columns along x, row 0 and column 0 at the low ends.
+
+    Attributes:
+        range: the box covered; TopoNet's +-51.2 x +-25.6 m.
+        rows, columns: cells along y and x.
+    """
+
+    range: PerceptionRange = PerceptionRange((-51.2, 51.2), (-25.6, 25.6), (-2.3, 1.7))
+    rows: int = 100
+    columns: int = 200
+
+    @property
+    def cell(self) -> tuple[float, float]:
+        """Cell size along x and y, metres."""
+        size = self.range.size(2)
+        return size[0] / self.columns, size[1] / self.rows
+
+    def centers(self) -> tuple[list[float], list[float]]:
+        """Coordinates of the cell centres: x for each column, y for each row, metres."""
+        (dx, dy), (x0, y0) = self.cell, self.range.low(2)
+        return (
+            [x0 + (c + 0.5) * dx for c in range(self.columns)],
+            [y0 + (r + 0.5) * dy for r in range(self.rows)],
+        )
+
+    def pixel(self, points: Float[Array, "*b d"]) -> Float[Array, "*b 2"]:
+        """Map metres to continuous (column, row) with cell centres at integers."""
+        xp = namespace(points)
+        unit = self.range.normalise(points[..., :2])
+        return unit * xp.asarray([self.columns, self.rows], points.dtype) - 0.5

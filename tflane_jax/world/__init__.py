@@ -1,0 +1,1 @@
+"""The built-in procedural world: roads, traffic, sensors and their rendering (numpy, seeded)."""

@@ -1,0 +1,144 @@
+"""The traffic-flow prior: thresholds, weights, selection, padding, numpy against jit."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, ego_centric_weight, select_traffic_flow
+from tflane_jax.scene import TrafficFlow
+
+CONFIG = TrafficFlowPriorConfig(max_instances=6)
+
+
+def make_flow(seed: int = 0, instances: int = 12, frames: int = 20, capacity: int = 16) -> TrafficFlow:
+    rng = np.random.default_rng(seed)
+    flow = TrafficFlow.empty(capacity, frames)
+    start = rng.uniform([-60, -30, -1], [60, 30, 1], (capacity, 3))
+    step = rng.uniform(-1, 1, (capacity, 3)) * [1, 1, 0.01]
+    position = start[:, None] + step[:, None] * np.arange(frames)[None, :, None]
+    exists = np.arange(capacity) < instances
+    return flow.replace(
+        position=position.astype(np.float32),
+        yaw=rng.uniform(-3, 3, (capacity, frames)).astype(np.float32),
+        size=rng.uniform(1, 10, (capacity, 3)).astype(np.float32),
+        category=rng.integers(0, 6, capacity).astype(np.int32),
+        occluded=rng.random((capacity, frames)) < 0.3,
+        valid=(rng.random((capacity, frames)) < 0.8) & exists[:, None],
+    )
+
+
+def loop_selection(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> list[int]:
+    """Which instances should be chosen, by plain loops from the paper's words."""
+    ranked = []
+    for k in range(len(flow.category)):
+        frames = [
+            n
+            for n in range(flow.valid.shape[1])
+            if flow.valid[k, n]
+            and not flow.occluded[k, n]
+            and abs(flow.position[k, n, 0]) <= 50
+            and abs(flow.position[k, n, 1]) <= 25
+        ]
+        if len(frames) < config.min_valid_frames:
+            continue
+        x, y = flow.position[k, frames[-1], :2]
+        weight = float(ego_centric_weight(np.array([[x, y]]), config)[0])
+        ranked.append((-weight, float(np.hypot(x, y)), k))
+    return [k for *_, k in sorted(ranked)][: config.max_instances]
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("tolerance", [1, 5, 10])
+def test_selection_matches_plain_loops(seed, tolerance):
+    config = dataclasses.replace(CONFIG, min_valid_frames=tolerance)
+    flow = make_flow(seed)
+    tokens = select_traffic_flow(flow, config)
+    expected = loop_selection(flow, config)
+    assert tokens.index[tokens.valid].tolist() == expected
+    assert tokens.valid.tolist() == [i < len(expected) for i in range(6)]
+
+
+@pytest.mark.parametrize("coordinates", ["normalised", "metres"])
+def test_jit_gives_the_same(coordinates):
+    config = dataclasses.replace(CONFIG, coordinates=coordinates)
+    flow = make_flow(3)
+    host = select_traffic_flow(flow, config)
+    device = jax.jit(lambda f: select_traffic_flow(f, config))(jax.tree.map(jnp.asarray, flow))
+    for field in dataclasses.fields(host):
+        a, b = getattr(host, field.name), np.asarray(getattr(device, field.name))
+        assert a.dtype.kind == b.dtype.kind, field.name
+        np.testing.assert_allclose(a, b, rtol=2e-6, atol=2e-6, err_msg=field.name)
+
+
+def test_padding_may_hold_nan():
+    flow = make_flow(4, instances=7)
+    dirty = flow.replace(
+        position=np.where(flow.valid[..., None], flow.position, np.nan),
+        yaw=np.where(flow.valid, flow.yaw, np.nan),
+        size=np.where(flow.valid.any(-1)[:, None], flow.size, np.nan),
+    )
+    jax.tree.map(np.testing.assert_array_equal, select_traffic_flow(flow, CONFIG), select_traffic_flow(dirty, CONFIG))
+
+
+def test_normalised_coordinates_span_the_bev():
+    flow = make_flow(5)
+    metres = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
+    unit = select_traffic_flow(flow, CONFIG)
+    back = CONFIG.bev_range.denormalise(unit.position)
+    np.testing.assert_allclose(back[unit.frame_valid], metres.position[unit.frame_valid], atol=1e-4)
+
+
+@pytest.mark.parametrize(("instances", "capacity", "frames"), [(0, 4, 20), (1, 1, 20), (3, 4, 22), (0, 0, 20)])
+def test_sizes(instances, capacity, frames):
+    flow = make_flow(6, instances, frames, capacity)
+    tokens = select_traffic_flow(flow, dataclasses.replace(CONFIG, min_valid_frames=1))
+    assert tokens.frame_valid.shape == (6, 20)
+    assert tokens.valid.sum() <= instances
+    assert not tokens.frame_valid[~tokens.valid].any()
+    assert not tokens.position[~tokens.valid].any()
+
+
+def test_no_top_instances_is_no_traffic():
+    tokens = select_traffic_flow(make_flow(7), dataclasses.replace(CONFIG, top_instances=0))
+    assert not tokens.valid.any()
+    assert not tokens.frame_valid.any()
+    assert not tokens.size.any()
+
+
+def test_too_few_frames_is_an_error():
+    with pytest.raises(ValueError, match="holds 4 frames, the prior asks for 20"):
+        select_traffic_flow(make_flow(frames=4), CONFIG)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.floats(0.5, 70), st.floats(-np.pi, np.pi), st.floats(0.1, 30))
+def test_weights(distance, bearing, farther):
+    def weight(d, b):
+        return float(ego_centric_weight(np.array([[d * np.cos(b), d * np.sin(b)]]), CONFIG)[0])
+
+    here = weight(distance, bearing)
+    assert 0 < here <= 1
+    assert here == pytest.approx(weight(distance, -bearing))
+    if abs(bearing) < np.pi / 6 - 1e-6:
+        assert here == 1
+    elif abs(bearing) > np.pi / 6 + 1e-6:
+        assert here < 1
+        assert weight(distance + farther, bearing) < here
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(st.integers(0, 100), st.randoms(use_true_random=False))
+def test_order_of_instances_does_not_matter(seed, random):
+    flow = make_flow(seed)
+    order = list(range(len(flow.category)))
+    random.shuffle(order)
+    shuffled = jax.tree.map(lambda x: x[np.array(order)], flow)
+    a, b = select_traffic_flow(flow, CONFIG), select_traffic_flow(shuffled, CONFIG)
+    np.testing.assert_array_equal(a.position, b.position)
+    np.testing.assert_array_equal(a.frame_valid, b.frame_valid)
+    np.testing.assert_array_equal(a.category, b.category)

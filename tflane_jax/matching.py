@@ -1,0 +1,132 @@
+"""Bipartite (Hungarian) matching of queries to targets.
+
+The default backend is scipy on the host, called once per step for every layer, example and seed together: the callback
+batches under `vmap` by adding axes, and the host loops over all of them. Keep it out of prediction paths: a program
+with a callback can be neither exported nor cached.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+from scipy.optimize import linear_sum_assignment
+
+_COST_LIMIT = 1e6
+
+
+@struct.dataclass
+class Assignment:
+    """Which query serves which target.
+
+    Attributes:
+        query: (N,) query index of each target; 0 where not matched.
+        matched: (N,) the target is valid and got a query (there may be more targets than queries).
+    """
+
+    query: Int[Array, "*b n"]
+    matched: Bool[Array, "*b n"]
+
+
+def match(
+    cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"], backend: Literal["scipy", "jax"] = "scipy"
+) -> Assignment:
+    """Return the assignment of least total cost between queries and valid targets; no gradient flows.
+
+    Args:
+        cost: cost of giving target n to query q; what stands at invalid targets is never looked at. Costs are clipped
+            to +-1e6, and NaN counts as 1e6, so that a diverging model fails at the loss and not in here.
+        valid: targets that exist.
+        backend: "scipy" calls the host; "jax" stays on the device.
+    """
+    cost = lax.stop_gradient(cost).astype(jnp.float32)
+    cost = jnp.nan_to_num(jnp.clip(cost, -_COST_LIMIT, _COST_LIMIT), nan=_COST_LIMIT)
+    valid = jnp.broadcast_to(valid, (*cost.shape[:-2], cost.shape[-1]))
+    if 0 in cost.shape:
+        return Assignment(jnp.zeros(valid.shape, jnp.int32), jnp.zeros(valid.shape, bool))
+    if backend == "jax":
+        solve = _augmenting_paths
+        for _ in cost.shape[:-2]:
+            solve = jax.vmap(solve)
+        query = solve(cost, valid)
+    else:
+        shape = jax.ShapeDtypeStruct(valid.shape, np.int32)
+        query = jax.pure_callback(_assign_on_host, shape, cost, valid, vmap_method="expand_dims")
+    matched = query >= 0
+    return Assignment(jnp.where(matched, query, 0), matched)
+
+
+def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Solve every problem of the leading axes with scipy; -1 where a target stays without a query.
+
+    Module-level and numpy-only: jax may call it from any thread.
+    """
+    cost, valid = np.asarray(cost), np.asarray(valid)
+    lead = np.broadcast_shapes(cost.shape[:-2], valid.shape[:-1])
+    cost = np.broadcast_to(cost, (*lead, *cost.shape[-2:])).reshape(-1, *cost.shape[-2:])
+    valid = np.broadcast_to(valid, (*lead, valid.shape[-1])).reshape(-1, valid.shape[-1])
+    query = np.full(valid.shape, -1, np.int32)
+    for problem, exists, answer in zip(cost, valid, query, strict=True):
+        columns = np.flatnonzero(exists)
+        targets, queries = linear_sum_assignment(problem[:, columns].T)
+        answer[columns[targets]] = queries
+    return query.reshape(*lead, -1)
+
+
+def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """Solve one problem by successive shortest augmenting paths (Jonker-Volgenant); -1 for targets without a query.
+
+    One path per valid target, so that padding costs nothing. Spare columns stand in for "no query" when there are
+    more targets than queries; they are dearer than any real assignment.
+    """
+    queries, targets = cost.shape
+    spare = max(targets - queries, 0)
+    dear = 2.0 * (jnp.max(jnp.where(valid[None], jnp.abs(cost), 0.0)) + 1.0)
+    table = jnp.concatenate([cost, jnp.full((spare, targets), dear)]).T  # (targets, columns)
+    columns = queries + spare
+    order = jnp.argsort(~valid, stable=True)  # valid targets first
+
+    def add_target(i, state):
+        owner, u, v = state  # owner (columns,): target that holds the column, -1 if free
+
+        def grow(path):
+            reach, via, done, row, offset, _ = path
+            slack = table[row] - u[row] - v + offset
+            closer = ~done & (slack < reach)
+            reach, via = jnp.where(closer, slack, reach), jnp.where(closer, row, via)
+            column = jnp.argmin(jnp.where(done, jnp.inf, reach))
+            done = done.at[column].set(True)
+            return reach, via, done, owner[column], reach[column], column
+
+        def searching(path):
+            return path[3] >= 0
+
+        start = order[i]
+        reach = jnp.full(columns, jnp.inf)
+        path = (reach, jnp.full(columns, -1), jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
+        reach, via, done, _, shortest, end = lax.while_loop(searching, grow, path)
+
+        # Potentials of everything inside the tree move by what is left of the shortest path.
+        gain = jnp.where(done, shortest - reach, 0.0)
+        holders = jnp.where(done & (owner >= 0), owner, targets)  # index `targets` is dropped
+        u = u.at[holders].add(gain, mode="drop").at[start].add(shortest)
+        v = v - gain
+
+        def flip(step):
+            owner, column, _ = step
+            row = via[column]
+            previous = jnp.argmax(owner == row)  # the column this row held before
+            return owner.at[column].set(row), previous, row
+
+        owner, _, _ = lax.while_loop(lambda s: s[2] != start, flip, flip((owner, end, start)))
+        return owner, u, v
+
+    state = (jnp.full(columns, -1), jnp.zeros(targets), jnp.zeros(columns))
+    owner, _, _ = lax.fori_loop(0, valid.sum(), add_target, state)
+    held = jnp.where(owner[:queries] >= 0, owner[:queries], targets)
+    return jnp.full(targets, -1, jnp.int32).at[held].set(jnp.arange(queries, dtype=jnp.int32), mode="drop")

@@ -1,0 +1,147 @@
+"""The traffic-flow prior of TF-Lane (sections 3.2 and 3.3, "Temporal Domain Encoder"), up to the learned part.
+
+Truncates the tracks to the region R_t, drops instances with fewer than tol_pts valid frames, weighs the rest by where
+they are relative to the ego vehicle, keeps the T_top heaviest and pads to T_max. The same lines run in numpy when
+data is loaded and under jit, whichever arrays come in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry.namespace import namespace
+from tflane_jax.scene import TrafficFlow
+
+
+@dataclass(frozen=True)
+class TrafficFlowPriorConfig:
+    """How traffic flow becomes tokens.
+
+    Attributes:
+        frames: f_t, how many past frames are used, the latest ones (paper: 20).
+        region: R_t; positions outside it are not used.
+        min_valid_frames: tol_pts, an instance needs this many valid frames (paper: 5).
+        max_instances: T_max, the number of slots (paper: N_t = 30).
+        top_instances: T_top, how many slots may be filled; None fills all. 0 is inference without traffic flow.
+        occluded_frames: "mask" treats a frame in which the tracker did not see the box as lost (Fig. 4); "keep" uses it.
+        front_sector_deg: full opening of the sector ahead that has the highest weight (paper: 60).
+        distance_scale: distance at which an instance outside that sector has lost half its weight, metres.
+        coordinates: "normalised" aligns positions with the BEV in [0, 1] (Table 5, "Norm." = T); "metres" does not.
+        bev_range: the box that normalised coordinates span.
+    """
+
+    frames: int = 20
+    region: PerceptionRange = PerceptionRange()
+    min_valid_frames: int = 5
+    max_instances: int = 30
+    top_instances: int | None = None
+    occluded_frames: Literal["mask", "keep"] = "mask"
+    front_sector_deg: float = 60.0
+    distance_scale: float = 25.0
+    coordinates: Literal["normalised", "metres"] = "normalised"
+    bev_range: PerceptionRange = BevGrid().range
+
+
+@struct.dataclass
+class TrafficFlowTokens:
+    """reTF_i and its temporal mask: T_max instances of N frames, heaviest first.
+
+    Attributes:
+        position: (T, N, 3) box centres, normalised or metres per the config; 0 where not valid.
+        heading: (T, N, 2) cos and sin of the yaw in the ego frame; 0 where not valid.
+        size: (T, 3) length, width, height, metres; 0 in padding.
+        category: (T,) `scene.RoadUser`; 0 in padding.
+        frame_valid: (T, N) the temporal mask.
+        valid: (T,) instance validity, from which the spatial mask is made.
+        weight: (T,) ego-centric weight in (0, 1]; 0 in padding.
+        index: (T,) which instance of the traffic flow stands here; 0 in padding.
+    """
+
+    position: Float[Array, "t n 3"]
+    heading: Float[Array, "t n 2"]
+    size: Float[Array, "t 3"]
+    category: Int[Array, " t"]
+    frame_valid: Bool[Array, "t n"]
+    valid: Bool[Array, " t"]
+    weight: Float[Array, " t"]
+    index: Int[Array, " t"]
+
+
+def select_traffic_flow(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> TrafficFlowTokens:
+    """Return the tokens of one frame's traffic flow; padding in `flow` may hold anything.
+
+    Raises ValueError where the traffic flow holds fewer frames than the config asks for.
+    """
+    xp = namespace(flow.position, flow.valid)
+    recorded = flow.valid.shape[1]
+    if recorded < config.frames:
+        raise ValueError(f"the traffic flow holds {recorded} frames, the prior asks for {config.frames}")
+    if flow.valid.shape[0] == 0:
+        flow = TrafficFlow.empty(1, recorded)  # so that the padding below has a row to point at
+    flow = TrafficFlow(
+        position=flow.position[:, recorded - config.frames :],
+        yaw=flow.yaw[:, recorded - config.frames :],
+        size=flow.size,
+        category=flow.category,
+        occluded=flow.occluded[:, recorded - config.frames :],
+        valid=flow.valid[:, recorded - config.frames :],
+    )
+    seen = flow.valid if config.occluded_frames == "keep" else flow.valid & ~flow.occluded
+    position = xp.where(flow.valid[..., None], flow.position, 0.0)
+    frame_valid = seen & config.region.contains(position)
+    instance_valid = frame_valid.sum(-1) >= max(config.min_valid_frames, 1)
+
+    latest = _latest_valid(frame_valid)
+    here = xp.take_along_axis(position[..., :2], latest[:, None, None], axis=1)[:, 0]
+    weight = xp.where(instance_valid, ego_centric_weight(here, config), 0.0)
+
+    # Heaviest first, nearest first among equals (all of the front sector weighs the same); both sorts are stable.
+    nearest = xp.argsort(xp.where(instance_valid, (here**2).sum(-1), xp.inf), stable=True)
+    order = nearest[xp.argsort(-weight[nearest], stable=True)]
+    slots = config.max_instances
+    order = xp.concatenate([order, xp.zeros(max(slots - len(order), 0), order.dtype)])[:slots]
+    allowed = slots if config.top_instances is None else config.top_instances
+    filled = xp.arange(slots) < xp.minimum(instance_valid.sum(), allowed)
+
+    frame_valid = frame_valid[order] & filled[:, None]
+    yaw = xp.where(frame_valid, flow.yaw[order], 0.0)
+    coordinates = position[order]
+    if config.coordinates == "normalised":
+        coordinates = config.bev_range.normalise(coordinates)
+    return TrafficFlowTokens(
+        position=xp.where(frame_valid[..., None], coordinates, 0.0),
+        heading=xp.where(frame_valid[..., None], xp.stack([xp.cos(yaw), xp.sin(yaw)], -1), 0.0),
+        size=xp.where(filled[:, None], flow.size[order], 0.0),
+        category=xp.where(filled, flow.category[order], 0),
+        frame_valid=frame_valid,
+        valid=filled,
+        weight=xp.where(filled, weight[order], 0.0),
+        index=xp.where(filled, order, 0),
+    )
+
+
+def ego_centric_weight(position: Float[Array, "k 2"], config: TrafficFlowPriorConfig) -> Float[Array, " k"]:
+    """Return the weight of instances at these positions (ego frame, metres), in (0, 1].
+
+    1 within the sector ahead; elsewhere it falls with the bearing beyond the sector and with the distance. The paper
+    (section 3.3) fixes the sector and that weights decrease "based on relative positions"; the two factors are ours.
+    """
+    xp = namespace(position)
+    half = math.radians(config.front_sector_deg) / 2
+    bearing = xp.abs(xp.arctan2(position[..., 1], position[..., 0]))
+    distance = xp.sqrt((position**2).sum(-1))
+    off_axis = 1.0 - 0.5 * (bearing - half) / (math.pi - half)
+    outside = off_axis / (1.0 + distance / config.distance_scale)
+    return xp.where(bearing <= half, xp.ones_like(outside), outside)
+
+
+def _latest_valid(frame_valid: Bool[Array, "k n"]) -> Int[Array, " k"]:
+    """Return the index of the last valid frame of each instance (the last frame where there is none)."""
+    xp = namespace(frame_valid)
+    return frame_valid.shape[1] - 1 - xp.argmax(xp.flip(frame_valid, axis=1), axis=1)

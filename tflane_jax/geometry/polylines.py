@@ -1,9 +1,12 @@
 """Polylines: arc length, resampling, clipping and the two curve distances of lane metrics.
 
-Resampling and clipping of ragged lines run in numpy (host); the distances run in numpy or under jit on fixed shapes.
+Resampling and clipping of ragged lines run in numpy (host); the distances run in numpy or under jit on fixed
+shapes.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,7 +15,7 @@ from tflane_jax.geometry.ranges import PerceptionRange
 
 
 def arc_length(points: Float[Array, "n d"]) -> Float[Array, " n"]:
-    """Return the distance travelled in the **ground plane** (x, y) from the first point to each point, metres.
+    """Return the **ground plane** (x, y) distance from the first point to each point along the line, metres.
 
     Lengths are 2-D even for 3-D lines, as in the OpenLane-V2 tools (specs/metrics.md section 6).
     """
@@ -23,8 +26,8 @@ def arc_length(points: Float[Array, "n d"]) -> Float[Array, " n"]:
 def resample(points: Float[Array, "n d"], count: int) -> Float[Array, "count d"]:
     """Return `count` points equally spaced in ground-plane arc length, both ends included.
 
-    At a repeated position the segment after the last repeated vertex counts; a line of length zero gives its first
-    vertex `count` times. Raises ValueError for an empty line.
+    At a repeated position the segment after the last repeated vertex counts; a line of length zero gives its
+    first vertex `count` times. Raises ValueError for an empty line.
     """
     points = np.asarray(points)
     if len(points) == 0:
@@ -45,55 +48,78 @@ def sample_at(points: Float[Array, "n d"], distances: Float[Array, " k"]) -> Flo
     segment = np.minimum(segment, last)
     start, length = along[segment], along[segment + 1] - along[segment]
     weight = ((distances - start) / length)[:, None]
-    # The form a + w (b - a) keeps w = 0 exact; w = 1 is set by hand so that both ends are the line's own points.
+    # The form a + w (b - a) keeps w = 0 exact; w = 1 is set by hand so that both ends are the line's own
+    # points.
     out = points[segment] + weight * (points[segment + 1] - points[segment])
     return np.where(weight == 1.0, points[segment + 1], out)
+
+
+def resample_lines(lines: Sequence[Float[Array, "_ d"]], count: int) -> Float[Array, "l count d"]:
+    """Return `resample` of every line at once (count >= 2); no line may be empty."""
+    if not lines:
+        return np.zeros((0, count, 3))
+    sizes = np.array([len(line) for line in lines])
+    if sizes.min() == 0:
+        raise ValueError("cannot resample a polyline without points")
+    points = np.concatenate(lines)
+    first = np.cumsum(sizes) - sizes
+    last = first + sizes - 1
+    steps = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=-1)
+    steps[last[:-1]] = 0.0
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    distances = along[first][:, None] + (along[last] - along[first])[:, None] * np.linspace(0.0, 1.0, count)
+    distances[:, -1] = along[last]
+    # The joint of two lines has one distance for both; the clip returns each query to its own line, and to
+    # its last segment that has a length.
+    start = np.searchsorted(along, distances, side="right") - 1
+    final = np.maximum(np.searchsorted(along, along[last], side="left") - 1, first)
+    start = np.clip(start, first[:, None], final[:, None])
+    stop = np.minimum(start + 1, last[:, None])
+    length = along[stop] - along[start]
+    weight = ((distances - along[start]) / np.where(length > 0.0, length, 1.0))[..., None]
+    weight = np.clip(weight, 0.0, 1.0)
+    return np.where(weight == 1.0, points[stop], points[start] + weight * (points[stop] - points[start]))
 
 
 def clip_to_range(points: Float[Array, "n d"], range_: PerceptionRange) -> list[np.ndarray]:
     """Cut a polyline at the border of the range in x and y.
 
-    Returns the pieces inside, in order along the line, with new points exactly on the border (z interpolated). A line
-    wholly outside, or only touching the border at a point, gives no piece.
+    Returns the pieces inside, in order along the line, with new points exactly on the border (z
+    interpolated). A line wholly outside, or only touching the border at a point, gives no piece.
     """
     points = np.asarray(points, np.float64)
-    pieces: list[list[np.ndarray]] = []
-    open_piece = False
-    for a, b in zip(points[:-1], points[1:], strict=True):
-        span = _inside_interval(a, b, range_)
-        if span is None:
-            open_piece = False
-            continue
-        enter, leave = (_on_segment(a, b, t, range_) for t in span)
-        if open_piece and span[0] == 0.0:
-            pieces[-1].append(leave)
-        else:
-            pieces.append([enter, leave])
-        open_piece = span[1] == 1.0
-    return [np.stack(p) for p in pieces if arc_length(np.stack(p))[-1] > 0.0]
+    a, b = points[:-1], points[1:]
+    enter, leave, inside = _inside_interval(a, b, range_)
+    enter_point, leave_point = (_on_segment(a, b, t, range_) for t in (enter, leave))
+    # A segment continues the piece of the one before it unless the line left the box in between.
+    continues = inside[1:] & inside[:-1] & (leave[:-1] == 1.0) & (enter[1:] == 0.0)
+    starts = np.flatnonzero(inside & ~np.concatenate([[False], continues]))
+    stops = np.flatnonzero(inside & ~np.concatenate([continues, [False]])) + 1
+    pieces = [
+        np.concatenate([enter_point[i : i + 1], leave_point[i:j]]) for i, j in zip(starts, stops, strict=True)
+    ]
+    return [p for p in pieces if arc_length(p)[-1] > 0.0]
 
 
-def _inside_interval(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[float, float] | None:
-    """Return the parameters at which the segment a-b enters and leaves the box (Liang-Barsky), or None."""
-    enter, leave = 0.0, 1.0
+def _inside_interval(
+    a: np.ndarray, b: np.ndarray, range_: PerceptionRange
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where each segment a-b enters and leaves the box (parameters, Liang-Barsky) and whether it does."""
+    enter, leave, inside = np.zeros(len(a)), np.ones(len(a)), np.ones(len(a), bool)
     for axis, (low, high) in enumerate((range_.x, range_.y)):
-        step = b[axis] - a[axis]
-        if step == 0.0:
-            if not low <= a[axis] <= high:
-                return None
-            continue
-        t0, t1 = sorted(((low - a[axis]) / step, (high - a[axis]) / step))
-        enter, leave = max(enter, t0), min(leave, t1)
-    return (enter, leave) if enter <= leave else None
+        step = b[:, axis] - a[:, axis]
+        parallel = step == 0.0
+        inside &= ~parallel | ((low <= a[:, axis]) & (a[:, axis] <= high))
+        inverse = 1.0 / np.where(parallel, 1.0, step)
+        t0, t1 = (low - a[:, axis]) * inverse, (high - a[:, axis]) * inverse
+        enter = np.where(parallel, enter, np.maximum(enter, np.minimum(t0, t1)))
+        leave = np.where(parallel, leave, np.minimum(leave, np.maximum(t0, t1)))
+    return enter, leave, inside & (enter <= leave)
 
 
-def _on_segment(a: np.ndarray, b: np.ndarray, t: float, range_: PerceptionRange) -> np.ndarray:
-    if t == 0.0:
-        return a
-    if t == 1.0:
-        return b
-    point = a + t * (b - a)
-    # Rounding must not leave a cut end a hair outside the box.
-    point[0] = np.clip(point[0], *range_.x)
-    point[1] = np.clip(point[1], *range_.y)
-    return point
+def _on_segment(a: np.ndarray, b: np.ndarray, t: np.ndarray, range_: PerceptionRange) -> np.ndarray:
+    point = a + t[:, None] * (b - a)
+    # Rounding must not leave a cut end a hair outside the box, nor move a vertex of the line.
+    point[:, 0] = np.clip(point[:, 0], *range_.x)
+    point[:, 1] = np.clip(point[:, 1], *range_.y)
+    return np.where(t[:, None] == 0.0, a, np.where(t[:, None] == 1.0, b, point))

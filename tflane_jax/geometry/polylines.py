@@ -104,7 +104,7 @@ def clip_to_range(points: Float[Array, "n d"], range_: PerceptionRange) -> list[
 def _inside_interval(
     a: np.ndarray, b: np.ndarray, range_: PerceptionRange
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where each segment a-b enters and leaves the box (Liang-Barsky parameters) and if it meets it."""
+    """Return where each segment a-b enters and leaves the box (Liang-Barsky), and whether it meets it."""
     enter, leave, inside = np.zeros(len(a)), np.ones(len(a)), np.ones(len(a), bool)
     for axis, (low, high) in enumerate((range_.x, range_.y)):
         step = b[:, axis] - a[:, axis]

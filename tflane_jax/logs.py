@@ -44,7 +44,7 @@ class MapElement:
         position: (3,) centre, global metres.
         yaw: direction that it faces, global radians.
         category: 1 traffic light, 2 road sign.
-        attribute: OpenLane-V2 attribute; for a light this is the state at the start, see `Log.element_attribute`.
+        attribute: OpenLane-V2 attribute; for a light this is the state at the start.
         lanes: ids of the lane segments that it governs.
     """
 
@@ -64,7 +64,7 @@ class VectorMap:
         crossings: closed rings (n, 3), first point repeated at the end.
         road_boundaries: polylines (n, 3); a closed ring repeats its first point.
         elements: traffic lights and signs.
-        buildings: (B, 5) x, y, length, width, yaw of opaque blocks beside the road, for line of sight; height unlimited.
+        buildings: (B, 5) x, y, length, width, yaw of opaque blocks beside the road, unlimited in height.
     """
 
     segments: dict[int, LaneSegment]

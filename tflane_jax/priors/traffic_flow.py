@@ -29,7 +29,8 @@ class TrafficFlowPriorConfig:
         min_valid_frames: tol_pts, an instance needs this many valid frames (paper: 5).
         max_instances: T_max, the number of slots (paper: N_t = 30).
         top_instances: T_top, how many slots may be filled; None fills all. 0 is inference without traffic flow.
-        occluded_frames: "mask" treats a frame in which the tracker did not see the box as lost (Fig. 4); "keep" uses it.
+        occluded_frames: "mask" treats a frame in which the tracker did not see the box as lost (Fig. 4); "keep" uses
+            it.
         front_sector_deg: full opening of the sector ahead that has the highest weight (paper: 60).
         distance_scale: distance at which an instance outside that sector has lost half its weight, metres.
         coordinates: "normalised" aligns positions with the BEV in [0, 1] (Table 5, "Norm." = T); "metres" does not.

@@ -1,0 +1,156 @@
+"""TopoNet's lane branch with and without the TFM: what must not matter does not, bit for bit."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
+from tflane_jax.scene import TrafficFlow
+from tflane_jax.training.lane_graph import LaneGraphTask
+
+MODELS = {
+    "baseline": BASELINE,
+    "traffic": WITH_TRAFFIC,
+    "every layer": dataclasses.replace(
+        WITH_TRAFFIC, traffic_flow=dataclasses.replace(WITH_TRAFFIC.traffic_flow, insert="every_layer")
+    ),
+    "fixed": dataclasses.replace(WITH_TRAFFIC, decoder=dataclasses.replace(WITH_TRAFFIC.decoder, refine="fixed")),
+}
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """Parameters (moved off their initial values) and a jitted predictor of each model."""
+    out = {}
+    for name, config in MODELS.items():
+        task = LaneGraphTask(model=config)
+        params = jax.jit(task.init)(jax.random.key(0), make_example())
+        leaves, tree = jax.tree.flatten(params)
+        keys = jax.random.split(jax.random.key(1), len(leaves))
+        leaves = [leaf + 0.05 * jax.random.normal(k, leaf.shape) for leaf, k in zip(leaves, keys, strict=True)]
+        params = jax.tree.unflatten(tree, leaves)
+        out[name] = task, params, jax.jit(lambda p, e, t=task: t.predict(p, e).lanes)
+    return out
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_shapes_and_range(fitted, name):
+    _, params, predict = fitted[name]
+    lanes = predict(params, make_example())
+    chex.assert_shape(lanes.points, (6, 11, 3))
+    chex.assert_shape(lanes.successor_logits, (6, 6))
+    assert np.abs(np.asarray(lanes.points)[..., 0]).max() <= 51.2
+    assert ((np.asarray(lanes.scores) > 0) & (np.asarray(lanes.scores) < 1)).all()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_padding_may_hold_nan(fitted, name):
+    _, params, predict = fitted[name]
+    example = make_example(3, instances=6)
+    flow = example.traffic_flow
+    dirty = flow.replace(
+        position=np.where(flow.valid[..., None], flow.position, np.nan),
+        yaw=np.where(flow.valid, flow.yaw, np.nan),
+        size=np.where(flow.valid.any(-1)[:, None], flow.size, np.nan),
+        category=np.where(flow.valid.any(-1), flow.category, 10**6).astype(np.int32),
+    )
+    same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
+
+
+@pytest.mark.parametrize("name", ["traffic", "every layer", "fixed"])
+def test_nobody_there_is_no_traffic_flow(fitted, name):
+    task, params, predict = fitted[name]
+    example = make_example(4)
+    absent = predict(params, example.replace(traffic_flow=None))
+    same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
+    # An untrained-on-empty temporal encoder must not leak in either: its parameters do not matter.
+    other = {**params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, params["temporal_encoder"])}
+    same(absent, predict(other, example.replace(traffic_flow=None)))
+    assert not np.array_equal(absent.points, predict(params, example).points)
+
+
+def test_baseline_never_looks_at_traffic(fitted):
+    _, params, predict = fitted["baseline"]
+    same(predict(params, make_example(5)), predict(params, make_example(5).replace(traffic_flow=None)))
+
+
+def test_lanes_do_not_depend_on_the_order_of_instances(fitted):
+    _, params, predict = fitted["traffic"]
+    example = make_example(6)
+    order = np.random.default_rng(0).permutation(16)
+    shuffled = example.replace(traffic_flow=jax.tree.map(lambda x: x[order], example.traffic_flow))
+    same(predict(params, example), predict(params, shuffled))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_batch_is_a_vmap(fitted, name):
+    task, params, predict = fitted[name]
+    examples = [make_example(s, instances=s) for s in (0, 3, 9)]
+    batch = jax.tree.map(lambda *x: np.stack(x), *examples)
+    together = jax.vmap(lambda e: task.predict(params, e).lanes)(batch)
+    for i, example in enumerate(examples):
+        alone = predict(params, example)
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=2e-4, atol=2e-4), alone, together)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
+    task, params, _ = fitted[name]
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def step(params, batch):
+        return jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(0))[0])(params)
+
+    for instances, lanes in ((9, 4), (0, 0), (1, 1)):
+        batch = jax.tree.map(lambda x: np.stack([x, x]), make_example(1, instances, lanes))
+        loss, gradient = step(params, batch)
+        assert np.isfinite(loss)
+        assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
+    if "temporal_encoder" in params:
+        batch = jax.tree.map(lambda x: np.stack([x, x]), make_example(1, instances=0))
+        silent = step(params, batch)[1]["temporal_encoder"]
+        assert all(not np.asarray(g).any() for g in jax.tree.leaves(silent))
+
+
+def test_same_key_same_parameters():
+    task = LaneGraphTask(model=WITH_TRAFFIC)
+    a, b = (task.init(jax.random.key(7), make_example()) for _ in range(2))
+    same(a, b)
+    names = {"/".join(str(k.key) for k in path) for path, _ in jax.tree_util.tree_leaves_with_path(a)}
+    assert not [n for n in names if "Dense_" in n or "Conv_" in n or "Norm_" in n]
+
+
+def test_no_bev_is_an_error(fitted):
+    task, params, _ = fitted["baseline"]
+    with pytest.raises(ValueError, match="bev is None"):
+        task.predict(params, make_example().replace(bev=None))
+
+
+def test_overfits_one_example():
+    import optax
+
+    task = LaneGraphTask(model=WITH_TRAFFIC)
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], make_example(2))
+    params = task.init(jax.random.key(0), make_example(2))
+    optimizer = optax.adam(3e-3)
+
+    @jax.jit
+    def step(params, state):
+        loss, gradient = jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(0))[0])(params)
+        update, state = optimizer.update(gradient, state)
+        return optax.apply_updates(params, update), state, loss
+
+    state, losses = optimizer.init(params), []
+    for _ in range(150):
+        params, state, loss = step(params, state)
+        losses.append(float(loss))
+    assert losses[-1] < 0.25 * losses[0]

@@ -1,0 +1,128 @@
+"""The TFM by itself: lane queries in, lane queries out."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.priors.test_traffic_flow import make_flow
+from tflane_jax.models.traffic_flow_module import (
+    ALL_FUSIONS,
+    LANE_FUSIONS,
+    SpatialEncoder,
+    TemporalEncoder,
+    TrafficFlowModuleConfig,
+    spatial_mask,
+)
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, select_traffic_flow
+
+CONFIG = TrafficFlowModuleConfig(width=8, heads=2, bands=3)
+PRIOR = TrafficFlowPriorConfig(max_instances=5)
+DIM, LANES = 12, 7
+
+
+def tokens(seed=0, instances=4, **prior):
+    flow = make_flow(seed, instances=instances)
+    return jax.tree.map(jnp.asarray, select_traffic_flow(flow, dataclasses.replace(PRIOR, **prior)))
+
+
+def spatial(config, seed=0, valid=None, lane_mask=None):
+    """Build a spatial encoder with random inputs; return module, parameters and arguments."""
+    rng = np.random.default_rng(seed)
+    lanes, position, traffic = (
+        jnp.asarray(rng.normal(size=(n, DIM)).astype(np.float32)) for n in (LANES, LANES, 5)
+    )
+    valid = jnp.arange(5) < 3 if valid is None else valid
+    module = SpatialEncoder(config, DIM)
+    arguments = (lanes, position, traffic, spatial_mask(LANES, valid, lane_mask))
+    return module, module.init(jax.random.key(seed), *arguments), arguments
+
+
+@pytest.mark.parametrize("depth", [0, 1, 3])
+def test_token_depends_on_valid_frames_only(depth):
+    module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM)
+    clean = tokens(1)
+    params = module.init(jax.random.key(0), clean)
+    hole = ~clean.frame_valid[..., None]
+    dirty = clean.replace(position=jnp.where(hole, 99.0, clean.position), heading=jnp.where(hole, -7.0, clean.heading))
+    a, b = (np.asarray(module.apply(params, t))[np.asarray(clean.valid)] for t in (clean, dirty))
+    np.testing.assert_array_equal(a, b)
+    assert len(a) > 0
+
+
+def test_token_sees_the_order_of_frames():
+    module = TemporalEncoder(CONFIG, DIM)
+    forward = tokens(2, occluded_frames="keep")
+    params = module.init(jax.random.key(0), forward)
+    whole = forward.replace(frame_valid=jnp.ones_like(forward.frame_valid))
+    back = whole.replace(position=whole.position[:, ::-1], heading=whole.heading[:, ::-1])
+    assert not np.allclose(module.apply(params, whole), module.apply(params, back))
+
+
+@pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS, ("L->T",), ("L->L",), ()])
+def test_only_the_chosen_modules_exist(fusions):
+    _, params, _ = spatial(dataclasses.replace(CONFIG, fusions=fusions))
+    expected = {name.replace("->", "_to_") for name in fusions}
+    assert {n for n in params["params"] if "_to_" in n and "norm" not in n} == expected
+
+
+@pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS])
+def test_invalid_instances_are_not_seen(fusions):
+    module, params, (lanes, position, traffic, mask) = spatial(dataclasses.replace(CONFIG, fusions=fusions))
+    dirty = traffic.at[3:].set(jnp.nan)
+    clean_out = module.apply(params, lanes, position, traffic, mask)
+    np.testing.assert_array_equal(clean_out, module.apply(params, lanes, position, dirty, mask))
+
+    def total(t):
+        return (module.apply(params, lanes, position, t, mask) ** 2).sum()
+
+    gradient = jax.grad(total)(dirty)
+    assert np.isfinite(gradient).all()
+    assert not np.asarray(gradient)[3:].any()
+    assert np.asarray(gradient)[:3].any()
+
+
+def test_valid_instances_are_seen():
+    module, params, (lanes, position, traffic, mask) = spatial(CONFIG)
+    moved = module.apply(params, lanes, position, traffic.at[1].add(1.0), mask)
+    assert not np.allclose(moved, module.apply(params, lanes, position, traffic, mask))
+
+
+def test_point_queries_keep_the_original():
+    """Eq. (3): I(Q_type) is 1 for point queries and 0 for instance queries."""
+    module, params, arguments = spatial(CONFIG)
+    point = SpatialEncoder(dataclasses.replace(CONFIG, query_type="point"), DIM)
+    difference = point.apply(params, *arguments) - module.apply(params, *arguments)
+    np.testing.assert_allclose(difference, arguments[0], atol=1e-6)
+
+
+def test_lane_mask_of_the_host_is_used():
+    lonely = jnp.eye(LANES, dtype=bool)
+    module, params, (lanes, position, traffic, mask) = spatial(CONFIG, lane_mask=lonely)
+    out = module.apply(params, lanes, position, traffic, mask)
+    moved = module.apply(params, lanes.at[0].add(1.0), position, traffic, mask)
+    np.testing.assert_array_equal(out[1:], moved[1:])
+    assert not np.allclose(out[0], moved[0])
+
+
+@pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS])
+def test_lane_queries_are_equivariant(fusions):
+    module, params, (lanes, position, traffic, mask) = spatial(dataclasses.replace(CONFIG, fusions=fusions))
+    order = np.random.default_rng(0).permutation(LANES)
+    out = module.apply(params, lanes, position, traffic, mask)
+    permuted = module.apply(params, lanes[order], position[order], traffic, mask)
+    np.testing.assert_allclose(out[order], permuted, rtol=2e-5, atol=2e-5)
+
+
+def test_gradient_against_finite_differences():
+    module, params, (lanes, position, traffic, mask) = spatial(dataclasses.replace(CONFIG, fusions=ALL_FUSIONS))
+
+    @jax.jit
+    def total(t):
+        return jnp.sin(module.apply(params, lanes, position, t, mask)).sum()
+
+    direction = jnp.asarray(np.random.default_rng(1).normal(size=traffic.shape).astype(np.float32))
+    slope = (total(traffic + 1e-2 * direction) - total(traffic - 1e-2 * direction)) / 2e-2
+    assert float(slope) == pytest.approx(float((jax.grad(total)(traffic) * direction).sum()), rel=1e-2, abs=1e-2)

@@ -1,0 +1,1 @@
+"""Losses on matched pairs. Elementwise where possible; who calls them reduces."""

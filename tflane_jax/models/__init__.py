@@ -1,0 +1,1 @@
+"""The published systems, one file each, built from `tflane_jax.layers`. A model sees ONE example; callers `vmap`."""

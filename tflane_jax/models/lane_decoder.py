@@ -1,0 +1,139 @@
+"""TopoNet's lane decoder: queries look at BEV features, refine centerlines and pass messages along predicted topology.
+
+Reference: specs/modules.md section 5. Two modes of refinement: "fixed" is TopoNet's own, where a query looks around one
+reference point that never moves; "iterative" moves all points of the lane from layer to layer and lets each attention
+head look around its own point of the lane (as LaneSegNet's heads-to-regions), which small models need to converge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.deformable import DeformableAttention
+from tflane_jax.layers.graph import Mlp, RelationshipHead, SceneGraphFeedForward
+from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.scene import LanePrediction
+
+
+@dataclass(frozen=True)
+class LaneDecoderConfig:
+    """Sizes of the decoder; the defaults train on two CPU cores (TopoNet: 256, 8, 6, 200, 4, 512, 128, "fixed").
+
+    Attributes:
+        dim: channels of a query.
+        heads: attention heads.
+        layers: decoder layers.
+        queries: lane queries Q.
+        points: points P of a centerline.
+        sampling_points: deformable sampling points per head.
+        hidden: channels inside the feed-forward block.
+        relation: channels of a side of the relationship head.
+        edge_weight: share of neighbours in the scene graph.
+        refine: see the file's docstring.
+        range: the box that normalised coordinates span.
+    """
+
+    dim: int = 64
+    heads: int = 4
+    layers: int = 3
+    queries: int = 60
+    points: int = 11
+    sampling_points: int = 4
+    hidden: int = 128
+    relation: int = 32
+    edge_weight: float = 0.6
+    refine: Literal["fixed", "iterative"] = "iterative"
+    range: PerceptionRange = BevGrid().range
+
+
+class LaneQueries(nn.Module):
+    """The learned queries: content, position and the reference point that the position stands for."""
+
+    config: LaneDecoderConfig
+
+    @nn.compact
+    def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
+        """Return content, position and initial reference points in [0, 1] (all points of a lane on one spot)."""
+        config = self.config
+        embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
+        position, content = jnp.split(embedding, 2, -1)
+        spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
+        shape = (config.queries, config.points, 3)
+        return content, position, jnp.broadcast_to(spot[:, None], shape)
+
+
+class LaneDecoderLayer(nn.Module):
+    """Self-attention, deformable attention to the BEV, scene-graph feed-forward; post-norm."""
+
+    config: LaneDecoderConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        queries: Float[Array, "q c"],
+        position: Float[Array, "q c"],
+        reference: Float[Array, "q r 2"],
+        bev: Float[Array, "hw c"],
+        shapes: Sequence[tuple[int, int]],
+        adjacency: Float[Array, "q q"],
+    ) -> Float[Array, "q c"]:
+        """Return the queries after one layer; `adjacency` holds the previous layer's edge probabilities."""
+        config = self.config
+        where = queries + position
+        attended = MultiHeadAttention(config.dim, config.heads, name="self_attention")(where, where, queries, None)
+        queries = nn.LayerNorm(name="self_attention_norm")(queries + attended)
+        look = DeformableAttention(
+            config.dim, config.heads, config.sampling_points, len(shapes), name="bev_attention"
+        )
+        queries = nn.LayerNorm(name="bev_attention_norm")(queries + look(queries + position, bev, shapes, reference))
+        graph = SceneGraphFeedForward(config.dim, config.hidden, config.edge_weight, name="scene_graph")
+        return nn.LayerNorm(name="scene_graph_norm")(graph(queries, adjacency))
+
+
+class LaneHeads(nn.Module):
+    """Class, centerline and topology of one decoder layer."""
+
+    config: LaneDecoderConfig
+
+    @nn.compact
+    def __call__(
+        self, queries: Float[Array, "q c"], reference: Float[Array, "q p 3"]
+    ) -> tuple[LanePrediction, Float[Array, "q p 3"]]:
+        """Return the prediction in metres and the same points in [0, 1]."""
+        config = self.config
+        x = queries
+        for i in range(2):
+            x = nn.relu(nn.LayerNorm(name=f"class_norm_{i}")(nn.Dense(config.dim, name=f"class_{i}")(x)))
+        # Bias -log 99: every query starts as one percent likely (focal loss prior).
+        logits = nn.Dense(1, bias_init=nn.initializers.constant(-np.log(99.0)), name="class_out")(x)
+        moved = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries)
+        unit = nn.sigmoid(moved.reshape(reference.shape) + inverse_sigmoid(reference))
+        successor = RelationshipHead(config.relation, name="successor")(queries, queries)
+        return LanePrediction(config.range.denormalise(unit), logits, successor), unit
+
+
+def attention_reference(
+    reference: Float[Array, "q p 3"], config: LaneDecoderConfig
+) -> Float[Array, "q r 2"]:
+    """Return where the heads look: one common point ("fixed"), or points spread along the lane, one for each head."""
+    if config.refine == "fixed":
+        return reference[:, :1, :2]
+    along = np.linspace(0, config.points - 1, config.heads).round().astype(int)
+    return reference[:, along, :2]
+
+
+def next_reference(
+    reference: Float[Array, "q p 3"], unit: Float[Array, "q p 3"], config: LaneDecoderConfig
+) -> Float[Array, "q p 3"]:
+    """Return the reference of the next layer; like Deformable DETR's it carries no gradient."""
+    return reference if config.refine == "fixed" else lax.stop_gradient(unit)

@@ -1,0 +1,168 @@
+"""The traffic-flow module (TFM) of TF-Lane: lane queries in, lane queries out.
+
+Two parts, as in Fig. 2 of the paper: the temporal encoder turns the history of each instance into one token (section
+3.3, "Temporal Domain Encoder", Fig. 4), the spatial encoder lets lane queries and tokens attend to each other under the
+spatial mask M_s (Fig. 5, Eq. (2) and (3)). Neither knows anything of the host detector.
+
+Where the paper is silent, and what stands here: each fusion module is multi-head attention with a residual and a
+LayerNorm; the transformation T of Eq. (3) is a residual two-layer perceptron with a LayerNorm; an instance's token is
+the mean of its valid frames after self-attention.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.graph import Mlp
+from tflane_jax.layers.masks import SpatialMask
+from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+from tflane_jax.scene import RoadUser
+
+Fusion = Literal["T->T", "T->L", "L->T", "L->L"]
+ALL_FUSIONS: tuple[Fusion, ...] = ("T->T", "T->L", "L->T", "L->L")
+LANE_FUSIONS: tuple[Fusion, ...] = ("L->T", "L->L")
+
+
+@dataclass(frozen=True)
+class TrafficFlowModuleConfig:
+    """Shape of the TFM; the defaults are the paper's best (Table 5, Abla5: LT/LL, depth 1, normalised coordinates).
+
+    Attributes:
+        fusions: which of the four modules run, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
+        depth: temporal self-attention layers, "Dep." in Table 5.
+        query_type: what a lane query of the host stands for: "instance" (TopoNet, LaneSegNet) or "point" (MapTR).
+            It decides I(Q_type) in Eq. (3).
+        position_encoding: "sine" for normalised coordinates, "linear" for metres.
+        bands: frequencies per coordinate of the sine encoding.
+        width: channels inside the temporal encoder.
+        heads: attention heads in both encoders.
+    """
+
+    fusions: tuple[Fusion, ...] = LANE_FUSIONS
+    depth: int = 1
+    query_type: Literal["instance", "point"] = "instance"
+    position_encoding: Literal["sine", "linear"] = "sine"
+    bands: int = 7
+    width: int = 32
+    heads: int = 4
+
+
+class TemporalEncoder(nn.Module):
+    """From N frames of an instance to one token, under the temporal mask.
+
+    Attributes:
+        config: shape.
+        dim: channels of the token.
+    """
+
+    config: TrafficFlowModuleConfig
+    dim: int
+
+    @nn.compact
+    def __call__(self, tokens: TrafficFlowTokens) -> Float[Array, "t d"]:
+        """Return TF_Feat; what stands at invalid instances is finite and meaningless."""
+        x = self._embed(tokens)
+        for i in range(self.config.depth):
+            x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, tokens.frame_valid)
+        x = nn.LayerNorm(name="norm")(x)
+        weight = tokens.frame_valid.astype(x.dtype)
+        mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
+        return Mlp((self.dim, self.dim), name="token")(mean)
+
+    def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
+        """Encode position, heading, size, category and age of every frame."""
+        width, (instances, frames) = self.config.width, tokens.frame_valid.shape
+        where = tokens.position
+        if self.config.position_encoding == "sine":
+            ground = sine_encoding(where[..., :2], self.config.bands)
+            where = jnp.concatenate([ground, where[..., 2:]], -1)
+        moving = jnp.concatenate([where, tokens.heading], -1)
+        x = nn.Dense(width, name="frame")(moving)
+        category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
+        size = nn.Dense(width, use_bias=False, name="size")(tokens.size)
+        age = self.param("age", nn.initializers.normal(0.02), (frames, width))
+        return x + (category + size)[:, None] + jnp.broadcast_to(age, (instances, frames, width))
+
+
+class TemporalLayer(nn.Module):
+    """Pre-norm transformer layer over the frames of each instance."""
+
+    width: int
+    heads: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "t n c"], frame_valid: Bool[Array, "t n"]) -> Float[Array, "t n c"]:
+        """Return the frames after masked self-attention and a feed-forward block."""
+        # One instance at a time; the mask is the temporal mask of Fig. 4.
+        attend = nn.vmap(
+            MultiHeadAttention, in_axes=(0, 0, 0, 0), variable_axes={"params": None}, split_rngs={"params": False}
+        )
+        y = nn.LayerNorm(name="attention_norm")(x)
+        x = x + attend(self.width, self.heads, name="attention")(y, y, y, frame_valid[:, None, :])
+        y = nn.LayerNorm(name="mlp_norm")(x)
+        return x + Mlp((2 * self.width, self.width), name="mlp")(y)
+
+
+class SpatialEncoder(nn.Module):
+    """The four fusion modules and the paradigm-aware composition.
+
+    Attributes:
+        config: shape.
+        dim: channels of lane queries and traffic tokens.
+    """
+
+    config: TrafficFlowModuleConfig
+    dim: int
+
+    @nn.compact
+    def __call__(
+        self,
+        lanes: Float[Array, "l d"],
+        lane_position: Float[Array, "l d"],
+        traffic: Float[Array, "t d"],
+        mask: SpatialMask,
+    ) -> Float[Array, "l d"]:
+        """Return L'_Feat.
+
+        Args:
+            lanes: L_Feat, the host's lane queries.
+            lane_position: the host's query positions, added to queries and keys and never to values.
+            traffic: TF_Feat.
+            mask: M_s; quadrants of fusion modules that are switched off are never built.
+        """
+
+        def fuse(name: Fusion, x, x_position, y, y_position, quadrant):
+            """Eq. (2): one fusion module, F_fusion(. ; M_s^(i))."""
+            if name not in self.config.fusions:
+                return x
+            label = name.replace("->", "_to_")
+            attended = MultiHeadAttention(self.dim, self.config.heads, name=label)(
+                x + x_position, y + y_position, y, quadrant
+            )
+            return nn.LayerNorm(name=f"{label}_norm")(x + attended)
+
+        # A traffic token carries its own position already.
+        none = jnp.zeros_like(traffic)
+        traffic = fuse("T->T", traffic, none, traffic, none, mask.traffic_traffic)
+        traffic = fuse("T->L", traffic, none, lanes, lane_position, mask.traffic_lane)
+        fused = fuse("L->T", lanes, lane_position, traffic, none, mask.lane_traffic)
+        fused = fuse("L->L", fused, lane_position, fused, lane_position, mask.lane_lane)
+
+        # Eq. (3): L' = T(F^(4)) + I(Q_type) * L.
+        transformed = fused + Mlp((2 * self.dim, self.dim), name="transform")(fused)
+        transformed = nn.LayerNorm(name="transform_norm")(transformed)
+        return transformed + lanes if self.config.query_type == "point" else transformed
+
+
+def spatial_mask(
+    lanes: int, traffic_valid: Bool[Array, " t"], lane_mask: Bool[Array, "l l"] | None = None
+) -> SpatialMask:
+    """Return M_s: the host's own L->L mask (None: all lanes see all), the rest from instance validity."""
+    return SpatialMask.from_validity(lane_mask, traffic_valid, lanes)

@@ -88,6 +88,9 @@ def clip_to_range(points: Float[Array, "n d"], range_: PerceptionRange) -> list[
     interpolated). A line wholly outside, or only touching the border at a point, gives no piece.
     """
     points = np.asarray(points, np.float64)
+    if len(points) > 1 and range_.contains(points).all():
+        # The common case, several times faster than the general one below.
+        return [points] if arc_length(points)[-1] > 0.0 else []
     a, b = points[:-1], points[1:]
     enter, leave, inside = _inside_interval(a, b, range_)
     enter_point, leave_point = (_on_segment(a, b, t, range_) for t in (enter, leave))

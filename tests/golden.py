@@ -1,0 +1,106 @@
+"""Golden numbers of the reference programs: which test checks which file, and reading the module cases.
+
+Cases are found by listing `$TFLANE_SHARED/golden`, so that a further case of a kind that is claimed here is checked
+too; `tests/test_golden_coverage.py` names what nothing claims. Schema: shared specs/modules.md section 1.
+"""
+
+from __future__ import annotations
+
+import json
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tests.shared import shared_root
+
+# Glob under golden/ (a folder of metrics, or the name of a module case) -> the test file that checks it.
+CLAIMS = {
+    "metrics/openlanev2_centerline": "tests/metrics/test_openlane_v2.py",
+    "metrics/resample": "tests/geometry/test_polylines.py",
+}
+
+Arrays = dict[str, np.ndarray]
+
+
+class ModuleCase(NamedTuple):
+    """One reference module with its weights, inputs, outputs and gradients, names as in PyTorch.
+
+    Attributes:
+        meta: `source`, `config`, `seed`, `note`, ... of the file.
+        params: parameters and buffers by state_dict name, PyTorch's layout.
+        inputs: by name; `name.b` per batch element.
+        outputs: by name.
+        weights: by output name; the differentiated scalar is the sum of weight * output over all outputs.
+        gradients: of that scalar, by `in/<name>` and `p/<name>`; of one with more than 24,000 elements only
+            `last/p/<name>`, its sum over the last axis, and `rest/p/<name>`, its sum over all other axes.
+    """
+
+    meta: dict[str, Any]
+    params: Arrays
+    inputs: Arrays
+    outputs: Arrays
+    weights: Arrays
+    gradients: Arrays
+
+
+def golden_entries() -> dict[str, Path]:
+    """Return what lies under golden/: each folder of metrics and each module case by its name for `CLAIMS`."""
+    root = shared_root() / "golden"
+    folders = {f"metrics/{path.name}": path for path in (root / "metrics").glob("*") if path.is_dir()}
+    files = {f"modules/{path.stem}": path for path in (root / "modules").glob("*.npz")}
+    return dict(sorted((folders | files).items()))
+
+
+def golden_modules(pattern: str) -> list[Path]:
+    """Return the module cases that match a claimed pattern such as "toponet_lclc_gcn*"; none where they are absent.
+
+    For `pytest.mark.parametrize("path", golden_modules(...), ids=case_id)`, which skips where the list is empty.
+    """
+    claim = f"modules/{pattern}"
+    if claim not in CLAIMS:
+        raise KeyError(f"add {claim!r} to tests.golden.CLAIMS with the test file that checks it")
+    return [path for name, path in golden_entries().items() if fnmatchcase(name, claim)]
+
+
+def case_id(path: Path) -> str:
+    """Return the name of a module case for pytest's listing."""
+    return path.stem
+
+
+def load_module_case(path: Path) -> ModuleCase:
+    """Read one file of golden/modules."""
+    groups: dict[str, Arrays] = {key: {} for key in ("p", "in", "out", "gw", "grad")}
+    with np.load(path, allow_pickle=False) as file:
+        meta = json.loads(str(file["meta/json"]))
+        for key in file.files:
+            group, name = key.split("/", 1)
+            if group in groups:
+                groups[group][name] = file[key]
+            elif group.startswith("gradsum_"):
+                groups["grad"][f"{group.removeprefix('gradsum_')}/{name}"] = file[key]
+    return ModuleCase(meta, *groups.values())
+
+
+def assert_outputs_close(actual: Arrays, expected: Arrays, tolerance: float = 2e-5) -> None:
+    """Compare every expected output by name: |a - b| <= tolerance (1 + |b|), the rule of the specification."""
+    for name, value in expected.items():
+        np.testing.assert_allclose(actual[name], value, rtol=tolerance, atol=tolerance, err_msg=name)
+
+
+def assert_gradients_close(actual: Arrays, expected: Arrays, tolerance: float = 2e-4) -> None:
+    """Compare every expected gradient by name: max|a - b| <= tolerance (1 + max|b|), also where only sums are given.
+
+    `actual` holds full gradients by `in/<name>` and `p/<name>` in PyTorch's layout.
+    """
+    for name, value in expected.items():
+        if name.startswith("last/"):
+            got = np.asarray(actual[name.removeprefix("last/")]).sum(-1)
+        elif name.startswith("rest/"):
+            full = np.asarray(actual[name.removeprefix("rest/")])
+            got = full.sum(tuple(range(full.ndim - 1)))
+        else:
+            got = np.asarray(actual[name])
+        scale = 1.0 + np.abs(value).max(initial=0.0)
+        np.testing.assert_allclose(got, value, rtol=0.0, atol=tolerance * scale, err_msg=name)

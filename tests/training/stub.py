@@ -1,0 +1,48 @@
+"""A task small enough to train in milliseconds, with everything a real one has: terms, dropout, a host callback."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def _host_sum(x):
+    return np.asarray(x).sum(-1, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class LineTask:
+    """Fit y = w x + b with dropout noise. `blow_up` makes the term `explosive` infinite where x exceeds it."""
+
+    features: int = 3
+    blow_up: float = 1e9
+
+    def init(self, key, example):
+        kernel = jax.random.normal(key, (example["x"].shape[-1], self.features))
+        return {"line": {"kernel": kernel, "bias": jnp.zeros(self.features)}}
+
+    def loss(self, params, batch, key):
+        x = batch["x"] * jax.random.bernoulli(key, 0.9, batch["x"].shape)
+        error = jax.vmap(lambda features: self._apply(params, features))(x) - batch["y"][:, None]
+        total = jax.pure_callback(
+            _host_sum, jax.ShapeDtypeStruct(x.shape[:-1], jnp.float32), jax.lax.stop_gradient(x),
+            vmap_method="expand_dims",
+        )  # fmt: skip
+        fit = (error**2).mean()
+        explosive = jnp.where((batch["x"] > self.blow_up).any(), jnp.inf, 0.0)
+        return fit + explosive + 0.0 * total.mean(), {"fit": fit, "explosive": explosive}
+
+    def predict(self, params, example):
+        return self._apply(params, example["x"])
+
+    def _apply(self, params, x):
+        return x @ params["line"]["kernel"] + params["line"]["bias"]
+
+
+def line_arrays(examples: int = 20) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(examples, 4)).astype(np.float32)
+    return {"x": x, "y": (x @ [1.0, -2.0, 0.5, 3.0]).astype(np.float32)}

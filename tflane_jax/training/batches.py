@@ -1,0 +1,56 @@
+"""Which examples a step sees, and having them ready when it starts."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+
+def batch_indices(seed: int, step: int, examples: int, batch_size: int) -> Int[np.ndarray, " b"]:
+    """Return the examples of one step.
+
+    Every epoch is a permutation of its own, drawn from (seed, epoch), and the batches run through them without gaps: a
+    batch at the seam takes the rest of one epoch and the start of the next. The step alone says where one is, so
+    that a resumed run goes on with the same batches.
+    """
+    epochs, places = np.divmod(step * batch_size + np.arange(batch_size), examples)
+    return np.concatenate(
+        [_permutation(seed, int(epoch), examples)[places[epochs == epoch]] for epoch in np.unique(epochs)]
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _permutation(seed: int, epoch: int, examples: int) -> Int[np.ndarray, " n"]:
+    order = np.random.default_rng([seed, epoch]).permutation(examples)
+    order.flags.writeable = False
+    return order
+
+
+def batches(arrays: Any, seeds: Sequence[int], steps: range, batch_size: int) -> Generator[Any]:
+    """Yield the batch of each step on the device, the next one being gathered in a thread meanwhile.
+
+    Args:
+        arrays: stacked examples, numpy leaves with a leading axis.
+        seeds: of the run; each has an order of its own, and more than one gives batches a leading seed axis.
+        steps: which steps.
+        batch_size: examples of a step (and seed).
+    """
+    examples = len(jax.tree.leaves(arrays)[0])
+
+    def fetch(step: int) -> Any:
+        order = np.stack([batch_indices(seed, step, examples, batch_size) for seed in seeds])
+        order = order[0] if len(seeds) == 1 else order
+        return jax.device_put(jax.tree.map(lambda leaf: np.take(leaf, order, axis=0), arrays))
+
+    with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
+        ahead = None
+        for step in steps:
+            batch = fetch(step) if ahead is None else ahead.result()
+            ahead = pool.submit(fetch, step + 1) if step + 1 in steps else None
+            yield batch

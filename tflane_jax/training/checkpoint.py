@@ -1,0 +1,246 @@
+"""Checkpoints: whole or absent, checked against checksums, self-contained.
+
+One folder per checkpoint, `step_00001000/`: the state as an orbax tree of plain arrays (`state/`) and `manifest.json`
+with the step, its metrics, what the loop wants back, the run's resolved configuration, and the checksum of every file
+of the state. It is written beside its place and renamed into it. Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import zlib
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from flax import serialization
+
+from tflane_jax.errors import UserError
+from tflane_jax.training.state import TrainState
+
+_VERSION = 1
+Which = int | Literal["last", "best"]
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a checkpoint says about itself.
+
+    Attributes:
+        step: updates made.
+        config: the run's resolved configuration, plain JSON.
+        metrics: of the evaluation at this step; empty where there was none.
+        progress: what the loop needs to go on as if it had never stopped.
+        files: CRC-32 of every file of the state, by path relative to the checkpoint.
+        version: of this layout.
+    """
+
+    step: int
+    config: dict[str, Any]
+    metrics: dict[str, float] = field(default_factory=dict)
+    progress: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, int] = field(default_factory=dict)
+    version: int = _VERSION
+
+
+class Checkpoints:
+    """The checkpoints of a run: the last few, and the best by one metric.
+
+    Args:
+        folder: where they are; created when the first one is saved.
+        keep: how many of the latest to keep.
+        best_metric: name in `Manifest.metrics`, higher is better.
+    """
+
+    def __init__(self, folder: Path, *, keep: int = 2, best_metric: str = ""):
+        self.folder, self._keep, self._best_metric = folder, keep, best_metric
+
+    def steps(self) -> list[int]:
+        """Return the steps of all checkpoints, ascending."""
+        names = [p.name for p in self.folder.iterdir()] if self.folder.is_dir() else []
+        return sorted(int(found[1]) for name in names if (found := re.fullmatch(r"step_(\d{8,})", name)))
+
+    def path(self, step: int) -> Path:
+        """Return the folder of the checkpoint of that step."""
+        return self.folder / f"step_{step:08d}"
+
+    def best_step(self) -> int | None:
+        """Return the step with the highest best metric (the earliest of equals), None where nothing was evaluated."""
+        scores = [(self.manifest(step).metrics.get(self._best_metric), -step) for step in self.steps()]
+        found = [(score, negative) for score, negative in scores if score is not None and np.isfinite(score)]
+        return -max(found)[1] if found else None
+
+    def save(self, state: TrainState, manifest: Manifest) -> Path:
+        """Write a checkpoint, in place of one of the same step, and drop those that need not be kept."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for stale in self.folder.glob(".writing-*"):  # left behind by a process that was killed
+            shutil.rmtree(stale, ignore_errors=True)
+        writing, place = self.folder / f".writing-{os.getpid()}", self.path(manifest.step)
+        try:
+            _save_tree(writing / "state", _plain(state))
+            content = asdict(manifest) | {"files": _checksums(writing)}
+            (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+            if place.exists():
+                shutil.rmtree(place)
+            writing.rename(place)
+        except OSError as error:
+            shutil.rmtree(writing, ignore_errors=True)
+            raise UserError(f"cannot write checkpoint {place}: {error.strerror or error}; free space there") from error
+        self._drop_old()
+        return place
+
+    def manifest(self, step: int) -> Manifest:
+        """Return what the checkpoint says about itself; raises UserError where it is damaged."""
+        try:
+            content = json.loads((self.path(step) / "manifest.json").read_text(encoding="utf-8"))
+            manifest = Manifest(**content)
+        except (OSError, ValueError, TypeError) as error:
+            raise self._damaged(step, f"manifest.json: {error}") from error
+        if manifest.version != _VERSION:
+            raise UserError(
+                f"checkpoint {self.path(step)} has layout version {manifest.version}, this program reads {_VERSION}"
+            )
+        return manifest
+
+    def find(self, which: Which) -> int:
+        """Return the step that is meant; raises UserError, listing what there is, where there is no such one."""
+        steps = self.steps()
+        if not steps:
+            raise UserError(f"{self.folder} holds no checkpoint: the run ended before its first one was written")
+        step = steps[-1] if which == "last" else self.best_step() if which == "best" else which
+        if step is None:
+            raise UserError(f"no checkpoint in {self.folder} was evaluated, so none is best: ask for `last`")
+        if step not in steps:
+            raise UserError(f"{self.folder} has no checkpoint of step {step}, only {', '.join(map(str, steps))}")
+        return step
+
+    def restore(self, step: int, template: TrainState) -> TrainState:
+        """Return the state saved at `step`, on the default device.
+
+        Args:
+            step: which checkpoint.
+            template: a state (or the shapes of one) of the same task, optimiser and seeds.
+
+        Raises:
+            UserError: the checkpoint is damaged, or belongs to another model or optimiser.
+        """
+        tree, expected = self.arrays(step), _plain_shapes(template)
+        if tree.keys() != expected.keys() or (odd := _first_difference(tree, expected)) is not None:
+            name = odd if tree.keys() == expected.keys() else sorted(tree.keys() ^ expected.keys())[0]
+            raise UserError(
+                f"checkpoint {self.path(step)} does not fit this configuration: {name} differs. It was made by another "
+                "model, optimiser or number of seeds"
+            )
+        state = serialization.from_state_dict(template, _nested(tree))
+        return jax.device_put(_with_keys(state, template))
+
+    def arrays(self, step: int) -> dict[str, np.ndarray]:
+        """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError where they are damaged."""
+        folder, manifest = self.path(step), self.manifest(step)
+        try:
+            if (found := _checksums(folder)) != manifest.files:
+                wrong = sorted(k for k in found.keys() | manifest.files.keys() if found.get(k) != manifest.files.get(k))
+                raise self._damaged(step, f"{wrong[0]} is not what was written")
+            return _load_tree(folder / "state")
+        except (OSError, ValueError, KeyError) as error:
+            raise self._damaged(step, str(error)) from error
+
+    def params(self, step: int) -> dict[str, Any]:
+        """Return the averaged parameters of a checkpoint (leading seed axis where it has several), numpy."""
+        prefix = "ema_params/"
+        arrays = self.arrays(step)
+        return _nested({name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)})
+
+    def _drop_old(self) -> None:
+        steps = self.steps()
+        kept = {*steps[-self._keep :], self.best_step()}
+        for step in steps:
+            if step not in kept:
+                shutil.rmtree(self.path(step))
+
+    def _damaged(self, step: int, why: str) -> UserError:
+        others = [other for other in self.steps() if other != step]
+        remedy = f"the run can go on from step {others[-1]}" if others else "there is no other: start the run again"
+        return UserError(f"checkpoint {self.path(step)} is damaged ({why}): delete that folder; {remedy}")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Arrays on disk. Orbax is imported where it is used, because that takes long.
+
+
+def _save_tree(folder: Path, tree: dict[str, np.ndarray]) -> None:
+    import orbax.checkpoint as ocp
+
+    with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as writer:
+        writer.save(folder.absolute(), args=ocp.args.PyTreeSave(_nested(tree)))
+
+
+def _load_tree(folder: Path) -> dict[str, np.ndarray]:
+    import orbax.checkpoint as ocp
+
+    with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as reader:
+        names = reader.metadata(folder.absolute()).item_metadata.tree
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), names)
+        return _flat(reader.restore(folder.absolute(), args=ocp.args.PyTreeRestore(restore_args=as_numpy)))
+
+
+def _checksums(folder: Path) -> dict[str, int]:
+    files = sorted(p for p in (folder / "state").rglob("*") if p.is_file())
+    return {p.relative_to(folder).as_posix(): zlib.crc32(p.read_bytes()) for p in files}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A state as named plain arrays and back. Random keys are stored as their raw words.
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _plain(state: TrainState) -> dict[str, np.ndarray]:
+    words = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
+    return _flat(serialization.to_state_dict(jax.device_get(words)))
+
+
+def _plain_shapes(state: TrainState) -> dict[str, jax.ShapeDtypeStruct]:
+    words = jax.eval_shape(
+        lambda s: jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, s), state
+    )
+    return _flat(serialization.to_state_dict(words))
+
+
+def _with_keys(state: TrainState, template: TrainState) -> TrainState:
+    return jax.tree.map(
+        lambda leaf, like: jax.random.wrap_key_data(leaf) if _is_key(like) else leaf, state, template
+    )
+
+
+def _first_difference(tree: dict[str, Any], expected: dict[str, Any]) -> str | None:
+    for name, leaf in tree.items():
+        if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
+            return f"the shape or type of {name} ({leaf.shape}, expected {expected[name].shape})"
+    return None
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the leaves of nested dicts by path; empty dicts vanish."""
+    out: dict[str, Any] = {}
+    for name, value in tree.items():
+        out |= _flat(value, f"{prefix}{name}/") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return out
+
+
+def _nested(leaves: dict[str, Any]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for path, leaf in leaves.items():
+        *parents, name = path.split("/")
+        node = out
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[name] = leaf
+    return out

@@ -1,0 +1,274 @@
+"""The training program, top to bottom: set up, state, compile, steps, evaluation, checkpoints, stop.
+
+It knows no dataset, metric or picture: the caller hands in arrays, a function that evaluates and one that draws. All
+that a run needs to go on is in its folder (`training.run_folder`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.errors import UserError
+from tflane_jax.training.batches import batches
+from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.interrupt import StopRequest
+from tflane_jax.training.provenance import add_provenance
+from tflane_jax.training.records import Record, RecordWriter
+from tflane_jax.training.run_folder import Start, claimed, read_config, write_json, write_text
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import TrainState, init_states, per_seed, with_params
+from tflane_jax.training.step import make_multi_seed_step, make_update_step
+from tflane_jax.training.task import Params, Task
+
+Evaluate = Callable[[Params], dict[str, float]]
+"""Averaged parameters of one seed -> numbers by name."""
+Draw = Callable[[Path, int, Params, list[Record]], None]
+"""(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """The program's settings.
+
+    Attributes:
+        steps: updates.
+        batch_size: examples of an update (of each seed).
+        seeds: roots of everything random in training; several train side by side in one program, each exactly as it
+            would alone up to float rounding.
+        log_every: steps between records; a record holds means over the steps since the last one.
+        eval_every: steps between evaluations, each with a checkpoint and pictures; the last step always has one.
+        checkpoint_every: steps between further checkpoints.
+        keep_checkpoints: how many of the latest to keep, beside the best.
+        best_metric: of the evaluation, higher is better.
+        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); None starts afresh.
+    """
+
+    steps: int = 10_000
+    batch_size: int = 8
+    seeds: tuple[int, ...] = (0,)
+    log_every: int = 50
+    eval_every: int = 1000
+    checkpoint_every: int = 500
+    keep_checkpoints: int = 2
+    best_metric: str = "all/DET_l"
+    init_from: str | None = None
+
+
+@dataclass
+class _Window:
+    """Sums of metrics since the last record, which a checkpoint carries so that records, too, survive a resume."""
+
+    steps: int = 0
+    sums: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, metrics: dict[str, np.ndarray]) -> None:
+        for name, value in metrics.items():
+            self.sums[name] = list(np.add(self.sums.get(name, 0.0), np.atleast_1d(value).astype(float)))
+        self.steps += 1
+
+    def record(self, step: int) -> Record:
+        means = {name: np.divide(values, self.steps).tolist() for name, values in self.sums.items()}
+        return {"step": step, "split": "train"} | {k: v[0] if len(v) == 1 else v for k, v in means.items()}
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended.
+
+    Attributes:
+        step: updates made.
+        metrics: of the last evaluation, mean over seeds.
+        compile_seconds: tracing and compiling the update step.
+        steps_per_second: of this process, evaluations and checkpoints not counted.
+        stopped_by: number of the signal that stopped it before its end, else None.
+    """
+
+    step: int
+    metrics: dict[str, float]
+    compile_seconds: float
+    steps_per_second: float
+    stopped_by: int | None
+
+
+def train(
+    task: Task, arrays: Any, folder: Path, *, config: TrainingConfig, optim: OptimConfig,
+    resolved: dict[str, Any], resolved_text: str = "", start: Start = "new",
+    evaluate: Evaluate | None = None, draw: Draw | None = None, progress: bool = True,
+) -> TrainingResult:  # fmt: skip
+    """Train a task on arrays in memory and leave everything about the run in `folder`.
+
+    Args:
+        task: what to train.
+        arrays: stacked training examples (numpy, leading axis).
+        folder: of the run.
+        config, optim: settings.
+        resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
+        resolved_text: the same for people.
+        start: see `run_folder.claimed`.
+        evaluate, draw: called at every evaluation.
+        progress: show a bar with rate and time left.
+
+    Raises:
+        UserError: see `run_folder.claimed` and `Checkpoints`; settings that cannot work; a loss that is not finite,
+            after the last good state was written.
+    """
+    _check(config)
+    with claimed(folder, start), StopRequest() as stop:
+        # =============================================================================================================
+        # Run folder
+        # =============================================================================================================
+        if start == "resume" and (saved := read_config(folder)) != resolved:
+            raise UserError(f"{folder} was started with another configuration ({_difference(saved, resolved)}): "
+                            "resume it as it is, or start another run")  # fmt: skip
+        add_provenance(folder)
+        write_text(folder / "config.txt", resolved_text)
+        write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
+        checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
+
+        # =============================================================================================================
+        # State: fresh, of another run, or resumed
+        # =============================================================================================================
+        optimizer = make_optimizer(optim, config.steps)
+        state = init_states(task, optimizer, config.seeds, jax.tree.map(lambda leaf: leaf[0], arrays))
+        window, metrics, seconds = _Window(), {}, 0.0
+        if start == "resume" and (written := checkpoints.steps()):
+            manifest = checkpoints.manifest(written[-1])
+            state = checkpoints.restore(manifest.step, state)
+            window, seconds = _Window(**manifest.progress["window"]), manifest.progress["seconds"]
+            metrics = manifest.progress["metrics"]
+        elif config.init_from is not None:
+            state = with_params(state, _params_of_run(Path(config.init_from), state), optimizer)
+        first = step = int(np.max(state.step))
+
+        # =============================================================================================================
+        # Compile
+        # =============================================================================================================
+        began = time.perf_counter()
+        feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size)
+        batch = next(feed, None)
+        if len(config.seeds) == 1:
+            update = make_update_step(task, optim, config.steps)
+        else:
+            update = make_multi_seed_step(task, optim, config.steps, batch="per_seed")
+        if batch is not None:  # a run that is complete has no next batch
+            update = update.lower(state, batch).compile()
+        compile_seconds = time.perf_counter() - began
+        if progress:
+            tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)
+
+        # =============================================================================================================
+        # Steps
+        # =============================================================================================================
+        def save(evaluated: dict[str, float]) -> None:
+            carried = {"window": asdict(window), "seconds": seconds, "metrics": metrics}
+            checkpoints.save(state, Manifest(step=step, config=resolved, metrics=evaluated, progress=carried))
+
+        stepping, saved_step = 0.0, first
+        with (
+            contextlib.closing(feed),
+            RecordWriter(folder, first) as writer,
+            tqdm(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
+        ):
+            while batch is not None and stop.signal is None:
+                began = time.perf_counter()
+                state, values = update(state, batch)
+                # Waiting here costs nothing: matching is on the host, so that the host is needed in every step anyway.
+                values = jax.device_get(values)
+                if not values["finite"].all():
+                    save({})
+                    raise UserError(_not_finite(values, step, config.seeds, checkpoints.path(step)))
+                step += 1
+                window.add({name: value for name, value in values.items() if name != "finite"})
+                batch = next(feed, None)
+                elapsed = time.perf_counter() - began
+                stepping, seconds = stepping + elapsed, seconds + elapsed
+                bar.update()
+
+                is_last = step == config.steps
+                if step % config.log_every == 0 or is_last:
+                    record = window.record(step)
+                    writer.write(record | {"seconds": seconds})
+                    bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
+                    window = _Window()
+                if evaluate is not None and (step % config.eval_every == 0 or is_last):
+                    metrics = _evaluate(evaluate, state, step, config.seeds, writer)
+                    save(metrics)
+                    saved_step = step
+                    if draw is not None:
+                        draw(folder, step, per_seed(state.ema_params, config.seeds)[0], writer.records)
+                elif step % config.checkpoint_every == 0 or is_last:
+                    save({})
+                    saved_step = step
+
+            # =========================================================================================================
+            # Stop
+            # =========================================================================================================
+            if step > saved_step:
+                save({})
+        rate = (step - first) / stepping if stepping else 0.0
+        return TrainingResult(step, metrics, compile_seconds, rate, stop.signal if step < config.steps else None)
+
+
+def _check(config: TrainingConfig) -> None:
+    for name in ("steps", "batch_size", "log_every", "eval_every", "checkpoint_every", "keep_checkpoints"):
+        if getattr(config, name) < 1:
+            raise UserError(f"training.{name} is {getattr(config, name)}: it must be at least 1")
+    if not config.seeds or len(set(config.seeds)) < len(config.seeds):
+        raise UserError(f"training.seeds is {config.seeds}: give one or more different numbers")
+
+
+def _evaluate(
+    evaluate: Evaluate, state: TrainState, step: int, seeds: tuple[int, ...], writer: RecordWriter
+) -> dict[str, float]:
+    """Evaluate every seed, record the numbers and return their means over the seeds."""
+    every = [evaluate(params) for params in per_seed(state.ema_params, seeds)]
+    values = {name: [one[name] for one in every] for name in every[0]}
+    writer.write({"step": step, "split": "val"} | {k: v[0] if len(v) == 1 else v for k, v in values.items()})
+    return {name: float(np.mean(v)) for name, v in values.items()}
+
+
+def _params_of_run(folder: Path, state: TrainState) -> Params:
+    """Return the best averaged parameters of another run (the last ones where none was evaluated)."""
+    settings = read_config(folder)["training"]
+    checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
+    step = checkpoints.best_step()
+    params = checkpoints.params(checkpoints.find("last") if step is None else step)
+    params = per_seed(params, settings["seeds"])[0]
+    wanted = per_seed(state.params, range(state.step.size))[0]
+    shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), tree) for tree in (params, wanted)]
+    if shapes[0] != shapes[1]:
+        raise UserError(f"training.init_from: {folder} holds another model ({_difference(*shapes)})")
+    return params
+
+
+def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
+    """Name the step, the seed and the first thing that is not finite: a loss term, else the loss, else the gradient."""
+    bad = int(np.argmin(np.atleast_1d(values["finite"])))
+    numbers = {name: float(np.atleast_1d(value)[bad]) for name, value in values.items()}
+    terms = [name for name, value in sorted(numbers.items(), reverse=True) if not np.isfinite(value)]
+    what = ", ".join(f"{name} = {numbers[name]}" for name in terms)
+    return (
+        f"step {step + 1}, seed {seeds[bad]}: {what} is not finite. The last good state (step {step}) is kept in "
+        f"{kept}. Lower optim.lr or optim.clip_norm and start again, from there with training.init_from"
+    )
+
+
+def _difference(saved: dict[str, Any], resolved: dict[str, Any], prefix: str = "") -> str:
+    """Return the first entry in which two configurations differ."""
+    for name in sorted(saved.keys() | resolved.keys()):
+        old, new = saved.get(name), resolved.get(name)
+        if isinstance(old, dict) and isinstance(new, dict) and old != new:
+            return _difference(old, new, f"{prefix}{name}.")
+        if old != new:
+            return f"{prefix}{name}: {old} there, {new} here"
+    return ""

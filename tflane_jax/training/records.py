@@ -1,0 +1,74 @@
+"""The record of a run: metrics as JSON lines and for TensorBoard, both cut back to the step a run is resumed from."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+Record = dict[str, Any]
+
+
+def read_records(path: Path) -> list[Record]:
+    """Return the records of a metrics.jsonl in order; a last line cut short by a kill is left out."""
+    if not path.exists():
+        return []
+    records = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            records.append(json.loads(line))
+        except ValueError:
+            break
+    return records
+
+
+class RecordWriter:
+    """Appends records to `<folder>/metrics.jsonl` and `<folder>/tensorboard/`.
+
+    A record is one flat dict: `step` (updates made), `split` ("train", "val") and values by name: a number, or a list
+    of one per seed where several train together.
+
+    Args:
+        folder: the run's folder.
+        step: the step the run starts or resumes from; what an earlier process wrote beyond it is dropped.
+    """
+
+    def __init__(self, folder: Path, step: int):
+        from tensorboardX import SummaryWriter
+
+        path = folder / "metrics.jsonl"
+        self.records = [record for record in read_records(path) if record["step"] <= step]
+        rewritten = path.with_suffix(".jsonl.tmp")
+        rewritten.write_text("".join(_line(record) for record in self.records), encoding="utf-8")
+        os.replace(rewritten, path)
+        self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
+        purge = step + 1 if self.records else None
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=purge, write_to_disk=True)
+
+    def write(self, record: Record) -> None:
+        """Append one record; it is on disk when this returns."""
+        self.records.append(record)
+        self._file.write(_line(record))
+        self._file.flush()
+        for name, value in record.items():
+            if name in ("step", "split"):
+                continue
+            tag = f"{record['split']}/{name}"
+            tags = {f"{tag}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {tag: value}
+            for one, number in tags.items():
+                self._board.add_scalar(one, number, record["step"])
+
+    def __enter__(self) -> RecordWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+        self._board.close()
+
+
+def _line(record: Record) -> str:
+    return json.dumps(record) + "\n"

@@ -1,0 +1,98 @@
+"""The folder of a run: who may write into it, and what lies where.
+
+    config.json, config.txt   resolved configuration: to load again, to read
+    provenance.json           git hash, versions, device, command of every start
+    metrics.jsonl             records; tensorboard/ holds the same
+    checkpoints/              see training.checkpoint
+    curves.png, pictures/     drawn at every evaluation
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from tflane_jax.errors import UserError
+
+Start = Literal["new", "resume", "overwrite"]
+_CONTENT = ("config.json", "config.txt", "provenance.json", "metrics.jsonl", "metrics.jsonl.tmp", "tensorboard",
+            "checkpoints", "curves.png", "pictures", "run.lock")  # fmt: skip
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Return the resolved configuration of a run as plain JSON; raises UserError where the folder holds no run."""
+    try:
+        return json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise UserError(f"{folder} holds no run (it has no config.json)") from error
+    except ValueError as error:
+        raise UserError(f"{folder / 'config.json'} is damaged ({error}): checkpoints hold a copy") from error
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file, whole or not at all."""
+    write_text(path, json.dumps(content, indent=1) + "\n")
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a text file, whole or not at all."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(content, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+@contextlib.contextmanager
+def claimed(folder: Path, start: Start) -> Iterator[None]:
+    """Make the folder ready for this process alone, for as long as the block lasts.
+
+    Args:
+        folder: of the run.
+        start: "new" refuses a folder that holds a run, "overwrite" deletes that run (and nothing else), "resume" needs
+            one.
+
+    Raises:
+        UserError: the folder is not what `start` says, another process trains into it, or it cannot be written.
+    """
+    holds_run = (folder / "config.json").exists()
+    if start == "new" and holds_run:
+        raise UserError(f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
+                        "or choose another folder with --out")  # fmt: skip
+    if start == "resume" and not holds_run:
+        raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
+    if not holds_run and folder.is_dir() and (other := {p.name for p in folder.iterdir()} - set(_CONTENT)):
+        raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = open(folder / "run.lock", "a")  # noqa: SIM115 (held open while the run lasts)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror or error}") from error
+    with lock:
+        _lock(lock.fileno(), folder)
+        if start == "overwrite":
+            for name in _CONTENT:
+                _delete(folder / name)
+        yield
+
+
+def _lock(file: int, folder: Path) -> None:
+    """Take the lock, which the system releases even where the process is killed."""
+    try:
+        import fcntl
+    except ImportError:  # Windows has no such lock; two processes in one folder are then the user's to avoid
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise UserError(f"another process is training into {folder}: wait for it or choose another folder") from error
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    elif path.name != "run.lock":
+        path.unlink(missing_ok=True)

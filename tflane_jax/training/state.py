@@ -1,0 +1,77 @@
+"""What training carries from step to step: everything that a bit-exact resume needs, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Int
+
+from tflane_jax.training.rng import stream
+from tflane_jax.training.task import Params, Task
+
+
+@struct.dataclass
+class TrainState:
+    """State after `step` updates; a further leading axis on every leaf when several seeds train together.
+
+    Attributes:
+        step: () number of updates made.
+        params: the task's parameters.
+        ema_params: their exponential moving average, which is what gets evaluated.
+        opt_state: of the optimiser.
+        key: () root key of the run; it never changes, streams are derived from it by name and step.
+    """
+
+    step: Int[Array, "*seeds"]
+    params: Params
+    ema_params: Params
+    opt_state: Any
+    key: jax.Array
+
+
+def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Array, example: Any) -> TrainState:
+    """Return the state before the first update."""
+    params = task.init(stream(key, "params"), example)
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        params=params,
+        ema_params=jax.tree.map(jnp.copy, params),  # the update donates its buffers, so none may be shared
+        opt_state=optimizer.init(params),
+        key=key,
+    )
+
+
+def init_states(
+    task: Task, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any
+) -> TrainState:
+    """Return the state of a run: without a seed axis for one seed, with a leading one for several."""
+    keys = jnp.stack([jax.random.key(seed) for seed in seeds])
+
+    def init(key: jax.Array, example: Any) -> TrainState:
+        return init_state(task, optimizer, key, example)
+
+    if len(seeds) == 1:
+        return jax.jit(init)(keys[0], example)
+    return jax.jit(jax.vmap(init, in_axes=(0, None)))(keys, example)
+
+
+def with_params(state: TrainState, params: Params, optimizer: optax.GradientTransformation) -> TrainState:
+    """Return the state of a run that starts from given parameters, as fine-tuning does (all seeds from the same)."""
+    if state.step.ndim:
+        params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.step.shape, *leaf.shape)), params)
+    opt_state = jax.vmap(optimizer.init)(params) if state.step.ndim else optimizer.init(params)
+    params = jax.tree.map(jnp.array, params)
+    ema_params = jax.tree.map(jnp.copy, params)
+    return state.replace(params=params, ema_params=ema_params, opt_state=opt_state)  # pyright: ignore
+
+
+def per_seed(tree: Any, seeds: Sequence[int]) -> list[Any]:
+    """Split a tree of a run (state, parameters, metrics) into one per seed."""
+    if len(seeds) == 1:
+        return [tree]
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], tree) for i in range(len(seeds))]

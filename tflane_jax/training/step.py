@@ -1,0 +1,96 @@
+"""The update step: loss, gradient, AdamW, moving average; traced once, donated, safe against non-finite numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int
+
+from tflane_jax.training.rng import stream
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
+from tflane_jax.training.state import TrainState
+from tflane_jax.training.task import Params, Task
+
+Metrics = dict[str, jax.Array]
+UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
+
+
+def make_update_step(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
+    """Return the jitted update (state, batch) -> (state, metrics); the state that goes in is consumed.
+
+    Metrics: `loss`, the task's terms as `loss/<term>`, `grad_norm` before clipping, `learning_rate`, and `finite`.
+    Where the loss or a gradient is not finite, `finite` is False and the state comes out unchanged.
+    A second trace (a batch of another shape) raises AssertionError.
+    """
+    return _guarded(_update(task, optim, steps))
+
+
+def make_multi_seed_step(
+    task: Task, optim: OptimConfig, steps: int, *, batch: Literal["shared", "per_seed"]
+) -> UpdateStep:
+    """Return the update of several seeds at once: state and metrics have a leading seed axis.
+
+    Each seed gets what it gets when it trains alone, up to float rounding (batched products round differently).
+
+    A number that is not finite in one seed leaves the states of all of them unchanged.
+
+    Args:
+        task, optim, steps: as for `make_update_step`.
+        batch: "per_seed" batches have a leading seed axis, "shared" ones are seen by every seed.
+    """
+    update = _update(task, optim, steps)
+    return _guarded(jax.vmap(update, in_axes=(0, 0 if batch == "per_seed" else None)))
+
+
+def _guarded(update: UpdateStep) -> UpdateStep:
+    """Compile an update that leaves the state (of every seed) as it was unless all numbers are finite."""
+
+    def guarded(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+        new, metrics = update(state, batch)
+        finite = metrics["finite"].all()
+        return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state), metrics
+
+    return jax.jit(chex.assert_max_traces(guarded, n=1), donate_argnums=0)
+
+
+def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
+    optimizer, schedule = make_optimizer(optim, steps), make_schedule(optim, steps)
+
+    def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+        key = stream(state.key, "dropout", state.step)
+        (loss, terms), grads = jax.value_and_grad(task.loss, has_aux=True)(state.params, batch, key)
+        grad_norm = optax.tree.norm(grads)
+        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        params: Params = optax.apply_updates(state.params, updates)  # pyright: ignore[reportAssignmentType]
+        new = TrainState(
+            step=state.step + 1,
+            params=params,
+            ema_params=moving_average(state.ema_params, params, state.step, optim.ema_decay),
+            opt_state=opt_state,
+            key=state.key,
+        )
+        metrics = {f"loss/{name}": value for name, value in terms.items()} | {
+            "loss": loss,
+            "grad_norm": grad_norm,
+            "learning_rate": schedule(state.step),
+            "finite": jnp.isfinite(loss) & jnp.isfinite(grad_norm),
+        }
+        return new, metrics
+
+    return update
+
+
+def moving_average(
+    average: Params, params: Params, step: int | Int[Array, ""], decay: float | Float[Array, ""]
+) -> Params:
+    """Return d * average + (1 - d) * params with d = min(decay, (1 + step) / (10 + step)).
+
+    The second bound lets the average forget the initial parameters early, so that short runs can be evaluated by it.
+    """
+    d = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
+    return jax.tree.map(lambda a, p: d * a + (1.0 - d) * p, average, params)

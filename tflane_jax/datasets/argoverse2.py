@@ -1,0 +1,313 @@
+"""Argoverse 2 sensor logs: annotations, ego poses and the vector map (specs/data_formats.md section 1).
+
+Images and lidar are not needed. Two traps: a box is given in the ego frame of its own timestamp, and the
+map's predecessor lists are incomplete, so that only successors are read.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from tflane_jax.datasets.argoverse2_map import read_map
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo
+from tflane_jax.datasets.examples import make_example
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
+from tflane_jax.logs import KeyFrame, Log, Tracks
+from tflane_jax.scene import Example, RoadUser
+
+ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
+_POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_BOX_COLUMNS = (*_POSE_COLUMNS, "track_uuid", "category", "length_m", "width_m", "height_m",
+"num_interior_pts")
+# Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
+_FRAMES_PER_KEYFRAME = 5
+_OPENLANE_SPLITS, _OPENLANE_LOGS = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
+
+CATEGORIES: Mapping[str, RoadUser | None] = {
+    "REGULAR_VEHICLE": RoadUser.CAR,
+    "LARGE_VEHICLE": RoadUser.TRUCK,
+    "BOX_TRUCK": RoadUser.TRUCK,
+    "TRUCK": RoadUser.TRUCK,
+    "TRUCK_CAB": RoadUser.TRUCK,
+    "VEHICULAR_TRAILER": RoadUser.TRUCK,
+    "BUS": RoadUser.BUS,
+    "ARTICULATED_BUS": RoadUser.BUS,
+    "SCHOOL_BUS": RoadUser.BUS,
+    "RAILED_VEHICLE": RoadUser.BUS,
+    "MOTORCYCLE": RoadUser.MOTORCYCLE,
+    "MOTORCYCLIST": RoadUser.MOTORCYCLE,
+    "BICYCLE": RoadUser.BICYCLE,
+    "BICYCLIST": RoadUser.BICYCLE,
+    "WHEELED_DEVICE": RoadUser.BICYCLE,
+    "WHEELED_RIDER": RoadUser.BICYCLE,
+    "PEDESTRIAN": RoadUser.PEDESTRIAN,
+    "OFFICIAL_SIGNALER": RoadUser.PEDESTRIAN,
+    "STROLLER": RoadUser.PEDESTRIAN,
+    "WHEELCHAIR": RoadUser.PEDESTRIAN,
+    "DOG": RoadUser.PEDESTRIAN,
+    "ANIMAL": RoadUser.PEDESTRIAN,
+    "BOLLARD": None,
+    "SIGN": None,
+    "STOP_SIGN": None,
+    "CONSTRUCTION_CONE": None,
+    "CONSTRUCTION_BARREL": None,
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
+    "MESSAGE_BOARD_TRAILER": None,
+    "TRAFFIC_LIGHT_TRAILER": None,
+}
+"""Road user of each Argoverse 2 category; None is street furniture, which is annotated as tracks but is not traffic."""
+
+Keyframes = Literal["openlane_v2", "annotations"]
+
+
+def load_log(
+    folder: Path,
+    *,
+    keyframes: Keyframes = "openlane_v2",
+    openlane: Path | None = None,
+    categories: Mapping[str, RoadUser | None] = CATEGORIES,
+) -> Log:
+    """Read one log folder.
+
+    Args:
+        folder: holds annotations.feather, city_SE3_egovehicle.feather and map/.
+        keyframes: "openlane_v2": the 2 Hz frames of OpenLane-V2; "annotations": every annotated frame (10
+            Hz).
+        openlane: folder of the OpenLane-V2 split files, which name the exact timestamps (those of the front
+            camera); without it, or for a log that they do not hold, every fifth annotated frame stands for
+            "openlane_v2".
+        categories: road user of each category, None to leave it out.
+
+    Raises:
+        UserError: a file is missing or unreadable, lacks a column, or holds no frame.
+    """
+    folder = Path(folder)
+    pose_times, poses = _read_poses(folder)
+    boxes = read_table(folder / ANNOTATIONS, _BOX_COLUMNS)
+    times = np.unique(boxes["timestamp_ns"])
+    if len(times) == 0:
+        raise UserError(
+            f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): "
+            "use a train or val log"
+        )
+    tracks = _tracks(boxes, times, categories, folder)
+    moments = _openlane_times(folder.name, openlane) if keyframes == "openlane_v2" else None
+    if keyframes == "annotations":
+        moments = times
+    elif moments is None:
+        moments = times[::_FRAMES_PER_KEYFRAME]
+    nearest = np.abs(moments[:, None] - times).argmin(-1)
+    return Log(
+        name=folder.name,
+        source="argoverse2",
+        map=read_map(folder / "map"),
+        timestamps_ns=times,
+        global_from_ego=_poses_at(times, pose_times, poses, folder),
+        tracks=tracks,
+        actors=tracks,
+        keyframes=tuple(
+            KeyFrame(int(t), pose, int(frame))
+            for t, pose, frame in zip(moments, _poses_at(moments, pose_times, poses, folder), nearest, strict=True)
+        ),
+        seed=zlib.crc32(folder.name.encode()),
+    )
+
+
+def read_table(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Read columns of a feather file; raise UserError naming the file and what it lacks."""
+    try:
+        import pyarrow
+        from pyarrow import feather
+    except ImportError as error:
+        raise UserError("reading Argoverse 2 needs pyarrow: pip install 'tflane_jax[data]'") from error
+    if not path.is_file():
+        raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
+    try:
+        table = feather.read_table(path)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise UserError(f"{path} is not a readable feather file ({error}): download it again") from error
+    missing = [c for c in columns if c not in table.column_names]
+    if missing:
+        raise UserError(f"{path} lacks the column(s) {', '.join(missing)}: it is no Argoverse 2 sensor-dataset file")
+    return {c: table[c].to_numpy() for c in columns}
+
+
+def _read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4)."""
+    table = read_table(folder / POSES, _POSE_COLUMNS)
+    order = np.argsort(table["timestamp_ns"], kind="stable")
+    return table["timestamp_ns"][order], _pose_of(table)[order]
+
+
+def _pose_of(table: dict[str, np.ndarray]) -> np.ndarray:
+    quaternion = np.stack([table[c] for c in ("qw", "qx", "qy", "qz")], -1)
+    return pose_matrix(matrix_from_quaternion(quaternion), np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1))
+
+
+def _poses_at(times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, folder: Path) -> np.ndarray:
+    """Return the poses whose timestamps are exactly `times`."""
+    if not len(pose_times):
+        raise UserError(f"{folder / POSES} holds no pose: download it again")
+    row = np.minimum(np.searchsorted(pose_times, times), len(pose_times) - 1)
+    missing = times[pose_times[row] != times]
+    if len(missing):
+        raise UserError(
+            f"{folder / POSES} has no pose at {len(missing)} of {len(times)} frames (first {missing[0]}): "
+            "annotations and poses are not of the same log; download both again"
+        )
+    return poses[row]
+
+
+def _tracks(
+    boxes: dict[str, Any], times: np.ndarray, categories: Mapping[str, RoadUser | None], folder: Path
+) -> Tracks:
+    names, category_row = np.unique(boxes["category"].astype(str), return_inverse=True)
+    unknown = [n for n in names if n not in categories]
+    if unknown:
+        raise UserError(
+            f"{folder / ANNOTATIONS} has the unknown category {', '.join(unknown)}: "
+            "say what road user it is in `categories`"
+        )
+    traffic = np.isin(category_row, [i for i, n in enumerate(names) if categories[n] is not None])
+    boxes = {name: column[traffic] for name, column in boxes.items()}
+    uuid, first, k = np.unique(boxes["track_uuid"].astype(str), return_index=True, return_inverse=True)
+    f = np.searchsorted(times, boxes["timestamp_ns"])
+    pose, shape = _pose_of(boxes), (len(times), len(uuid))
+    tracks = Tracks(
+        position=np.zeros((*shape, 3)),
+        yaw=np.zeros(shape),
+        size=np.stack([boxes[c][first] for c in ("length_m", "width_m", "height_m")], -1),
+        category=np.array([categories[c] for c in boxes["category"][first]], np.int32),
+        occluded=np.zeros(shape, bool),
+        valid=np.zeros(shape, bool),
+        uuid=uuid,
+    )
+    tracks.position[f, k] = pose[:, :3, 3]
+    tracks.yaw[f, k] = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
+    tracks.occluded[f, k] = boxes["num_interior_pts"] == 0
+    tracks.valid[f, k] = True
+    return tracks
+
+
+def _openlane_times(log_id: str, folder: Path | None) -> np.ndarray | None:
+    """Return the OpenLane-V2 timestamps of a log, None where the split files do not hold it."""
+    return None if folder is None else openlane_timestamps(folder).get(log_id)
+
+
+@functools.lru_cache(maxsize=4)
+def openlane_timestamps(folder: Path) -> dict[str, np.ndarray]:
+    """Return the frame timestamps (F,) int64 of every Argoverse 2 log that is a segment of OpenLane-V2 subset A.
+
+    Args:
+        folder: holds OpenLane-V2/data_dict_subset_A.json and subset_A_segment_to_av2_log.json (segment to log
+            id).
+    """
+    frames, logs = (_read_json(Path(folder) / name) for name in (_OPENLANE_SPLITS, _OPENLANE_LOGS))
+    return {
+        logs[split][segment]: np.sort([int(name.removesuffix(".json")) for name in names])
+        for split, segments in frames.items()
+        for segment, names in segments.items()
+        if segment in logs.get(split, {})
+    }
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"{path} is missing: it is one of the OpenLane-V2 split files") from error
+    except ValueError as error:
+        raise UserError(f"{path} is not valid json ({error})") from error
+
+
+def check_log(folder: Path) -> list[str]:
+    """Return what a log folder lacks, one sentence each; an empty list means that it can be read."""
+    folder, lacking = Path(folder), []
+    if not folder.is_dir():
+        return [f"{folder} is no folder"]
+    for name, columns in ((ANNOTATIONS, _BOX_COLUMNS), (POSES, _POSE_COLUMNS)):
+        try:
+            read_table(folder / name, columns)
+        except UserError as error:
+            lacking.append(str(error))
+    try:
+        read_map(folder / "map")
+    except UserError as error:
+        lacking.append(str(error))
+    if not lacking:
+        try:
+            load_log(folder)
+        except UserError as error:
+            lacking.append(str(error))
+    return lacking
+
+
+def find_logs(root: Path) -> list[Path]:
+    """Return the log folders, sorted by log id, below a dataset root, a split, a folder of logs, or in a log itself.
+
+    Raises UserError where there is none.
+    """
+    root = Path(root)
+    patterns = ("", "*", "*/*", "sensor/*/*")
+    found = {path.parent for p in patterns for path in root.glob(f"{p}/{ANNOTATIONS}".lstrip("/"))}
+    if not found:
+        raise UserError(
+            f"{root} holds no Argoverse 2 log: no {ANNOTATIONS} in it, in */, in */*/ or in sensor/<split>/<log>/"
+        )
+    return sorted(found, key=lambda path: path.name)
+
+
+@dataclass(frozen=True)
+class Argoverse2Config:
+    """Which logs, which of their moments, and how they become examples.
+
+    Attributes:
+        root: a dataset root (sensor/<split>/<log id>/), a split, a folder of logs, or one log.
+        keyframes, openlane: see `load_log`.
+        example: what is in an example, and its capacities.
+    """
+
+    root: Path
+    keyframes: Keyframes = "openlane_v2"
+    openlane: Path | None = None
+    example: ExampleConfig = field(default_factory=ExampleConfig)
+
+
+class Argoverse2Dataset:
+    """Examples of every log below a folder, by log id and then time.
+
+    Raises UserError where there is no log or one cannot be read.
+    """
+
+    name = "argoverse2"
+
+    def __init__(self, config: Argoverse2Config):
+        self.config = config
+        self.logs = tuple(
+            load_log(folder, keyframes=config.keyframes, openlane=config.openlane)
+            for folder in find_logs(config.root)
+        )
+        self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def example(self, index: int) -> Example:
+        """Return one example."""
+        log, keyframe = self._frames[index]
+        return make_example(log, keyframe, self.config.example)
+
+    def info(self, index: int) -> FrameInfo:
+        """Return log id, time and pose of one example."""
+        log, number = self._frames[index]
+        keyframe = log.keyframes[number]
+        return FrameInfo(log.source, log.name, keyframe.timestamp_ns, keyframe.global_from_ego)

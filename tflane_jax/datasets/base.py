@@ -1,0 +1,85 @@
+"""What every dataset offers, and the sizes of the examples that it makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.scene import Example
+from tflane_jax.world.bev_sensor import BevSensorConfig
+
+
+@dataclass(frozen=True)
+class ExampleConfig:
+    """Sizes and ranges of an `Example`.
+
+    The capacities hold the two Argoverse 2 logs at hand with room to spare (55 lane segments, 29 centerlines,
+    7 road boundaries, 114 traffic tracks of which 60 at once); what does not fit is left out, farthest first,
+    with a `TruncationWarning`.
+
+    Attributes:
+        range: in which lanes, areas and elements are truth.
+        sensor: bird's-eye-view evidence.
+        lanes, lane_points: merged centerlines and points on each.
+        segments, segment_points: lane segments and points on each.
+        areas, area_points: crossings with road boundaries and points on each.
+        history: frames N of traffic flow before the key frame.
+        tracks: instances K of traffic flow.
+        elements: traffic lights and signs.
+        bike_lanes: whether lanes closed to motor vehicles are truth.
+    """
+
+    range: PerceptionRange = PerceptionRange()
+    sensor: BevSensorConfig = BevSensorConfig()
+    lanes: int = 48
+    lane_points: int = 11
+    segments: int = 96
+    segment_points: int = 10
+    areas: int = 32
+    area_points: int = 20
+    history: int = 20
+    tracks: int = 96
+    elements: int = 24
+    bike_lanes: Literal["include", "exclude"] = "include"
+
+
+class TruncationWarning(UserWarning):
+    """Something in range found no room in an example."""
+
+
+@dataclass(frozen=True)
+class FrameInfo:
+    """Where an example comes from.
+
+    Attributes:
+        source: dataset name.
+        scene: log or scene name.
+        timestamp_ns: moment.
+        global_from_ego: (4, 4) float64 pose.
+    """
+
+    source: str
+    scene: str
+    timestamp_ns: int
+    global_from_ego: np.ndarray
+
+
+class Dataset(Protocol):
+    """Indexed examples as numpy arrays without a batch axis, all of one shape."""
+
+    name: str
+
+    def __len__(self) -> int:
+        """Return the number of examples."""
+        ...
+
+    def example(self, index: int) -> Example:
+        """Return one example; the same index always gives the same bits."""
+        ...
+
+    def info(self, index: int) -> FrameInfo:
+        """Return where an example comes from, without making it."""
+        ...

@@ -1,0 +1,134 @@
+"""Turn one moment of a `Log` into an `Example`: what the sensor and the priors say there, and the truth."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
+from tflane_jax.datasets.ground_truth import crop_areas, lane_graph, prepare_map, traffic_elements
+from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.logs import Log, Tracks
+from tflane_jax.scene import Example, TrafficFlow
+from tflane_jax.world.bev_sensor import hidden_cells, render_bev
+
+
+def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tuple[TrafficFlow, int]:
+    """Return the tracks of the last `history` frames strictly before the key frame's own, and how many instances
+    found no room (the farthest at their nearest).
+
+    Each frame's boxes are in the ego frame of that frame; TF-Lane Eq. (1) moves them into the key frame's.
+    Missing frames stand invalid at the front; instances that no frame holds are left out.
+    """
+    moment, tracks = log.keyframes[keyframe], log.tracks
+    frames = np.arange(max(moment.track_frame - history, 0), moment.track_frame)
+    flow = TrafficFlow.empty(capacity, history)
+    found = np.flatnonzero(tracks.valid[frames].any(0))
+    if not len(found):
+        return flow, 0
+    position, yaw = _moved(tracks, frames, found, log.global_from_ego, moment.global_from_ego)
+    valid = tracks.valid[frames[:, None], found]
+    distance = np.where(valid, np.linalg.norm(position[..., :2], axis=-1), np.inf).min(0)
+    kept = np.sort(np.argsort(distance, kind="stable")[:capacity])
+    n, rows = len(kept), found[kept]
+    window = slice(history - len(frames), history)
+    flow.position[:n, window] = position[:, kept].swapaxes(0, 1)
+    flow.yaw[:n, window] = yaw[:, kept].T
+    flow.size[:n] = tracks.size[rows]
+    flow.category[:n] = tracks.category[rows]
+    flow.occluded[:n, window] = tracks.occluded[frames[:, None], rows].T
+    flow.valid[:n, window] = valid[:, kept].T
+    return flow, len(found) - n
+
+
+def occluder_boxes(log: Log, keyframe: int) -> Float[np.ndarray, "k 7"]:
+    """Return every actor at the key frame as rows x, y, length, width, yaw, height, base_z = 0, ego frame.
+
+    The boxes stand on the flat ground on which line of sight is asked, whatever the slope of the real road.
+    """
+    moment, actors = log.keyframes[keyframe], log.actors
+    present = np.flatnonzero(actors.valid[moment.track_frame])
+    frames = np.array([moment.track_frame])
+    position, yaw = _moved(actors, frames, present, log.global_from_ego, moment.global_from_ego)
+    length, width, height = actors.size[present].T
+    return np.stack([*position[0, :, :2].T, length, width, yaw[0], height, np.zeros(len(present))], -1)
+
+
+def _moved(
+    tracks: Tracks, frames: np.ndarray, rows: np.ndarray, poses: np.ndarray, target: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (F, K, 3) and yaws (F, K) of some tracks in some frames, moved into the target's frame."""
+    target_from_frame = relative_pose(target, poses[frames])  # Eq. (1)
+    position = transform_points(target_from_frame, tracks.position[frames[:, None], rows])
+    yaw = tracks.yaw[frames[:, None], rows] + pose_yaw(target_from_frame)[:, None]
+    return position, (yaw + np.pi) % (2 * np.pi) - np.pi
+
+
+def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
+    """Return the example of one key frame: numpy arrays of the sizes in `config`, no batch axis.
+
+    A log without history (its first frame) or without road users gives a valid example with an empty traffic
+    flow. Warns (`TruncationWarning`) where something in range finds no room.
+    """
+    moment = log.keyframes[keyframe]
+    ego_from_global = invert_pose(moment.global_from_ego)
+    prepared = prepare_map(log.map, bike_lanes=config.bike_lanes == "include")
+    boxes, buildings = occluder_boxes(log, keyframe), _buildings(log, ego_from_global)
+    hidden = hidden_cells(config.sensor.grid, boxes, buildings)
+    lanes = lane_graph(
+        prepared.centerlines, ego_from_global, config.range,
+        capacity=config.lanes, points=config.lane_points, boxes=boxes, buildings=buildings,
+    )  # fmt: skip
+    segments = lane_graph(
+        prepared.segments, ego_from_global, config.range,
+        capacity=config.segments, points=config.segment_points, boxes=boxes, buildings=buildings,
+    )  # fmt: skip
+    areas, areas_dropped = crop_areas(
+        prepared, ego_from_global, config.range, capacity=config.areas, points=config.area_points
+    )
+    elements, elements_dropped = traffic_elements(
+        log.map, prepared, lanes, ego_from_global, config.range, capacity=config.elements
+    )
+    flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks)
+    _warn_dropped(
+        config, lanes=lanes.dropped, segments=segments.dropped, areas=areas_dropped,
+        elements=elements_dropped, tracks=tracks_dropped,
+    )  # fmt: skip
+    previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
+    return Example(
+        bev=render_bev(
+            prepared.samples, ego_from_global, boxes, buildings, hidden,
+            weather=log.weather, paint_wear=log.paint_wear, log_seed=log.seed, frame=keyframe,
+            config=config.sensor,
+        ),
+        hidden=hidden,
+        traffic_flow=flow,
+        markers=None,
+        sd_map=None,
+        lanes=lanes.graph,
+        segments=segments.graph,
+        areas=areas,
+        traffic_elements=elements,
+        previous_from_ego=relative_pose(previous.global_from_ego, moment.global_from_ego).astype(np.float32),
+        has_previous=np.asarray(keyframe > 0),
+    )  # fmt: skip
+
+
+def _buildings(log: Log, ego_from_global: np.ndarray) -> Float[np.ndarray, "b 5"]:
+    blocks = log.map.buildings
+    pose = ego_from_global @ yaw_pose(blocks[:, 0], blocks[:, 1], blocks[:, 4])
+    return np.stack([pose[:, 0, 3], pose[:, 1, 3], blocks[:, 2], blocks[:, 3], pose_yaw(pose)], -1)
+
+
+def _warn_dropped(config: ExampleConfig, **dropped: int) -> None:
+    for name, count in dropped.items():
+        if count:
+            # One text for all frames, so that Python's default filter shows it once.
+            warnings.warn(
+                f"more {name} in range than ExampleConfig.{name} = {getattr(config, name)}: "
+                "the farthest are left out",
+                TruncationWarning,
+                stacklevel=3,
+            )

@@ -90,7 +90,7 @@ def clip_to_range(points: Float[Array, "n d"], range_: PerceptionRange) -> list[
     points = np.asarray(points, np.float64)
     if len(points) > 1 and range_.contains(points).all():
         # The common case, several times faster than the general one below.
-        return [points] if arc_length(points)[-1] > 0.0 else []
+        return [points] if _has_length(points) else []
     a, b = points[:-1], points[1:]
     enter, leave, inside = _inside_interval(a, b, range_)
     enter_point, leave_point = (_on_segment(a, b, t, range_) for t in (enter, leave))
@@ -101,7 +101,11 @@ def clip_to_range(points: Float[Array, "n d"], range_: PerceptionRange) -> list[
     pieces = [
         np.concatenate([enter_point[i : i + 1], leave_point[i:j]]) for i, j in zip(starts, stops, strict=True)
     ]
-    return [p for p in pieces if arc_length(p)[-1] > 0.0]
+    return [p for p in pieces if _has_length(p)]
+
+
+def _has_length(points: np.ndarray) -> bool:
+    return bool((points[1:, :2] != points[:-1, :2]).any())
 
 
 def _inside_interval(

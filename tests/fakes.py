@@ -1,0 +1,120 @@
+"""Small made-up examples, predictions and a dataset, for tests that need no world."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.scene import Areas, Example, LaneGraph, LanePrediction, TrafficElements, TrafficFlow
+
+LANES, POINTS, USERS, FRAMES = 5, 4, 3, 6
+
+
+def fake_example(seed: int = 0, *, padding: float = 0.0) -> Example:
+    """Return an example with two lanes, two road users, one crossing and one light; `padding` fills unused floats."""
+    rng = np.random.default_rng([seed, 0])
+    lanes = LaneGraph.empty(LANES, POINTS)
+    for line in (lanes.points, lanes.left, lanes.right):
+        line[:] = padding
+        line[:2] = rng.uniform(-20, 20, (2, POINTS, 3))
+    lanes.visibility[:] = padding
+    lanes.visibility[:2] = 0.25, 1.0
+    lanes.valid[:2] = True
+    lanes.successor[0, 1] = True
+    flow = TrafficFlow.empty(USERS, FRAMES)
+    flow.position[:], flow.yaw[:], flow.size[:] = padding, padding, padding
+    flow.position[:2, 2:] = rng.uniform(-20, 20, (2, FRAMES - 2, 3))
+    flow.yaw[:2, 2:] = rng.uniform(-3, 3, (2, FRAMES - 2))
+    flow.size[:2] = 4.5, 2.0, 1.5
+    flow.category[:2] = 0, 5
+    flow.valid[:2, 2:] = True
+    flow.occluded[0, -1] = True
+    areas = Areas.empty(2, 5)
+    areas.points[:] = padding
+    areas.points[0] = [[5, -3, 0], [8, -3, 0], [8, 3, 0], [5, 3, 0], [5, -3, 0]]
+    areas.category[0], areas.valid[0] = 1, True
+    elements = TrafficElements.empty(2, LANES)
+    elements.position[:] = padding
+    elements.position[0] = 15.0, 4.0, 5.0
+    elements.category[0], elements.attribute[0], elements.valid[0] = 1, 2, True
+    hidden = np.zeros((10, 20), bool)
+    hidden[3:6, 4:9] = True
+    return Example(
+        bev=rng.integers(0, 256, (10, 20, 4), dtype=np.uint8), hidden=hidden, traffic_flow=flow, markers=None,
+        sd_map=None, lanes=lanes, segments=LaneGraph.empty(3, POINTS), areas=areas, traffic_elements=elements,
+        previous_from_ego=np.eye(4, dtype=np.float32), has_previous=np.asarray(seed % 2 == 1),
+    )  # fmt: skip
+
+
+def empty_example() -> Example:
+    """Return an example of the same shapes in which nothing is valid."""
+    example = fake_example()
+    parts = {name: getattr(example, name) for name in ("lanes", "areas", "traffic_flow", "traffic_elements")}
+    return example.replace(
+        bev=np.zeros_like(example.bev), hidden=np.zeros_like(example.hidden),
+        **{name: part.replace(valid=np.zeros_like(part.valid)) for name, part in parts.items()},
+    )  # fmt: skip
+
+
+def fake_prediction(seed: int = 0, *, queries: int = 6) -> LanePrediction:
+    """Return a prediction whose first two lanes are sure and linked."""
+    rng = np.random.default_rng([seed, 1])
+    logits = np.full((queries, 1), -4.0, np.float32)
+    logits[:2] = 2.0
+    links = np.full((queries, queries), -3.0, np.float32)
+    links[:1, 1:2] = 3.0
+    return LanePrediction(rng.uniform(-20, 20, (queries, POINTS, 3)).astype(np.float32), logits, links)
+
+
+@dataclass(frozen=True)
+class FakeConfig:
+    """How many examples, and one number that changes all of them."""
+
+    size: int = 3
+    seed: int = 0
+
+
+class FakeDataset:
+    """A dataset of fake examples that can be sent to worker processes."""
+
+    def __init__(self, config: FakeConfig):
+        self.config = config
+        self.name = "fake"
+
+    def __len__(self) -> int:
+        return self.config.size
+
+    def example(self, index: int) -> Example:
+        return fake_example(1000 * self.config.seed + index)
+
+    def info(self, index: int) -> FrameInfo:
+        pose = np.eye(4) * (1 + 1 / 3)
+        return FrameInfo("fake", f"scene {index // 2}", timestamp_ns=10**18 + index, global_from_ego=pose)
+
+
+class BrokenDataset(FakeDataset):
+    """Fails at its third example."""
+
+    def example(self, index: int) -> Example:
+        if index == 2:
+            raise RuntimeError("example 2 is broken")
+        return super().example(index)
+
+
+class DeadlyDataset(FakeDataset):
+    """Kills the process that makes its last example, as the system does when memory runs out."""
+
+    def example(self, index: int) -> Example:
+        if index == len(self) - 1:
+            import os
+
+            os._exit(9)
+        return super().example(index)
+
+
+class UnevenDataset(FakeDataset):
+    """Has examples of different shapes."""
+
+    def example(self, index: int) -> Example:
+        example = super().example(index)
+        return example if index == 0 else example.replace(bev=example.bev[1:])

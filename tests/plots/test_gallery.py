@@ -1,0 +1,68 @@
+import sys
+
+import numpy as np
+import pytest
+
+from tests.fakes import FakeConfig, FakeDataset, empty_example, fake_example, fake_prediction
+from tflane_jax.errors import UserError
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.gallery import save_examples, show_dataset
+from tflane_jax.scene import stack_examples
+
+pytest.importorskip("matplotlib")
+from matplotlib.image import imread
+
+EXAMPLES = stack_examples([fake_example(0, padding=np.nan), empty_example()])
+PREDICTIONS = stack_examples([fake_prediction(0), fake_prediction(1)])
+
+
+def colours(path) -> int:
+    return len(np.unique((imread(path)[..., :3] * 255).astype(np.uint8).reshape(-1, 3), axis=0))
+
+
+def test_one_row_for_each_example_and_one_column_for_each_model(tmp_path):
+    alone = save_examples(tmp_path / "new" / "alone.png", EXAMPLES)
+    both = save_examples(
+        tmp_path / "both.png", EXAMPLES, {"baseline": PREDICTIONS, "+TFM": PREDICTIONS}, titles=["a", "b"]
+    )
+    assert colours(alone) > 100
+    assert imread(both).shape[1] == 2 * imread(alone).shape[1]
+    assert imread(both).shape[0] == imread(alone).shape[0]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["both.png", "new"]
+
+
+def test_sizes_that_do_not_fit_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"2 examples, but .*'baseline': 1"):
+        save_examples(tmp_path / "a.png", EXAMPLES, {"baseline": stack_examples([fake_prediction()])})
+    with pytest.raises(ValueError, match="'titles': 1"):
+        save_examples(tmp_path / "a.png", EXAMPLES, titles=["only one"])
+
+
+@pytest.mark.parametrize(("size", "count"), [(1, 1), (1, 4), (5, 3)])
+def test_contact_sheet_shows_no_more_than_there_is(tmp_path, size, count):
+    out = show_dataset(FakeDataset(FakeConfig(size=size)), count, tmp_path / "sheet.png")
+    assert colours(out) > 100
+
+
+@pytest.mark.parametrize(("size", "count"), [(0, 3), (3, 0)])
+def test_nothing_to_show_is_an_error(tmp_path, size, count):
+    with pytest.raises(UserError, match="nothing to show"):
+        show_dataset(FakeDataset(FakeConfig(size=size)), count, tmp_path / "sheet.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(UserError, match=r"tflane_jax\[plot\]"):
+        new_figure()
+
+
+def test_a_failed_save_keeps_the_old_picture(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+    figure, _ = new_figure()
+    monkeypatch.setattr(figure, "savefig", lambda *_, **__: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        save_figure(figure, path)
+    assert path.read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 1

@@ -1,0 +1,43 @@
+import numpy as np
+
+from tests.fakes import empty_example, fake_example
+from tflane_jax.plots.summary import dataset_summary
+from tflane_jax.scene import stack_examples
+
+
+def summary(*examples) -> dict:
+    return {row["quantity"]: row for row in dataset_summary(stack_examples(list(examples)))}
+
+
+def test_quantities_are_counted_over_the_examples():
+    full = fake_example(1)
+    full.lanes.valid[:] = True
+    rows = summary(fake_example(0), full)
+    # Five slots for lanes: two used in the first example, all in the second; visibility is 0.25, 1, 0, 0, 0.
+    assert rows["lanes"] == {
+        "quantity": "lanes", "mean": 3.5, "least": 2, "most": 5, "capacity": 5, "full": 0.5,
+    }  # fmt: skip
+    assert rows["- hidden"]["mean"] == (1 + 4) / 2
+    assert rows["- share in line of sight"]["mean"] == np.mean([1.25 / 2, 1.25 / 5])
+    assert rows["- topology links"]["most"] == 1
+    assert rows["- crossings"]["mean"] == 1
+    assert rows["road users"]["most"] == 2
+    assert rows["- frames of each"]["mean"] == 4
+    assert rows["- share of boxes not seen"]["mean"] == 1 / 8
+    assert rows["share of ground out of sight"]["mean"] == 15 / 200
+
+
+def test_padding_changes_nothing():
+    assert summary(fake_example(0)) == summary(fake_example(0, padding=np.nan))
+
+
+def test_examples_without_a_quantity_do_not_count_in_its_mean():
+    rows = summary(fake_example(0), empty_example())
+    assert rows["- share in line of sight"]["mean"] == 1.25 / 2
+    assert rows["lanes"]["least"] == 0
+    assert summary(empty_example())["- frames of each"]["mean"] is None
+
+
+def test_what_a_dataset_does_not_offer_has_no_row():
+    bare = fake_example().replace(hidden=None, traffic_flow=None, traffic_elements=None)
+    assert not {"road users", "share of ground out of sight", "traffic lights and signs"} & set(summary(bare))

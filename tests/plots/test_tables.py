@@ -1,0 +1,54 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tflane_jax.plots.tables import format_table, save_table
+
+ROWS = [
+    {"model": "baseline", "DET_l": 0.25, "lanes": 7, "best": False},
+    {"model": "+TFM", "DET_l": np.float32(0.5), "lanes": np.int64(12), "best": True, "note": "a|b"},
+]
+
+
+def test_columns_are_aligned_and_numbers_stand_to_the_right():
+    assert format_table(ROWS, title="OpenLane-V2 v2.1") == "\n".join(
+        [
+            "OpenLane-V2 v2.1",
+            "",
+            "| model    | DET_l | lanes | best | note |",
+            "| -------- | ----: | ----: | ---- | ---- |",
+            "| baseline | 0.250 |     7 | no   | -    |",
+            "| +TFM     | 0.500 |    12 | yes  | a\\|b |",
+        ]
+    )
+
+
+def test_columns_and_decimals_are_chosen():
+    assert format_table(ROWS, ["DET_l", "model"], digits=1).splitlines()[2:] == [
+        "|   0.2 | baseline |",
+        "|   0.5 | +TFM     |",
+    ]
+
+
+@pytest.mark.parametrize(("value", "shown"), [(None, "-"), (math.nan, "n/a"), (math.inf, "inf"), ("a\nb", "a b")])
+def test_cells_without_a_number(value, shown):
+    assert format_table([{"x": value}]).splitlines()[-1].strip("| ") == shown
+
+
+def test_no_rows_is_a_table_without_rows():
+    assert format_table([], ["a"]) == "| a   |\n| --- |"
+    assert format_table([]).count("\n") == 1
+
+
+def test_both_files_hold_the_rows(tmp_path):
+    rows = [{"x": np.float64(1.5), "y": math.nan, "z": np.arange(2), "path": tmp_path}]
+    text, data = save_table(tmp_path / "deep" / "table.v1", rows, {"seed": np.int32(3)}, title="T")
+    assert text.name == "table.v1.md"
+    assert text.read_text().startswith("T\n\n|")
+    assert json.loads(data.read_text()) == {
+        "meta": {"seed": 3},
+        "rows": [{"x": 1.5, "y": None, "z": [0, 1], "path": str(tmp_path)}],
+    }
+    assert len(list(text.parent.iterdir())) == 2

@@ -1,0 +1,253 @@
+"""Datasets built once and kept on disk as memory-mappable arrays.
+
+An entry is a folder with one .npy file per leaf of `Example` and an `index.json`. Its name carries a
+fingerprint of the dataset's configuration and of the code that makes examples, so that a changed world never
+reads stale examples. Entries appear whole or not at all: they are built beside their place under a lock and
+renamed into it.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import errno
+import functools
+import hashlib
+import json
+import os
+import shutil
+import sys
+import tempfile
+import zlib
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+import tflane_jax
+from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.leaves import example_from_leaves
+from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Example
+
+# The code that decides what an example is, relative to the package.
+_SOURCES = ("scene.py", "logs.py", "geometry", "world", "datasets")
+
+
+class Cacheable(Dataset, Protocol):
+    """A dataset that its configuration describes completely, and that can be sent to worker processes
+    (pickle)."""
+
+    @property
+    def config(self) -> object:
+        """Frozen dataclass; its repr is part of the fingerprint."""
+        ...
+
+
+def cache_root() -> Path:
+    """Return the folder of all entries: $TFLANE_CACHE, or ~/.cache/tflane_jax."""
+    return Path(os.environ.get("TFLANE_CACHE") or Path.home() / ".cache" / "tflane_jax").expanduser()
+
+
+def cached(
+    dataset: Cacheable, *, root: Path | None = None, workers: int | None = None, progress: bool = True
+) -> CachedDataset:
+    """Return the dataset read from its cache entry, which is built first where it is missing or damaged.
+
+    Args:
+        dataset: what to keep; its examples all have the same shapes.
+        root: folder of the entries, default `cache_root()`.
+        workers: processes that build, default one per core; the result does not depend on it. More than one
+            needs the caller's script to be guarded by `if __name__ == "__main__":`.
+        progress: show a bar with rate and time left while building.
+
+    Raises:
+        UserError: an empty dataset, a full disk, a folder that cannot be written, a worker that died.
+    """
+    if len(dataset) == 0:
+        raise UserError(f"dataset {dataset.name} has no examples: ask for at least one scene")
+    root = cache_root() if root is None else root
+    mark = fingerprint(dataset)
+    folder = root / f"{dataset.name.replace('/', '-')}-{mark[:16]}"
+    with contextlib.suppress(DamagedEntry, FileNotFoundError):
+        return CachedDataset(folder)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with _only_builder(folder):
+            # Another process may have finished it while this one waited for the lock.
+            with contextlib.suppress(DamagedEntry, FileNotFoundError):
+                return CachedDataset(folder)
+            _build(dataset, folder, mark, workers or os.cpu_count() or 1, progress)
+    except OSError as error:
+        raise _explain(error, root) from error
+    return CachedDataset(folder)
+
+
+def fingerprint(dataset: Cacheable) -> str:
+    """Return the hash of everything that an entry depends on: configuration, code and numpy's version."""
+    digest = hashlib.sha256()
+    for text in (_kind(dataset), repr(dataset.config), np.__version__, source_digest()):
+        digest.update(text.encode() + b"\0")
+    return digest.hexdigest()
+
+
+def _kind(dataset: Dataset) -> str:
+    return f"{type(dataset).__module__}.{type(dataset).__qualname__}"
+
+
+@functools.cache
+def source_digest() -> str:
+    """Return the hash of the code that makes examples; comments, docstrings and layout do not count."""
+    package = Path(tflane_jax.__file__).parent
+    found = [path for name in _SOURCES for path in (package / name, *(package / name).rglob("*.py"))]
+    digest = hashlib.sha256()
+    for file in sorted(path for path in found if path.is_file()):
+        digest.update(file.relative_to(package).as_posix().encode() + b"\0")
+        digest.update(_code(file.read_text(encoding="utf-8")).encode() + b"\0")
+    return digest.hexdigest()
+
+
+def _code(source: str) -> str:
+    """Return a text that is the same for two sources that differ in comments, docstrings and layout only."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        documented = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+        if documented and ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:]
+    return ast.dump(tree)
+
+
+class DamagedEntry(Exception):
+    """A cache entry that is not whole."""
+
+
+class CachedDataset:
+    """A dataset read from a cache entry; arrays are memory-mapped and read when looked at.
+
+    Raises FileNotFoundError where there is no entry and `DamagedEntry` where a file is missing, truncated or
+    altered in length.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        if not folder.is_dir():
+            raise FileNotFoundError(f"no cache entry at {folder}")
+        try:
+            self._index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
+            self.name: str = self._index["name"]
+            self.config_text: str = self._index["config"]
+            self._scenes: list[str] = self._index["scenes"]
+            self._arrays = {name: self._map(name) for name in self._index["leaves"]}
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise DamagedEntry(f"{folder}: {error}") from error
+
+    def _map(self, name: str) -> np.ndarray:
+        path, expected = leaf_path(self.folder, name), self._index["leaves"][name]["bytes"]
+        if path.stat().st_size != expected:
+            raise ValueError(f"{path.name} has {path.stat().st_size} bytes, {expected} were written")
+        return np.load(path, mmap_mode="r")
+
+    def __len__(self) -> int:
+        return len(self._scenes)
+
+    def example(self, index: int) -> Example:
+        """Return one example, read from disk."""
+        return example_from_leaves({name: np.array(array[index]) for name, array in self._leaves().items()})
+
+    def info(self, index: int) -> FrameInfo:
+        """Return where one example comes from."""
+        return FrameInfo(
+            source=self._index["source"],
+            scene=self._scenes[index],
+            timestamp_ns=int(self._arrays["info.timestamp_ns"][index]),
+            global_from_ego=np.array(self._arrays["info.global_from_ego"][index]),
+        )
+
+    def arrays(self, parts: Collection[str] | None = None) -> Mapping[str, np.ndarray]:
+        """Read the leaves of all examples, (len, ...) each, into memory and check them against their
+        checksums.
+
+        Args:
+            parts: fields of `Example` to read, default all.
+
+        Raises UserError where the content of a file has changed since it was written.
+        """
+        read = {}
+        for name, array in self._leaves().items():
+            if parts is None or name.split(".")[0] in parts:
+                read[name] = np.array(array)
+                if zlib.crc32(read[name].reshape(-1).view(np.uint8)) != self._index["leaves"][name]["crc32"]:
+                    raise UserError(
+                        f"{leaf_path(self.folder, name)} is corrupt: delete {self.folder} and run again"
+                    )
+        return read
+
+    def _leaves(self) -> dict[str, np.ndarray]:
+        return {name: array for name, array in self._arrays.items() if not name.startswith("info.")}
+
+
+def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: bool) -> None:
+    """Build the entry beside its place and rename it into place."""
+    # Whoever holds the lock is the only builder, so what lies here was left behind by a build that was
+    # killed.
+    for stale in folder.parent.glob(f"{folder.name}.building-*"):
+        shutil.rmtree(stale, ignore_errors=True)
+    template, _ = frame_leaves(dataset, 0)
+    needed = len(dataset) * sum(leaf.nbytes for leaf in template.values())
+    if needed > shutil.disk_usage(folder.parent).free:
+        raise OSError(errno.ENOSPC, f"{dataset.name} needs {needed / 1e9:.2f} GB")
+    temporary = Path(tempfile.mkdtemp(prefix=f"{folder.name}.building-", dir=folder.parent))
+    try:
+        scenes = fill(temporary, dataset, template, workers=workers, progress=progress)
+        index = {
+            "name": dataset.name,
+            "source": dataset.info(0).source,
+            "kind": _kind(dataset),
+            "config": repr(dataset.config),
+            "fingerprint": mark,
+            "leaves": {name: _summary(leaf_path(temporary, name)) for name in template},
+            "scenes": scenes,
+        }
+        (temporary / "index.json").write_text(json.dumps(index, indent=1), encoding="utf-8")
+        if folder.exists():  # damaged
+            shutil.rmtree(folder)
+        temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _summary(path: Path) -> dict[str, int]:
+    """Return what tells whether a leaf's file is still whole."""
+    values = np.load(path, mmap_mode="r")
+    return {"bytes": path.stat().st_size, "crc32": zlib.crc32(values.reshape(-1).view(np.uint8))}
+
+
+@contextlib.contextmanager
+def _only_builder(folder: Path) -> Iterator[None]:
+    """Hold the entry's lock, which the system releases even where the process is killed."""
+    try:
+        import fcntl
+    except ImportError:
+        # Windows has no such locks: there, building one entry twice at once is not guarded against.
+        yield
+        return
+    with open(folder.with_name(folder.name + ".lock"), "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(f"waiting for another process that builds {folder.name}", file=sys.stderr)
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _explain(error: OSError, root: Path) -> Exception:
+    """Return a message with a remedy for a failure to write below `root`, and any other error as it is."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        remedy = "free space there, ask for fewer scenes, or set TFLANE_CACHE to a folder on another disk"
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):
+        remedy = "set TFLANE_CACHE to a folder that can be written"
+    else:
+        return error
+    return UserError(f"cannot keep the dataset in {root}: {error.strerror}; {remedy}")

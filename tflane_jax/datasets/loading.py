@@ -1,0 +1,112 @@
+"""Datasets as arrays in memory: one stacked `Example` with a leading axis, and batches gathered from it.
+
+The arrays are numpy and stay on the host; `take` hands a batch to the device. Parts that a model does not
+look at need not be read at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Int
+from tqdm import tqdm
+
+from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.cache import CachedDataset
+from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Areas, Example, LaneGraph
+
+# What training on merged centerlines looks at.
+TRAINING_PARTS = ("bev", "traffic_flow", "markers", "sd_map", "lanes", "previous_from_ego", "has_previous")
+# Fields of `Example` without which there is none.
+_ALWAYS = ("previous_from_ego", "has_previous")
+
+
+def load_arrays(dataset: Dataset, *, parts: Collection[str] | None = None, progress: bool = True) -> Example:
+    """Read a whole dataset into memory.
+
+    Args:
+        dataset: a `CachedDataset` is read at the speed of the disk, any other example by example.
+        parts: fields of `Example` to keep, default all; see `keep`.
+        progress: show a bar with rate and time left, where examples are made one by one.
+
+    Returns:
+        The examples stacked along a new first axis.
+
+    Raises:
+        UserError: the dataset is empty, or a cache file is corrupt.
+        ValueError: a name in `parts` is no field of `Example`, or examples differ in shape.
+    """
+    if len(dataset) == 0:
+        raise UserError(f"dataset {dataset.name} has no examples")
+    wanted = None if parts is None else _checked(parts)
+    if isinstance(dataset, CachedDataset):
+        leaves = dataset.arrays(wanted)
+    else:
+        leaves = _stacked(dataset, wanted, progress)
+    return _completed(example_from_leaves(leaves), len(dataset))
+
+
+def _stacked(dataset: Dataset, parts: Collection[str] | None, progress: bool) -> Mapping[str, np.ndarray]:
+    """Make every example and write it into place, so that memory holds the data once."""
+    leaves: dict[str, np.ndarray] = {}
+    bar = tqdm(range(len(dataset)), desc=f"loading {dataset.name}", unit="example", disable=not progress)
+    for index in bar:
+        for name, leaf in example_leaves(dataset.example(index)).items():
+            if parts is not None and name.split(".")[0] not in parts:
+                continue
+            if index == 0:
+                leaves[name] = np.empty((len(dataset), *leaf.shape), leaf.dtype)
+            elif leaves[name].shape[1:] != leaf.shape:
+                raise ValueError(
+                    f"{dataset.name}: {name} is {leaf.shape} in example {index} and "
+                    f"{leaves[name].shape[1:]} in example 0"
+                )
+            leaves[name][index] = leaf
+    return leaves
+
+
+def keep(arrays: Example, parts: Collection[str]) -> Example:
+    """Return the arrays without the fields that are not in `parts`.
+
+    A field that an `Example` cannot do without (`lanes`, `segments`, `areas`) stays with a capacity of zero,
+    the others become None. Raises ValueError for a name that is no field of `Example`.
+    """
+    wanted = _checked(parts)
+    dropped = {name: None for name in Example.__dataclass_fields__ if name not in wanted}
+    return _completed(replace(arrays, **dropped), count(arrays))
+
+
+def for_training(arrays: Example) -> Example:
+    """Return the arrays without what only evaluation and pictures look at (`TRAINING_PARTS` stay)."""
+    return keep(arrays, TRAINING_PARTS)
+
+
+def count(arrays: Example) -> int:
+    """Return the number of stacked examples."""
+    return len(arrays.has_previous)
+
+
+def take(arrays: Example, indices: Int[np.ndarray, "*b"]) -> Example:
+    """Return the examples at `indices`, which may repeat, as a batch with their shape as leading axes (a
+    copy)."""
+    return jax.tree.map(lambda leaf: np.take(leaf, indices, axis=0), arrays)
+
+
+def _checked(parts: Collection[str]) -> frozenset[str]:
+    unknown = set(parts) - set(Example.__dataclass_fields__)
+    if unknown:
+        raise ValueError(f"no field of Example: {', '.join(sorted(unknown))}")
+    return frozenset(parts).union(_ALWAYS)
+
+
+def _completed(arrays: Example, size: int) -> Example:
+    """Return the arrays with a graph or set of capacity zero where a field that must be there is None."""
+    empty = {"lanes": LaneGraph.empty(0, 2), "segments": LaneGraph.empty(0, 2), "areas": Areas.empty(0, 2)}
+    missing = {name: part for name, part in empty.items() if getattr(arrays, name) is None}
+    stacked = jax.tree.map(lambda leaf: np.zeros((size, *leaf.shape), leaf.dtype), missing)
+    return replace(arrays, **stacked)

@@ -1,0 +1,209 @@
+"""Filling .npy files with the examples of a dataset, in parallel worker processes.
+
+Every example has its own slot in files laid out beforehand, so that the bytes do not depend on the number of
+workers or on the order in which they finish, and no array travels between processes. Slots are written with
+plain `write`, not through memory maps: on a full disk a write raises OSError where a memory map kills the
+process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.leaves import example_leaves
+from tflane_jax.errors import UserError
+
+# Examples handed to a worker at a time. Divisible by scenes of 1, 2, 3, 4, 6, 8 and 12 frames, which are then
+# made once.
+BLOCK = 24
+
+# What a worker runs in: one core each, and never the accelerator of the training process.
+_WORKER_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "JAX_PLATFORMS": "cpu",
+}
+
+
+def frame_leaves(dataset: Dataset, index: int) -> tuple[dict[str, np.ndarray], str]:
+    """Return the arrays of one example, with those of its `FrameInfo` under "info.", and its scene's name."""
+    info = dataset.info(index)
+    leaves = example_leaves(dataset.example(index))
+    leaves["info.timestamp_ns"] = np.asarray(info.timestamp_ns, np.int64)
+    leaves["info.global_from_ego"] = np.asarray(info.global_from_ego, np.float64)
+    return leaves, info.scene
+
+
+def leaf_path(folder: Path, name: str) -> Path:
+    """Return the file that holds the leaf of that name for every example."""
+    return folder / f"{name}.npy"
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where a leaf's file holds its values, and what each example's value is.
+
+    Attributes:
+        start: bytes before the first example's value.
+        shape, dtype: of one example's value.
+    """
+
+    start: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What every worker needs to know."""
+
+    folder: Path
+    dataset: Dataset
+    slots: dict[str, Slot]
+
+
+def fill(
+    folder: Path, dataset: Dataset, template: dict[str, np.ndarray], *, workers: int, progress: bool
+) -> list[str]:
+    """Write every example of `dataset` below `folder`, one .npy file per leaf, and return each one's scene
+    name.
+
+    Args:
+        folder: empty.
+        dataset: what to write.
+        template: `frame_leaves` of any example, for names, shapes and types.
+        workers: processes; with one, or no more examples than a block, this process does the work itself.
+        progress: show a bar with rate and time left.
+
+    Raises OSError (disk full, no permission), whatever the dataset raises, ValueError where examples differ
+    in shape, and UserError where a worker dies.
+    """
+    count = len(dataset)
+    slots = {name: _lay_out(folder, name, leaf, count) for name, leaf in template.items()}
+    job = _Job(folder, dataset, slots)
+    blocks = [range(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
+    scenes: dict[int, str] = {}
+    with tqdm(total=count, desc=f"building {dataset.name}", unit="example", disable=not progress) as bar:
+        for indices, names in _run(job, blocks, min(workers, len(blocks))):
+            scenes.update(zip(indices, names, strict=True))
+            bar.update(len(indices))
+    return [scenes[index] for index in range(count)]
+
+
+def _lay_out(folder: Path, name: str, leaf: np.ndarray, count: int) -> Slot:
+    """Create the leaf's file at its full size (sparse, all zero) and return where its slots are."""
+    header = {
+        "descr": np.lib.format.dtype_to_descr(leaf.dtype),
+        "fortran_order": False,
+        "shape": (count, *leaf.shape),
+    }
+    with open(leaf_path(folder, name), "wb") as file:
+        np.lib.format.write_array_header_2_0(file, header)
+        start = file.tell()
+        file.truncate(start + count * leaf.nbytes)
+    return Slot(start, leaf.shape, leaf.dtype)
+
+
+def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, list[str]]]:
+    """Yield indices and the scene names of their examples as they are finished."""
+    if workers <= 1:
+        for index in itertools.chain.from_iterable(blocks):
+            one = range(index, index + 1)
+            yield one, _write_examples(job, one)
+        return
+    # Not fork: jax runs threads, and a fork of a process with threads may deadlock.
+    context = multiprocessing.get_context("spawn")
+    with _environment(_WORKER_ENVIRONMENT):
+        pool = ProcessPoolExecutor(workers, context, _start_worker, (job,))
+        try:
+            futures = {pool.submit(_write_block, block): block for block in blocks}
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise UserError(
+                "a worker process that builds the dataset died: either memory ran out (use fewer workers), or a "
+                'script started the build outside `if __name__ == "__main__":` (workers import the script)'
+            ) from error
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Set environment variables, which child processes inherit, for as long as the block lasts."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _write_examples(job: _Job, indices: range) -> list[str]:
+    """Write these examples into their slots and return the names of their scenes."""
+    scenes = []
+    with contextlib.ExitStack() as stack:
+        files = {name: stack.enter_context(open(leaf_path(job.folder, name), "r+b")) for name in job.slots}
+        for index in indices:
+            leaves, scene = frame_leaves(job.dataset, index)
+            _check(job, index, leaves)
+            for name, leaf in leaves.items():
+                files[name].seek(job.slots[name].start + index * leaf.nbytes)
+                files[name].write(leaf.tobytes())
+            scenes.append(scene)
+    return scenes
+
+
+def _check(job: _Job, index: int, leaves: dict[str, np.ndarray]) -> None:
+    """Raise ValueError where an example is not made like the first one."""
+    found = {name: (leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
+    expected = {name: (slot.shape, slot.dtype) for name, slot in job.slots.items()}
+    for name in sorted(found.keys() | expected.keys()):
+        if found.get(name) != expected.get(name):
+            raise ValueError(
+                f"{job.dataset.name}: {name} is {found.get(name)} in example {index} and {expected.get(name)} "
+                "in example 0; all examples of a dataset have the same shapes"
+            )
+
+
+_worker_job: _Job
+
+
+def _start_worker(job: _Job) -> None:
+    global _worker_job
+    _worker_job = job
+    # Ctrl-C reaches the whole process group; only the parent reacts, and ends the pool in order.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when the parent is killed, which a worker waiting for its next block would never
+    notice."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _write_block(indices: range) -> list[str]:
+    return _write_examples(_worker_job, indices)

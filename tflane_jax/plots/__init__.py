@@ -1,0 +1,33 @@
+"""Pictures and tables. matplotlib (extra `plot`) is imported when the first figure is made, not with this
+package."""
+
+from tflane_jax.plots.attention import (
+    draw_attention_matrix,
+    draw_lane_attention,
+    draw_spatial_mask,
+    draw_temporal_mask,
+)
+from tflane_jax.plots.bev import draw_prediction, draw_scene
+from tflane_jax.plots.curves import save_curves
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.gallery import add_legend, save_examples, show_dataset
+from tflane_jax.plots.summary import dataset_summary
+from tflane_jax.plots.tables import format_table, save_table
+
+__all__ = [
+    "add_legend",
+    "dataset_summary",
+    "draw_attention_matrix",
+    "draw_lane_attention",
+    "draw_prediction",
+    "draw_scene",
+    "draw_spatial_mask",
+    "draw_temporal_mask",
+    "format_table",
+    "new_figure",
+    "save_curves",
+    "save_examples",
+    "save_figure",
+    "save_table",
+    "show_dataset",
+]

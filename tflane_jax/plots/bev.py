@@ -1,0 +1,271 @@
+"""Scenes and predictions from above: x (forward) to the right, y (left) upward, metres.
+
+Each `draw_*` adds one layer to a matplotlib `Axes`, and `draw_scene` puts the usual ones together. Only valid
+entries are drawn: padding may hold anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt8
+from numpy.typing import ArrayLike
+
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.plots import style
+from tflane_jax.scene import (
+    Areas,
+    AreaType,
+    Example,
+    LaneGraph,
+    LanePrediction,
+    RoadUser,
+    TrafficElements,
+    TrafficFlow,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Layer = Literal["evidence", "hidden", "areas", "lanes", "traffic", "elements"]
+# The ground that rasters cover, and the part of it that is shown.
+GROUND = BevGrid().range
+VIEW = PerceptionRange()
+
+ALL_LAYERS: tuple[Layer, ...] = ("evidence", "hidden", "areas", "lanes", "traffic", "elements")
+
+
+def draw_scene(
+    ax: Axes,
+    example: Example,
+    *,
+    layers: Collection[Layer] = ALL_LAYERS,
+    ground: PerceptionRange = GROUND,
+    view: PerceptionRange = VIEW,
+    title: str = "",
+) -> None:
+    """Draw one example (no batch axis): the given layers, the ego vehicle, and axes in metres.
+
+    Args:
+        ax: where to draw.
+        example: a layer that it does not have is skipped.
+        layers: what to draw; the order is fixed.
+        ground: what `example.bev` and `example.hidden` cover.
+        view: the ground to show.
+        title: above the picture.
+    """
+    prepare(ax, view, title)
+    if "evidence" in layers and example.bev is not None:
+        draw_evidence(ax, example.bev, ground)
+    if "hidden" in layers and example.hidden is not None:
+        draw_hidden(ax, example.hidden, ground)
+    if "areas" in layers:
+        draw_areas(ax, example.areas)
+    if "lanes" in layers:
+        draw_lanes(ax, example.lanes)
+    if "traffic" in layers and example.traffic_flow is not None:
+        draw_traffic(ax, example.traffic_flow)
+    if "elements" in layers and example.traffic_elements is not None:
+        draw_elements(ax, example.traffic_elements)
+    draw_ego(ax)
+
+
+def prepare(ax: Axes, view: PerceptionRange = VIEW, title: str = "") -> None:
+    """Set up empty ground: limits, equal scale, a faint grid."""
+    ax.set_facecolor(style.ROAD)
+    ax.set(xlim=view.x, ylim=view.y, aspect="equal")
+    ax.set_title(title, fontsize=9, loc="left")
+    ax.tick_params(labelsize=7, length=2)
+    ax.grid(color=style.GRID, linewidth=0.4, zorder=0)
+    ax.set_axisbelow(True)
+
+
+def draw_evidence(
+    ax: Axes, bev: UInt8[Array, "h w c"], ground: PerceptionRange = GROUND, *, strength: float = 1.0
+) -> None:
+    """Draw the evidence raster (H, W, C) uint8 as light on dark ground; `strength` 0 to 1 dims it."""
+    from matplotlib.colors import to_rgb
+
+    colour = np.asarray([style.EVIDENCE[channel] for channel in style.EVIDENCE], np.float32)
+    light = np.asarray(bev, np.float32)[..., list(style.EVIDENCE)] / 255.0 * strength
+    # Each channel covers the ground by its own evidence, like thin layers of paint: one does not erase
+    # another.
+    road = np.asarray(to_rgb(style.ROAD), np.float32)
+    shown = 1.0 - (1.0 - road) * np.prod(1.0 - light[..., None] * colour, axis=-2)
+    ax.imshow(shown, extent=_extent(ground), origin="lower", interpolation="bilinear", zorder=0.5)
+
+
+def draw_hidden(ax: Axes, hidden: Bool[Array, "h w"], ground: PerceptionRange = GROUND) -> None:
+    """Darken and hatch the ground that no ray reaches."""
+    from matplotlib.colors import ListedColormap
+
+    dark = np.asarray(hidden, bool)
+    if not dark.any():
+        return
+    shade = np.ma.masked_where(~dark, np.ones(dark.shape))
+    ax.imshow(
+        shade, extent=_extent(ground), origin="lower", cmap=ListedColormap(["black"]), alpha=0.45, zorder=0.8
+    )
+    filled = ax.contourf(
+        dark.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"], extent=_extent(ground), origin="lower"
+    )
+    # Without an edge colour of its own the hatch takes the global default, black on black.
+    filled.set(edgecolor=style.HATCH, linewidth=0.0, zorder=0.9)
+
+
+def draw_areas(ax: Axes, areas: Areas) -> None:
+    """Draw crossings (outlined) and road boundaries."""
+    points, category = _rows(areas.valid, areas.points, areas.category)
+    _lines(ax, points[category == AreaType.ROAD_BOUNDARY], "#7f8da3", width=1.0, zorder=1.0)
+    _lines(ax, points[category == AreaType.PEDESTRIAN_CROSSING], "#b9a5e2", width=0.9, zorder=1.1)
+
+
+def draw_lanes(
+    ax: Axes, lanes: LaneGraph, *, colour: str | None = None, width: float = 1.5, alpha: float = 1.0
+) -> None:
+    """Draw truth lanes with arrows in driving direction, by default coloured by visibility (hidden to
+    clear)."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    points, visibility = _rows(lanes.valid, lanes.points, lanes.visibility)
+    by_visibility = LinearSegmentedColormap.from_list("visibility", [style.LANE_HIDDEN, style.LANE_CLEAR])
+    colours = by_visibility(np.clip(visibility, 0.0, 1.0)) if colour is None else colour
+    _lines(ax, points, colours, width=width, alpha=alpha, zorder=3.0)
+    _arrows(ax, points, colours, alpha=alpha, zorder=3.1)
+
+
+def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
+    """Draw tracks: a trail that fades with age and the box of the latest frame, empty where it was not
+    seen."""
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.colors import to_rgba_array
+
+    known = np.asarray(flow.valid).any(-1)
+    position, yaw, size, category, occluded, valid = _rows(
+        known, flow.position, flow.yaw, flow.size, flow.category, flow.occluded, flow.valid
+    )
+    if len(valid) == 0:
+        return
+    colours = to_rgba_array([style.ROAD_USER[RoadUser(c)] for c in category])
+    frames = valid.shape[1]
+    who, when = np.nonzero(valid[:, 1:] & valid[:, :-1])
+    trail = np.stack([position[who, when, :2], position[who, when + 1, :2]], 1)
+    fading = colours[who]
+    fading[:, 3] = 0.08 + 0.8 * (when + 1) / max(frames - 1, 1)
+    ax.add_collection(LineCollection(list(trail), colors=fading, linewidths=1.4, zorder=4.0))
+
+    each, last = np.arange(len(valid)), frames - 1 - np.argmax(valid[:, ::-1], axis=1)
+    boxes = box_corners(position[each, last, :2], yaw[each, last], size[:, :2])
+    filled = colours.copy()
+    filled[:, 3] = np.where(occluded[each, last], 0.0, 0.55)
+    ax.add_collection(
+        PolyCollection(list(boxes), facecolors=filled, edgecolors=colours, linewidths=0.9, zorder=4.1)
+    )
+
+
+def draw_elements(ax: Axes, elements: TrafficElements) -> None:
+    """Draw traffic lights (round, in the colour that they show) and signs (square)."""
+    position, category, attribute = _rows(
+        elements.valid, elements.position, elements.category, elements.attribute
+    )
+    for kind, marker in ((1, "o"), (2, "s")):
+        mine = category == kind
+        colours = [style.LIGHT.get(int(a), style.OTHER_ELEMENT) if kind == 1 else style.OTHER_ELEMENT
+                   for a in attribute[mine]]  # fmt: skip
+        ax.scatter(
+            position[mine, 0], position[mine, 1], c=colours, marker=marker, s=22, edgecolors="black",
+            linewidths=0.6, zorder=5.0,
+        )  # fmt: skip
+
+
+def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
+    """Draw the ego vehicle (length, width in metres) at the origin, heading along x."""
+    from matplotlib.collections import PolyCollection
+
+    body = box_corners(np.zeros((1, 2)), np.zeros(1), np.asarray([size]))
+    ax.add_collection(
+        PolyCollection(list(body), facecolors=style.EGO, edgecolors="black", linewidths=0.6, zorder=6.0)
+    )
+    nose = np.asarray([[[1.6, 0.0], [0.2, 0.7], [0.2, -0.7]]])
+    ax.add_collection(PolyCollection(list(nose), facecolors=style.ROAD, zorder=6.1))
+
+
+def draw_prediction(ax: Axes, prediction: LanePrediction, *, threshold: float = 0.3) -> None:
+    """Draw the lanes that score at least `threshold`, stronger the higher they score, and their topology.
+
+    A link runs from the end of a lane to the start of its successor, where the model holds that more likely
+    than not.
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba
+
+    scores = np.asarray(prediction.scores)
+    chosen = scores >= threshold
+    points = np.asarray(prediction.points)[chosen]
+    colours = np.tile(to_rgba(style.PREDICTION), (len(points), 1))
+    colours[:, 3] = 0.25 + 0.75 * scores[chosen]
+    _lines(ax, points, colours, width=1.7, zorder=3.5)
+    _arrows(ax, points, colours, zorder=3.6)
+    # A logit of zero is a probability of one half.
+    before, after = np.nonzero(np.asarray(prediction.successor_logits)[np.ix_(chosen, chosen)] > 0.0)
+    links = np.stack([points[before, -1, :2], points[after, 0, :2]], 1)
+    ax.add_collection(LineCollection(list(links), colors=style.LINK, linewidths=1.1, zorder=3.7))
+    joints = links.mean(1)
+    ax.scatter(joints[:, 0], joints[:, 1], s=7, c=style.LINK, linewidths=0, zorder=3.8)
+
+
+def box_corners(
+    centre: Float[np.ndarray, "k 2"], yaw: Float[np.ndarray, " k"], size: Float[np.ndarray, "k 2"]
+) -> Float[np.ndarray, "k 4 2"]:
+    """Return the corners of boxes of (length, width) turned by `yaw`, counter-clockwise from front left."""
+    corners = np.asarray([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]) * size[:, None]
+    return _turned(corners, yaw) + centre[:, None]
+
+
+def _turned(
+    shapes: Float[np.ndarray, "#k n 2"], angle: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k n 2"]:
+    """Return each shape turned about the origin by its angle, counter-clockwise."""
+    along = np.stack([np.cos(angle), np.sin(angle)], -1)[:, None]
+    across = np.stack([-np.sin(angle), np.cos(angle)], -1)[:, None]
+    return shapes[..., :1] * along + shapes[..., 1:] * across
+
+
+def _extent(ground: PerceptionRange) -> tuple[float, float, float, float]:
+    return (*ground.x, *ground.y)
+
+
+def _rows(valid: ArrayLike, *arrays: ArrayLike) -> list[np.ndarray]:
+    """Return the valid rows of each array."""
+    chosen = np.asarray(valid, bool)
+    return [np.asarray(array)[chosen] for array in arrays]
+
+
+def _lines(ax: Axes, points: np.ndarray, colours, *, width: float, zorder: float, alpha: float = 1.0) -> None:
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import to_rgba_array
+
+    shown = to_rgba_array(colours)
+    shown[:, 3] *= alpha
+    ax.add_collection(
+        LineCollection(list(points[..., :2]), colors=shown, linewidths=width, capstyle="round", zorder=zorder)
+    )
+
+
+def _arrows(ax: Axes, points: np.ndarray, colours, *, zorder: float, alpha: float = 1.0) -> None:
+    """Draw an arrow head in the middle of each line of at least two points."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgba_array
+
+    if len(points) == 0 or points.shape[1] < 2:
+        return
+    middle = points.shape[1] // 2
+    tip, tail = points[:, middle, :2], points[:, middle - 1, :2]
+    heading = np.arctan2(tip[:, 1] - tail[:, 1], tip[:, 0] - tail[:, 0])
+    head = np.asarray([[[1.0, 0.0], [-0.9, 0.75], [-0.9, -0.75]]])
+    shown = to_rgba_array(colours)
+    shown[:, 3] *= alpha
+    triangles = _turned(head, heading) + tip[:, None]
+    ax.add_collection(PolyCollection(list(triangles), facecolors=shown, linewidths=0, zorder=zorder))

@@ -1,0 +1,61 @@
+"""Making and saving figures without matplotlib's global state, so that it works in threads and without a
+display.
+
+matplotlib is imported when the first figure is made: it takes a second and is an optional extra.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tflane_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def new_figure(
+    rows: int = 1, columns: int = 1, *, panel: tuple[float, float] = (4.0, 3.0), footer: float = 0.0
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its (rows, columns) array of axes.
+
+    Args:
+        rows, columns: of panels.
+        panel: width and height of one panel, inches.
+        footer: further height for a legend, inches.
+
+    Raises UserError where matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError(
+            "pictures need matplotlib: install the extra with `pip install 'tflane_jax[plot]'`"
+        ) from error
+    figure = Figure((columns * panel[0], rows * panel[1] + footer), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
+    """Write the figure in the format of the file's suffix, all or nothing, and return the path."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        figure.savefig(temporary, dpi=dpi, format=path.suffix.removeprefix(".") or "png")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def hide_unused(axes: np.ndarray, used: int) -> None:
+    """Blank the panels of a grid after the first `used`, in reading order."""
+    ax: Axes
+    for ax in axes.flat[used:]:
+        ax.set_axis_off()

@@ -1,0 +1,165 @@
+"""Pages of pictures: predictions beside the truth, and a contact sheet of a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeVar
+
+import jax
+import numpy as np
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.plots import style
+from tflane_jax.plots.bev import (
+    GROUND,
+    VIEW,
+    draw_ego,
+    draw_evidence,
+    draw_lanes,
+    draw_prediction,
+    draw_scene,
+    prepare,
+)
+from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+from tflane_jax.scene import Example, LanePrediction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tflane_jax.datasets.base import Dataset
+
+_PANEL_WIDTH = 4.8  # inches
+
+Tree = TypeVar("Tree")
+
+
+def save_examples(
+    path: Path,
+    examples: Example,
+    predictions: Mapping[str, LanePrediction] | None = None,
+    *,
+    titles: Sequence[str] = (),
+    ground: PerceptionRange = GROUND,
+    view: PerceptionRange = VIEW,
+    threshold: float = 0.3,
+) -> Path:
+    """Write one row per example: truth | evidence and traffic | one column per model.
+
+    Args:
+        path: .png, .pdf or .svg.
+        examples: B of them, stacked along a leading axis.
+        predictions: by the name of the model, stacked in the same way.
+        titles: one per row; default their numbers.
+        ground, view: see `draw_scene`.
+        threshold: lowest score of a lane that is drawn.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: the numbers of examples, predictions and titles differ.
+    """
+    predictions = predictions or {}
+    count = len(examples.has_previous)
+    titles = titles or [f"example {row}" for row in range(count)]
+    sizes = {"titles": len(titles)} | {name: len(stacked.points) for name, stacked in predictions.items()}
+    if any(size != count for size in sizes.values()):
+        raise ValueError(f"{count} examples, but {sizes}")
+    figure, axes = new_figure(count, 2 + len(predictions), panel=_panel(view), footer=0.5)
+    for row, title in enumerate(titles):
+        example, (truth, seen, *columns) = _pick(examples, row), axes[row]
+        draw_scene(
+            truth, example, layers=("hidden", "areas", "lanes", "elements"), ground=ground, view=view,
+            title=f"{title}: truth",
+        )  # fmt: skip
+        draw_scene(
+            seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
+        )
+        for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
+            prepare(ax, view, name)
+            if example.bev is not None:
+                draw_evidence(ax, example.bev, ground, strength=0.3)
+            draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
+            draw_prediction(ax, _pick(stacked, row), threshold=threshold)
+            draw_ego(ax)
+    _label(axes)
+    add_legend(figure, "with predictions" if predictions else "scenes")
+    return save_figure(figure, path)
+
+
+def show_dataset(
+    dataset: Dataset, count: int, out: Path, *, ground: PerceptionRange = GROUND, view: PerceptionRange = VIEW
+) -> Path:
+    """Write a contact sheet of `count` examples spread evenly over the dataset (all of them if it has fewer).
+
+    Each gets two panels, truth and what is seen. Raises UserError for an empty dataset or no pictures asked
+    for.
+    """
+    if len(dataset) == 0 or count < 1:
+        raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} examples, {count} asked for")
+    chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).round().astype(int))
+    pairs = 2 if len(chosen) > 1 else 1
+    figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=_panel(view), footer=0.5)
+    for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
+        example, info = dataset.example(index), dataset.info(index)
+        draw_scene(
+            truth, example, layers=("hidden", "areas", "lanes", "elements"), ground=ground, view=view,
+            title=f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s: truth",
+        )  # fmt: skip
+        draw_scene(
+            seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
+        )
+    hide_unused(axes, 2 * len(chosen))
+    _label(axes)
+    add_legend(figure, "scenes")
+    return save_figure(figure, out)
+
+
+def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes") -> None:
+    """Put the meaning of all colours below the panels, once for the whole figure."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    entries: list = [
+        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in view"),
+        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane hidden"),
+        Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
+        *(Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()),
+        Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"),
+        *(
+            Patch(facecolor=colour, label=f"evidence: {channel.name.lower().replace('_', ' ')}")
+            for channel, colour in style.EVIDENCE.items()
+        ),
+    ]
+    if kind == "with predictions":
+        entries += [
+            Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
+            Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
+            Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
+        ]
+    columns = min(len(entries), max(4, int(figure.get_figwidth() // 1.6)))
+    figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
+
+
+def _panel(view: PerceptionRange) -> tuple[float, float]:
+    """Width and height of a panel in inches; the title and the axis take 0.35."""
+    width, height = view.size(2)
+    return _PANEL_WIDTH, _PANEL_WIDTH * height / width + 0.35
+
+
+def _label(axes: np.ndarray) -> None:
+    """Name the axes along the left and lower edge of the grid and leave the other panels bare."""
+    for ax in axes[-1]:
+        ax.set_xlabel("x, forward [m]", fontsize=8)
+    for ax in axes[:-1].flat:
+        ax.tick_params(labelbottom=False)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y, left [m]", fontsize=8)
+    for ax in axes[:, 1:].flat:
+        ax.tick_params(labelleft=False)
+
+
+def _pick(stacked: Tree, row: int) -> Tree:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

@@ -1,0 +1,38 @@
+"""Colours of the pictures: a dark road seen from above, and one meaning for each colour throughout the
+project."""
+
+from __future__ import annotations
+
+from tflane_jax.scene import BevChannel, RoadUser
+
+ROAD = "#1b1f27"
+GRID = "#39404d"
+HATCH = "#5a6373"
+EGO = "#ffffff"
+PREDICTION = "#4dd2ff"
+LINK = "#ff5fd2"
+
+# A truth lane is drawn between these two by the share of it in direct line of sight.
+LANE_CLEAR = "#8be28b"
+LANE_HIDDEN = "#ff9d3c"
+
+# What each channel of the evidence adds to the picture at full strength (red, green, blue, 0 to 1).
+EVIDENCE = {
+    BevChannel.LANE_PAINT: (1.00, 0.93, 0.68),
+    BevChannel.ROAD_EDGE: (0.28, 0.50, 0.78),
+    BevChannel.CROSSING: (0.52, 0.42, 0.70),
+    BevChannel.OBSTACLE: (0.80, 0.27, 0.25),
+}
+
+ROAD_USER = {
+    RoadUser.CAR: "#6ea8fe",
+    RoadUser.TRUCK: "#f2b84b",
+    RoadUser.BUS: "#f07167",
+    RoadUser.MOTORCYCLE: "#c792ea",
+    RoadUser.BICYCLE: "#4fd1c5",
+    RoadUser.PEDESTRIAN: "#f6e58d",
+}
+
+# OpenLane-V2 attributes of a traffic light; any other state or element is drawn in grey.
+LIGHT = {1: "#ff3b30", 2: "#34c759", 3: "#ffcc00"}
+OTHER_ELEMENT = "#c8ccd4"

@@ -1,0 +1,99 @@
+"""Tables that read well on a terminal and as Markdown, and their JSON twins."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Row = Mapping[str, Any]
+
+
+def format_table(
+    rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str = "", digits: int = 3
+) -> str:
+    """Return the rows as an aligned Markdown table, numbers to the right.
+
+    Args:
+        rows: cells by column; a missing one or None is shown as "-", NaN as "n/a".
+        columns: which and in which order; default all, in order of appearance.
+        title: a line above the table; the place for the metric's protocol and version.
+        digits: decimals of floating-point numbers.
+    """
+    names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
+    cells = [[_cell(row.get(name), digits) for name in names] for row in rows]
+    numeric = [
+        any(_is_number(row.get(name)) for row in rows)
+        and all(row.get(name) is None or _is_number(row.get(name)) for row in rows)
+        for name in names
+    ]
+    widths = [max(3, len(name), *(len(line[i]) for line in cells)) for i, name in enumerate(names)]
+    rule = ["-" * (width - 1) + ":" if right else "-" * width for width, right in zip(widths, numeric, strict=True)]
+    lines = [_line(line, widths, numeric) for line in (names, rule, *cells)]
+    return "\n".join([title, "", *lines] if title else lines)
+
+
+def save_table(
+    stem: Path, rows: Sequence[Row], meta: Mapping[str, Any], *, title: str = "", digits: int = 3
+) -> tuple[Path, Path]:
+    """Write `<stem>.md` and `<stem>.json` ({"meta": ..., "rows": [...]}), each all or nothing, and return
+    both.
+
+    NaN and infinity become null in the JSON file, where they are not allowed.
+    """
+    stem = Path(stem)
+    text = json.dumps({"meta": _plain(meta), "rows": _plain(rows)}, indent=1, allow_nan=False)
+    table = format_table(rows, title=title, digits=digits)
+    return _write(stem.with_name(stem.name + ".md"), table), _write(stem.with_name(stem.name + ".json"), text)
+
+
+def _line(cells: Iterable[str], widths: list[int], right: list[bool]) -> str:
+    placed = (
+        cell.rjust(width) if r else cell.ljust(width)
+        for cell, width, r in zip(cells, widths, right, strict=True)
+    )
+    return "| " + " | ".join(placed) + " |"
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+
+
+def _cell(value: Any, digits: int) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, (bool, np.bool_)):
+        return "yes" if value else "no"
+    if isinstance(value, (float, np.floating)):
+        return "n/a" if math.isnan(value) else f"{value:.{digits}f}"
+    # A bar would end the cell, a line break the table.
+    return str(value).replace("|", "\\|").replace("\n", " ")
+
+
+def _plain(value: Any) -> Any:
+    """Return the value as what JSON knows."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
+
+
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path

@@ -116,10 +116,17 @@ def draw_hidden(ax: Axes, hidden: Bool[Array, "h w"], ground: PerceptionRange = 
 
 
 def draw_areas(ax: Axes, areas: Areas) -> None:
-    """Draw crossings (outlined) and road boundaries."""
+    """Draw crossings (shaded) and road boundaries."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgba
+
     points, category = _rows(areas.valid, areas.points, areas.category)
-    _lines(ax, points[category == AreaType.ROAD_BOUNDARY], "#7f8da3", width=1.0, zorder=1.0)
-    _lines(ax, points[category == AreaType.PEDESTRIAN_CROSSING], "#b9a5e2", width=0.9, zorder=1.1)
+    _lines(ax, points[category == AreaType.ROAD_BOUNDARY], style.ROAD_BOUNDARY, width=1.0, zorder=1.0)
+    crossings = points[category == AreaType.PEDESTRIAN_CROSSING][..., :2]
+    shade, outline = to_rgba(style.CROSSING, 0.22), to_rgba(style.CROSSING, 0.8)
+    ax.add_collection(
+        PolyCollection(list(crossings), facecolors=[shade], edgecolors=[outline], linewidths=0.7, zorder=1.1)
+    )
 
 
 def draw_lanes(

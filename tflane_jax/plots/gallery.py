@@ -106,7 +106,7 @@ def show_dataset(
         example, info = dataset.example(index), dataset.info(index)
         draw_scene(
             truth, example, layers=("hidden", "areas", "lanes", "elements"), ground=ground, view=view,
-            title=f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s: truth",
+            title=f"{index}: {info.scene[:16]}, truth",
         )  # fmt: skip
         draw_scene(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
@@ -139,7 +139,9 @@ def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "sc
             Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
             Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
         ]
-    columns = min(len(entries), max(4, int(figure.get_figwidth() // 1.6)))
+    fitting = max(4, int(figure.get_figwidth() // 1.6))
+    rows = -(-len(entries) // fitting)
+    columns = -(-len(entries) // rows)
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
 
 

@@ -16,18 +16,21 @@ LINK = "#ff5fd2"
 LANE_CLEAR = "#8be28b"
 LANE_HIDDEN = "#ff9d3c"
 
+ROAD_BOUNDARY = "#7f8da3"
+CROSSING = "#b9a5e2"
+
 # What each channel of the evidence adds to the picture at full strength (red, green, blue, 0 to 1).
 EVIDENCE = {
     BevChannel.LANE_PAINT: (1.00, 0.93, 0.68),
     BevChannel.ROAD_EDGE: (0.28, 0.50, 0.78),
     BevChannel.CROSSING: (0.52, 0.42, 0.70),
-    BevChannel.OBSTACLE: (0.80, 0.27, 0.25),
+    BevChannel.OBSTACLE: (0.60, 0.20, 0.24),
 }
 
 ROAD_USER = {
     RoadUser.CAR: "#6ea8fe",
     RoadUser.TRUCK: "#f2b84b",
-    RoadUser.BUS: "#f07167",
+    RoadUser.BUS: "#ff7a6b",
     RoadUser.MOTORCYCLE: "#c792ea",
     RoadUser.BICYCLE: "#4fd1c5",
     RoadUser.PEDESTRIAN: "#f6e58d",

@@ -1,0 +1,123 @@
+"""Distances between polylines: discrete Frechet and Chamfer, over vertices as the lane metrics define them.
+
+Leading axes broadcast, so one call serves aligned pairs (`f(a, b)`) and all pairs (`f(a[:, None], b[None])`); numpy
+arrays in float64 on the host, jax arrays under jit. Source: shared specs/metrics.md section 1; Eiter & Mannila,
+Computing Discrete Frechet Distance (1994), for the recursion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.geometry.namespace import namespace
+
+
+def pad_lines(lines: Sequence[Float[Array, "_ d"]] | Float[Array, "l n d"], dims: int = 3) -> Float[Array, "l n d"]:
+    """Stack ragged polylines into one float64 array by repeating each line's last vertex (numpy).
+
+    The repetition changes neither the discrete Frechet distance (no coupling gets longer or shorter by standing
+    still) nor the nearest vertex to a point; it does change vertex means, so Chamfer needs the true counts.
+    Raises ValueError for a line without points.
+    """
+    if len(lines) == 0:
+        return np.zeros((0, 1, dims))
+    sizes = np.array([len(line) for line in lines])
+    if sizes.min() == 0:
+        raise ValueError(f"polyline {int(sizes.argmin())} has no points")
+    if (sizes == sizes[0]).all():
+        return np.stack(lines).astype(np.float64) if isinstance(lines, Sequence) else np.asarray(lines, np.float64)
+    first = np.cumsum(sizes) - sizes
+    index = first[:, None] + np.minimum(np.arange(sizes.max()), sizes[:, None] - 1)
+    return np.concatenate(lines).astype(np.float64)[index]
+
+
+def vertex_distance(a: Float[Array, "*b d"], b: Float[Array, "*b d"]) -> Float[Array, "*b"]:
+    """Return the Euclidean distance between points; leading axes broadcast."""
+    return namespace(a, b).sqrt(_squared(a, b))
+
+
+def discrete_frechet(a: Float[Array, "*b n d"], b: Float[Array, "*b m d"]) -> Float[Array, "*b"]:
+    """Return the discrete Frechet distance between polylines, metres; n, m >= 1, leading axes broadcast.
+
+    Directional: a reversed polyline is far away. Never less than the distance of the two first vertices nor of the
+    two last ones.
+    """
+    xp = namespace(a, b)
+    # The vertex axes come first: each step of the recursion then works on one contiguous array over all pairs.
+    a, b = xp.moveaxis(xp.asarray(a), -2, 0), xp.moveaxis(xp.asarray(b), -2, 0)
+    # Minimum and maximum commute with the square, so one root at the end is enough.
+    return xp.sqrt(_frechet_jax(a, b) if xp is jnp else _frechet_numpy(a, b))
+
+
+def chamfer(
+    a: Float[Array, "*b n d"],
+    b: Float[Array, "*b m d"],
+    a_valid: Bool[Array, "*b n"] | None = None,
+    b_valid: Bool[Array, "*b m"] | None = None,
+) -> Float[Array, "*b"]:
+    """Return half the sum of the mean distances from each vertex to the nearest vertex of the other line, metres.
+
+    Not squared, blind to direction. `a_valid` and `b_valid` leave vertices out of both the means and the search
+    (None: all count); a line without valid vertices gives inf.
+    """
+    xp = namespace(a, b)
+    a, b = xp.asarray(a), xp.asarray(b)
+    a_valid = xp.ones(a.shape[:-1], bool) if a_valid is None else xp.asarray(a_valid)
+    b_valid = xp.ones(b.shape[:-1], bool) if b_valid is None else xp.asarray(b_valid)
+    squared = _squared(a[..., :, None, :], b[..., None, :, :])
+    squared = xp.where(a_valid[..., :, None] & b_valid[..., None, :], squared, xp.inf)
+    return 0.5 * (_valid_mean(squared.min(-1), a_valid) + _valid_mean(squared.min(-2), b_valid))
+
+
+def _valid_mean(squared: Float[Array, "*b n"], valid: Bool[Array, "*b n"]) -> Float[Array, "*b"]:
+    xp = namespace(squared)
+    count = valid.sum(-1)
+    total = xp.sqrt(xp.where(valid, squared, 0.0)).sum(-1)
+    return xp.where(count > 0, total / xp.maximum(count, 1), xp.inf)
+
+
+def _squared(a: Float[Array, "*b d"], b: Float[Array, "*b d"]) -> Float[Array, "*b"]:
+    # Differences, not |a|^2 + |b|^2 - 2ab: that form loses the distances that lie exactly on a threshold. Summed
+    # coordinate by coordinate, so that every caller rounds alike.
+    total = 0.0
+    for axis in range(a.shape[-1]):
+        total = total + (a[..., axis] - b[..., axis]) ** 2
+    return total
+
+
+def _frechet_numpy(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Squared distance; a (n, *B, d), b (m, *B, d)."""
+    row: list[np.ndarray] = []
+    for point in a:
+        squared = _squared(point[None], b)
+        above, row = row, []
+        for j, here in enumerate(squared):
+            # The least of the three cells from which a coupling can step here (fewer on the first row and column).
+            best = row[j - 1] if j else None
+            for before in above[max(j - 1, 0) : j + 1]:
+                best = before if best is None else np.minimum(best, before)
+            row.append(here if best is None else np.maximum(here, best))
+    return row[-1]
+
+
+def _frechet_jax(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Squared distance; a (n, *B, d), b (m, *B, d)."""
+
+    def along(left: jax.Array, cell: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        here, before = cell
+        out = jnp.maximum(here, jnp.minimum(left, before))
+        return out, out
+
+    def down(above: jax.Array, point: jax.Array) -> tuple[jax.Array, None]:
+        squared = _squared(point[None], b)
+        # Row cell j may be reached from above[j] and above[j - 1]; no cell lies left of the first.
+        before = jnp.minimum(above, jnp.concatenate([jnp.full_like(above[:1], jnp.inf), above[:-1]]))
+        return jax.lax.scan(along, jnp.full_like(squared[0], jnp.inf), (squared, before))[1], None
+
+    first = jax.lax.cummax(_squared(a[:1], b), axis=0)
+    return jax.lax.scan(down, first, a[1:])[0][-1]

@@ -1,0 +1,196 @@
+"""Matching of one frame by the OpenLane-V2 centerline rules: all that the metrics keep of it.
+
+Source: shared specs/metrics.md sections 1 and 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.distances import discrete_frechet, vertex_distance
+from tflane_jax.metrics.frames import (
+    ElementDetections,
+    ElementTruth,
+    LaneDetections,
+    LaneTruth,
+    check_shape,
+    checked_lines,
+)
+from tflane_jax.metrics.matching import greedy_match
+from tflane_jax.metrics.topology import FILL, Version, matchings, topology_precision
+
+LANE_THRESHOLDS = (1.0, 2.0, 3.0)  # metres, discrete Frechet
+ELEMENT_THRESHOLD = 0.75  # IoU distance
+ATTRIBUTES = 13
+
+
+def nearest_lanes(
+    truth: Float[np.ndarray, "g n 3"], detected: Float[np.ndarray, "p m 3"]
+) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Return for each detection the relaxed Frechet distance to its nearest lane (metres), and which lane that is.
+
+    The distance is multiplied by max(0.5, 1 - 0.005 r), r the range of the lane's nearest vertex, so far lanes are
+    easier. Exact without measuring every pair: the distance of the end points bounds a pair from below. Without lanes
+    the distances are inf.
+    """
+    if len(truth) == 0 or len(detected) == 0:
+        return np.full(len(detected), np.inf), np.zeros(len(detected), np.int64)
+    relax = np.maximum(0.5, 1.0 - 0.005 * np.linalg.norm(truth, axis=-1).min(-1))[:, None]
+    ends_truth, ends_detected = truth[:, None, [0, -1]], detected[None, :, [0, -1]]
+    bound = relax * vertex_distance(ends_truth, ends_detected).max(-1)
+
+    distance = np.full(bound.shape, np.inf)
+
+    def measure(pairs: tuple[np.ndarray, np.ndarray]) -> None:
+        distance[pairs] = relax[pairs[0], 0] * discrete_frechet(truth[pairs[0]], detected[pairs[1]])
+
+    guess = bound.argmin(0), np.arange(len(detected))
+    measure(guess)
+    measure(np.nonzero((bound <= distance[guess]) & np.isinf(distance)))
+    return distance.min(0), distance.argmin(0)
+
+
+def iou_distance(
+    a: Float[np.ndarray, "t 2 2"], b: Float[np.ndarray, "u 2 2"]
+) -> Float[np.ndarray, "t u"]:
+    """Return 1 - IoU of all pairs of boxes (corners, no +1 pixel convention); 1 where both have no area."""
+    a, b = np.asarray(a, np.float64)[:, None], np.asarray(b, np.float64)[None]
+    shared = np.minimum(a[..., 1, :], b[..., 1, :]) - np.maximum(a[..., 0, :], b[..., 0, :])
+    shared = np.maximum(shared, 0.0).prod(-1)
+    union = (a[..., 1, :] - a[..., 0, :]).prod(-1) + (b[..., 1, :] - b[..., 0, :]).prod(-1) - shared
+    return 1.0 - shared / np.where(union > 0.0, union, 1.0)
+
+
+@dataclass(frozen=True)
+class MatchedFrame:
+    """Everything that the metrics keep of one frame (K lane thresholds, P detections, G lanes).
+
+    Attributes:
+        scores: (P,).
+        nearest: (P,) the lane that each detection is nearest to (relaxed Frechet distance).
+        hits: (K, P) true positive.
+        lanes: G.
+        topology: (K, G) for each lane, the mean over v1.0's levels (v2.1 has one) of its vertex average precision,
+            outgoing plus incoming.
+        elements: the part of the traffic elements, None without them.
+    """
+
+    scores: Float[np.ndarray, " p"]
+    nearest: Int[np.ndarray, " p"]
+    hits: Bool[np.ndarray, "k p"]
+    lanes: int
+    topology: Float[np.ndarray, "k g"]
+    elements: MatchedElements | None
+
+    def select(self, lanes: Bool[np.ndarray, " g"]) -> MatchedFrame:
+        """Return the part of the frame that belongs to some of its lanes, from this same matching.
+
+        A detection belongs to its nearest lane; in a frame without lanes it belongs to none. Traffic elements are
+        left out.
+        """
+        owned = lanes[self.nearest] if self.lanes else np.zeros(len(self.nearest), bool)
+        return MatchedFrame(
+            scores=self.scores[owned],
+            nearest=(np.cumsum(lanes) - 1)[self.nearest[owned]],
+            hits=self.hits[:, owned],
+            lanes=int(lanes.sum()),
+            topology=self.topology[:, lanes],
+            elements=None,
+        )
+
+
+@dataclass(frozen=True)
+class MatchedElements:
+    """Everything that the metrics keep of the traffic elements of one frame.
+
+    Attributes:
+        scores, attributes, hits: (U,) detections, matched inside their attribute.
+        truths: (13,) number of true elements per attribute.
+        topology: (K,) sum over lanes and elements of the vertex average precision.
+        vertices: number of terms of that sum; 0 where lanes or elements are missing.
+    """
+
+    scores: Float[np.ndarray, " u"]
+    attributes: Int[np.ndarray, " u"]
+    hits: Bool[np.ndarray, " u"]
+    truths: Int[np.ndarray, "13"]
+    topology: Float[np.ndarray, " k"]
+    vertices: int
+
+
+def match_frame(detections: LaneDetections, truth: LaneTruth, version: Version = "v2.1") -> MatchedFrame:
+    """Match one frame by the rules of the given version; raise UserError for arrays that do not fit together."""
+    true_points, points = checked_lines(truth.points, "truth"), checked_lines(detections.points, "detections")
+    g, p = len(true_points), len(points)
+    edges, confidence = np.asarray(truth.successor, bool), np.asarray(detections.successor)
+    scores = np.asarray(detections.scores)
+    check_shape(edges, (g, g), "truth: successor")
+    check_shape(scores, (p,), "detections: scores")
+    check_shape(confidence, (p, p), "detections: successor")
+
+    distance, nearest = nearest_lanes(true_points, points)
+    taken = np.stack([greedy_match(distance, nearest, scores, threshold) for threshold in LANE_THRESHOLDS])
+    levels = np.stack([matchings(scores, row, version) for row in taken])
+    rows = np.concatenate(levels)
+    topology = topology_precision(edges, confidence, rows, rows, FILL[version])
+    topology = topology.reshape(*levels.shape[:2], 2, g).mean(1).sum(1)
+    elements = None
+    if truth.elements is not None and detections.elements is not None:
+        elements = _match_elements(detections.elements, truth.elements, levels, g, version)
+    return MatchedFrame(scores, nearest, taken >= 0, g, topology, elements)
+
+
+def _match_elements(
+    detections: ElementDetections,
+    truth: ElementTruth,
+    lane_levels: Int[np.ndarray, "k levels p"],
+    lanes: int,
+    version: Version,
+) -> MatchedElements:
+    t, u, p = len(truth.boxes), len(detections.boxes), lane_levels.shape[-1]
+    edges, confidence = np.asarray(truth.lane, bool), np.asarray(detections.lane)
+    scores = np.asarray(detections.scores)
+    check_shape(np.asarray(truth.boxes), (t, 2, 2), "truth: element boxes")
+    check_shape(edges, (lanes, t), "truth: lane to element")
+    check_shape(np.asarray(detections.boxes), (u, 2, 2), "detections: element boxes")
+    check_shape(scores, (u,), "detections: element scores")
+    check_shape(confidence, (p, u), "detections: lane to element")
+    true_attributes = _checked_attributes(truth.attributes, t, "truth")
+    attributes = _checked_attributes(detections.attributes, u, "detections")
+
+    distance = iou_distance(truth.boxes, detections.boxes)
+    inside = np.where(true_attributes[:, None] == attributes, distance, np.inf)
+    # The score of detection looks inside an attribute, the score of topology does not.
+    hits = greedy_match(*_nearest(inside), scores, ELEMENT_THRESHOLD) >= 0
+    taken = greedy_match(*_nearest(distance), scores, ELEMENT_THRESHOLD)
+
+    thresholds, levels = lane_levels.shape[:2]
+    columns = np.tile(matchings(scores, taken, version), (thresholds, 1))
+    topology = topology_precision(edges, confidence, np.concatenate(lane_levels), columns, FILL[version])
+    vertices = lanes + t if lanes and t else 0
+    return MatchedElements(
+        scores=scores,
+        attributes=attributes,
+        hits=hits,
+        truths=np.bincount(true_attributes, minlength=ATTRIBUTES),
+        topology=topology.sum(-1).reshape(thresholds, levels).mean(1) * bool(vertices),
+        vertices=vertices,
+    )
+
+
+def _nearest(distance: Float[np.ndarray, "t u"]) -> tuple[Float[np.ndarray, " u"], Int[np.ndarray, " u"]]:
+    if len(distance) == 0:
+        return np.full(distance.shape[1], np.inf), np.zeros(distance.shape[1], np.int64)
+    return distance.min(0), distance.argmin(0)
+
+
+def _checked_attributes(attributes: Int[np.ndarray, " n"], count: int, what: str) -> Int[np.ndarray, " n"]:
+    attributes = np.asarray(attributes, np.int64)
+    check_shape(attributes, (count,), f"{what}: element attributes")
+    if ((attributes < 0) | (attributes >= ATTRIBUTES)).any():
+        raise UserError(f"{what}: element attributes must lie between 0 and {ATTRIBUTES - 1}")
+    return attributes

@@ -1,0 +1,138 @@
+"""What the lane metrics compare in one frame: truth and detections of lanes, their topology and traffic elements.
+
+Plain numpy and ragged, so that predictions of any framework fit in; two adapters lead here from the containers of
+`tflane_jax.scene`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.special import expit
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.distances import pad_lines
+from tflane_jax.scene import LaneGraph, LanePrediction, TrafficElements
+
+Lines = Sequence[Float[np.ndarray, "_ 3"]] | Float[np.ndarray, "l n 3"]
+
+
+@dataclass(frozen=True)
+class ElementTruth:
+    """Traffic elements of one frame and the lanes that they govern.
+
+    Attributes:
+        boxes: (T, 2, 2) top-left and bottom-right corner, pixels.
+        attributes: (T,) OpenLane-V2 attribute 0 to 12.
+        lane: (G, T) element t governs lane g.
+    """
+
+    boxes: Float[np.ndarray, "t 2 2"]
+    attributes: Int[np.ndarray, " t"]
+    lane: Bool[np.ndarray, "g t"]
+
+
+@dataclass(frozen=True)
+class ElementDetections:
+    """Detected traffic elements of one frame.
+
+    Attributes:
+        boxes: (U, 2, 2) top-left and bottom-right corner, pixels.
+        attributes: (U,) OpenLane-V2 attribute 0 to 12.
+        scores: (U,) confidence, 0 to 1.
+        lane: (P, U) confidence that element u governs detected lane p, 0 to 1.
+    """
+
+    boxes: Float[np.ndarray, "u 2 2"]
+    attributes: Int[np.ndarray, " u"]
+    scores: Float[np.ndarray, " u"]
+    lane: Float[np.ndarray, "p u"]
+
+
+@dataclass(frozen=True)
+class LaneTruth:
+    """Ground truth of one frame: G lanes.
+
+    Attributes:
+        points: G polylines (n, 3) in driving direction, metres, ego frame; each may have its own n >= 1.
+        successor: (G, G) [i, j] lane j continues lane i.
+        visibility: (G,) share of the lane in direct line of sight, 0 to 1; None where it is not known.
+        elements: traffic elements; None where the task has none.
+    """
+
+    points: Lines
+    successor: Bool[np.ndarray, "g g"]
+    visibility: Float[np.ndarray, " g"] | None = None
+    elements: ElementTruth | None = None
+
+
+@dataclass(frozen=True)
+class LaneDetections:
+    """Detections of one frame: P lanes, in any order.
+
+    Attributes:
+        points: P polylines (n, 3) in driving direction, metres, ego frame; each may have its own n >= 1.
+        scores: (P,) confidence, 0 to 1.
+        successor: (P, P) [i, j] confidence that lane j continues lane i, 0 to 1.
+        elements: traffic elements; None where the model predicts none.
+    """
+
+    points: Lines
+    scores: Float[np.ndarray, " p"]
+    successor: Float[np.ndarray, "p p"]
+    elements: ElementDetections | None = None
+
+
+def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None) -> LaneTruth:
+    """Return the valid lanes (and traffic elements) of one example."""
+    keep = np.flatnonzero(np.asarray(lanes.valid))
+    truth = None
+    if elements is not None:
+        shown = np.flatnonzero(np.asarray(elements.valid))
+        truth = ElementTruth(
+            boxes=np.asarray(elements.box)[shown],
+            attributes=np.asarray(elements.attribute)[shown],
+            lane=np.asarray(elements.lane)[np.ix_(keep, shown)],
+        )
+    return LaneTruth(
+        points=np.asarray(lanes.points)[keep],
+        successor=np.asarray(lanes.successor)[np.ix_(keep, keep)],
+        visibility=np.asarray(lanes.visibility)[keep],
+        elements=truth,
+    )
+
+
+def detections_from_prediction(prediction: LanePrediction) -> LaneDetections:
+    """Return the lanes of all queries of ONE example's last layer, best score first (no score threshold)."""
+    scores = expit(np.asarray(prediction.logits)).max(-1)
+    order = np.argsort(-scores, kind="stable")
+    return LaneDetections(
+        points=np.asarray(prediction.points)[order],
+        scores=scores[order],
+        successor=expit(np.asarray(prediction.successor_logits)[np.ix_(order, order)]),
+    )
+
+
+def checked_lines(lines: Lines, what: str) -> Float[np.ndarray, "l n 3"]:
+    """Return the polylines of one frame as one array (`pad_lines`); raise UserError for what cannot be measured."""
+    try:
+        points = pad_lines(lines)
+    except ValueError as error:
+        raise UserError(f"{what}: {error}") from None
+    if points.ndim != 3 or points.shape[-1] != 3:
+        raise UserError(f"{what}: points have shape {points.shape}, expected lines of 3-D points (lines, points, 3)")
+    finite = np.isfinite(points).all((1, 2))
+    if not finite.all():
+        raise UserError(f"{what}: line {int(finite.argmin())} has a coordinate that is not finite")
+    return points
+
+
+def check_shape(array: Array, shape: tuple[int, ...], what: str) -> None:
+    """Raise UserError if the array has another shape or holds a number that is not finite."""
+    if array.shape != shape:
+        raise UserError(f"{what} has shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise UserError(f"{what} holds a number that is not finite")

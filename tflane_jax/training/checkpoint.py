@@ -130,14 +130,16 @@ class Checkpoints:
             UserError: the checkpoint is damaged, or belongs to another model or optimiser.
         """
         tree, expected = self.arrays(step), _plain_shapes(template)
-        if tree.keys() != expected.keys() or (odd := _first_difference(tree, expected)) is not None:
-            name = odd if tree.keys() == expected.keys() else sorted(tree.keys() ^ expected.keys())[0]
+        if (difference := _first_difference(tree, expected)) is not None:
             raise UserError(
-                f"checkpoint {self.path(step)} does not fit this configuration: {name} differs. It was made by another "
+                f"checkpoint {self.path(step)} does not fit this configuration: {difference}. It was made by another "
                 "model, optimiser or number of seeds"
             )
-        state = serialization.from_state_dict(template, _nested(tree))
-        return jax.device_put(_with_keys(state, template))
+        # Through the template's own dict, because empty parts of an optimiser's state are not stored.
+        leaves = jax.tree_util.tree_map_with_path(
+            lambda path, _: tree["/".join(entry.key for entry in path)], serialization.to_state_dict(template)
+        )
+        return jax.device_put(_with_keys(serialization.from_state_dict(template, leaves), template))
 
     def arrays(self, step: int) -> dict[str, np.ndarray]:
         """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError where they are damaged."""
@@ -221,9 +223,12 @@ def _with_keys(state: TrainState, template: TrainState) -> TrainState:
 
 
 def _first_difference(tree: dict[str, Any], expected: dict[str, Any]) -> str | None:
-    for name, leaf in tree.items():
-        if (leaf.shape, leaf.dtype) != (expected[name].shape, expected[name].dtype):
-            return f"the shape or type of {name} ({leaf.shape}, expected {expected[name].shape})"
+    for name in sorted(tree.keys() | expected.keys()):
+        if name not in tree or name not in expected:
+            return f"{name} is {'not expected' if name in tree else 'missing'}"
+        here, wanted = tree[name], expected[name]
+        if (here.shape, here.dtype) != (wanted.shape, wanted.dtype):
+            return f"{name} is {here.dtype}{list(here.shape)}, not {wanted.dtype}{list(wanted.shape)}"
     return None
 
 

@@ -67,7 +67,7 @@ def test_padding_may_hold_nan(fitted, name):
 
 @pytest.mark.parametrize("name", ["traffic", "every layer", "fixed"])
 def test_nobody_there_is_no_traffic_flow(fitted, name):
-    task, params, predict = fitted[name]
+    _, params, predict = fitted[name]
     example = make_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
     same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
@@ -95,7 +95,7 @@ def test_batch_is_a_vmap(fitted, name):
     task, params, predict = fitted[name]
     examples = [make_example(s, instances=s) for s in (0, 3, 9)]
     batch = jax.tree.map(lambda *x: np.stack(x), *examples)
-    together = jax.vmap(lambda e: task.predict(params, e).lanes)(batch)
+    together = jax.jit(jax.vmap(lambda p, e: task.predict(p, e).lanes, in_axes=(None, 0)))(params, batch)
     for i, example in enumerate(examples):
         alone = predict(params, example)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=2e-4, atol=2e-4), alone, together)
@@ -104,6 +104,7 @@ def test_batch_is_a_vmap(fitted, name):
 @pytest.mark.parametrize("name", MODELS)
 def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
     task, params, _ = fitted[name]
+    chex.clear_trace_counter()
 
     @jax.jit
     @chex.assert_max_traces(n=1)
@@ -123,7 +124,7 @@ def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
 
 def test_same_key_same_parameters():
     task = LaneGraphTask(model=WITH_TRAFFIC)
-    a, b = (task.init(jax.random.key(7), make_example()) for _ in range(2))
+    a, b = (jax.jit(task.init)(jax.random.key(7), make_example()) for _ in range(2))
     same(a, b)
     names = {"/".join(str(k.key) for k in path) for path, _ in jax.tree_util.tree_leaves_with_path(a)}
     assert not [n for n in names if "Dense_" in n or "Conv_" in n or "Norm_" in n]
@@ -140,7 +141,7 @@ def test_overfits_one_example():
 
     task = LaneGraphTask(model=WITH_TRAFFIC)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], make_example(2))
-    params = task.init(jax.random.key(0), make_example(2))
+    params = jax.jit(task.init)(jax.random.key(0), make_example(2))
     optimizer = optax.adam(3e-3)
 
     @jax.jit

@@ -1,6 +1,7 @@
 """The TFM by itself: lane queries in, lane queries out."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,11 @@ PRIOR = TrafficFlowPriorConfig(max_instances=5)
 DIM, LANES = 12, 7
 
 
+@partial(jax.jit, static_argnums=0)
+def apply(module, params, *arguments):
+    return module.apply(params, *arguments)
+
+
 def tokens(seed=0, instances=4, **prior):
     flow = make_flow(seed, instances=instances)
     return jax.tree.map(jnp.asarray, select_traffic_flow(flow, dataclasses.replace(PRIOR, **prior)))
@@ -37,17 +43,17 @@ def spatial(config, seed=0, valid=None, lane_mask=None):
     valid = jnp.arange(5) < 3 if valid is None else valid
     module = SpatialEncoder(config, DIM)
     arguments = (lanes, position, traffic, spatial_mask(LANES, valid, lane_mask))
-    return module, module.init(jax.random.key(seed), *arguments), arguments
+    return module, jax.jit(module.init)(jax.random.key(seed), *arguments), arguments
 
 
 @pytest.mark.parametrize("depth", [0, 1, 3])
 def test_token_depends_on_valid_frames_only(depth):
     module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM)
     clean = tokens(1)
-    params = module.init(jax.random.key(0), clean)
+    params = jax.jit(module.init)(jax.random.key(0), clean)
     hole = ~clean.frame_valid[..., None]
     dirty = clean.replace(position=jnp.where(hole, 99.0, clean.position), heading=jnp.where(hole, -7.0, clean.heading))
-    a, b = (np.asarray(module.apply(params, t))[np.asarray(clean.valid)] for t in (clean, dirty))
+    a, b = (np.asarray(apply(module, params, t))[np.asarray(clean.valid)] for t in (clean, dirty))
     np.testing.assert_array_equal(a, b)
     assert len(a) > 0
 
@@ -55,10 +61,10 @@ def test_token_depends_on_valid_frames_only(depth):
 def test_token_sees_the_order_of_frames():
     module = TemporalEncoder(CONFIG, DIM)
     forward = tokens(2, occluded_frames="keep")
-    params = module.init(jax.random.key(0), forward)
+    params = jax.jit(module.init)(jax.random.key(0), forward)
     whole = forward.replace(frame_valid=jnp.ones_like(forward.frame_valid))
     back = whole.replace(position=whole.position[:, ::-1], heading=whole.heading[:, ::-1])
-    assert not np.allclose(module.apply(params, whole), module.apply(params, back))
+    assert not np.allclose(apply(module, params, whole), apply(module, params, back))
 
 
 @pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS, ("L->T",), ("L->L",), ()])
@@ -72,11 +78,11 @@ def test_only_the_chosen_modules_exist(fusions):
 def test_invalid_instances_are_not_seen(fusions):
     module, params, (lanes, position, traffic, mask) = spatial(dataclasses.replace(CONFIG, fusions=fusions))
     dirty = traffic.at[3:].set(jnp.nan)
-    clean_out = module.apply(params, lanes, position, traffic, mask)
-    np.testing.assert_array_equal(clean_out, module.apply(params, lanes, position, dirty, mask))
+    clean_out = apply(module, params, lanes, position, traffic, mask)
+    np.testing.assert_array_equal(clean_out, apply(module, params, lanes, position, dirty, mask))
 
     def total(t):
-        return (module.apply(params, lanes, position, t, mask) ** 2).sum()
+        return (apply(module, params, lanes, position, t, mask) ** 2).sum()
 
     gradient = jax.grad(total)(dirty)
     assert np.isfinite(gradient).all()
@@ -86,23 +92,23 @@ def test_invalid_instances_are_not_seen(fusions):
 
 def test_valid_instances_are_seen():
     module, params, (lanes, position, traffic, mask) = spatial(CONFIG)
-    moved = module.apply(params, lanes, position, traffic.at[1].add(1.0), mask)
-    assert not np.allclose(moved, module.apply(params, lanes, position, traffic, mask))
+    moved = apply(module, params, lanes, position, traffic.at[1].add(1.0), mask)
+    assert not np.allclose(moved, apply(module, params, lanes, position, traffic, mask))
 
 
 def test_point_queries_keep_the_original():
     """Eq. (3): I(Q_type) is 1 for point queries and 0 for instance queries."""
     module, params, arguments = spatial(CONFIG)
     point = SpatialEncoder(dataclasses.replace(CONFIG, query_type="point"), DIM)
-    difference = point.apply(params, *arguments) - module.apply(params, *arguments)
+    difference = apply(point, params, *arguments) - apply(module, params, *arguments)
     np.testing.assert_allclose(difference, arguments[0], atol=1e-6)
 
 
 def test_lane_mask_of_the_host_is_used():
     lonely = jnp.eye(LANES, dtype=bool)
     module, params, (lanes, position, traffic, mask) = spatial(CONFIG, lane_mask=lonely)
-    out = module.apply(params, lanes, position, traffic, mask)
-    moved = module.apply(params, lanes.at[0].add(1.0), position, traffic, mask)
+    out = apply(module, params, lanes, position, traffic, mask)
+    moved = apply(module, params, lanes.at[0].add(1.0), position, traffic, mask)
     np.testing.assert_array_equal(out[1:], moved[1:])
     assert not np.allclose(out[0], moved[0])
 
@@ -111,8 +117,8 @@ def test_lane_mask_of_the_host_is_used():
 def test_lane_queries_are_equivariant(fusions):
     module, params, (lanes, position, traffic, mask) = spatial(dataclasses.replace(CONFIG, fusions=fusions))
     order = np.random.default_rng(0).permutation(LANES)
-    out = module.apply(params, lanes, position, traffic, mask)
-    permuted = module.apply(params, lanes[order], position[order], traffic, mask)
+    out = apply(module, params, lanes, position, traffic, mask)
+    permuted = apply(module, params, lanes[order], position[order], traffic, mask)
     np.testing.assert_allclose(out[order], permuted, rtol=2e-5, atol=2e-5)
 
 
@@ -121,7 +127,7 @@ def test_gradient_against_finite_differences():
 
     @jax.jit
     def total(t):
-        return jnp.sin(module.apply(params, lanes, position, t, mask)).sum()
+        return jnp.sin(apply(module, params, lanes, position, t, mask)).sum()
 
     direction = jnp.asarray(np.random.default_rng(1).normal(size=traffic.shape).astype(np.float32))
     slope = (total(traffic + 1e-2 * direction) - total(traffic - 1e-2 * direction)) / 2e-2

@@ -61,7 +61,7 @@ def deformable_attention(
         sample = jax.vmap(lambda v, s, shape=(h, w): sample_bilinear(v, shape, s), in_axes=(1, 1))
         tap = sample(grid, locations[:, :, level])  # (heads, q, p, d)
         total = total + jnp.einsum("hqpd,qhp->hqd", tap, weights[:, :, level])
-    return total.transpose(1, 0, 2).reshape(queries, -1)
+    return total.transpose(1, 0, 2).reshape(queries, heads * value.shape[-1])
 
 
 def compass_offsets(heads: int, levels: int, points: int) -> np.ndarray:

@@ -148,6 +148,8 @@ class SpatialEncoder(nn.Module):
             )
             return nn.LayerNorm(name=f"{label}_norm")(x + attended)
 
+        # An instance that no lane may see is padding and may hold anything, NaN included.
+        traffic = jnp.where(mask.lane_traffic.any(0)[:, None], traffic, 0.0)
         # A traffic token carries its own position already.
         none = jnp.zeros_like(traffic)
         traffic = fuse("T->T", traffic, none, traffic, none, mask.traffic_traffic)

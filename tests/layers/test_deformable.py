@@ -1,0 +1,129 @@
+"""Deformable attention against the reference's numbers, a plain loop, and at its edges."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tflane_jax.layers.deformable import (
+    DeformableAttention,
+    compass_offsets,
+    deformable_attention,
+    sample_bilinear,
+)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("msda_func*"), ids=case_id)
+def test_core_matches_the_reference(path):
+    case = load_module_case(path)
+    shapes = [tuple(int(n) for n in row) for row in case.inputs.pop("spatial_shapes")]
+    batched = jax.vmap(lambda v, s, w: deformable_attention(v, shapes, s, w))
+
+    def scalar(arrays):
+        out = batched(arrays["value"], arrays["sampling_locations"], arrays["attention_weights"])
+        return (out * case.weights["output"]).sum(), out
+
+    (_, out), gradient = jax.jit(jax.value_and_grad(scalar, has_aux=True))(case.inputs)
+    assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
+    assert_gradients_close({f"in/{k}": v for k, v in gradient.items()}, case.gradients)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("custom_msda_decoder*"), ids=case_id)
+def test_decoder_attention_matches_the_reference(path):
+    case = load_module_case(path)
+    shapes = [tuple(int(n) for n in row) for row in case.inputs.pop("spatial_shapes")]
+    sizes = case.meta["config"]
+    module = DeformableAttention(sizes["embed_dims"], sizes["num_heads"], sizes["num_points"], sizes["num_levels"])
+
+    def scalar(torch_params, arrays):
+        params = {
+            name: {"kernel": torch_params[f"{name}.weight"].T, "bias": torch_params[f"{name}.bias"]}
+            for name in ("sampling_offsets", "attention_weights", "value_proj", "output_proj")
+        }
+
+        def one(query, position, value, reference):
+            return query + module.apply({"params": params}, query + position, value, shapes, reference)
+
+        # The reference puts the batch second, and adds the query back itself.
+        out = jax.vmap(one, in_axes=(1, 1, 1, 0), out_axes=1)(
+            arrays["query"], arrays["query_pos"], arrays["value"], arrays["reference_points"]
+        )
+        return (out * case.weights["output"]).sum(), out
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (_, out), (by_param, by_input) = step(case.params, case.inputs)
+    assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
+    gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
+    assert_gradients_close(gradients, case.gradients)
+
+
+def loop_sample(grid, x, y):
+    """Bilinear sample of one (h, w) channel by hand, zero outside."""
+    h, w = grid.shape
+    px, py = x * w - 0.5, y * h - 0.5
+    total = 0.0
+    for row in (int(np.floor(py)), int(np.floor(py)) + 1):
+        for column in (int(np.floor(px)), int(np.floor(px)) + 1):
+            if 0 <= row < h and 0 <= column < w:
+                total += grid[row, column] * (1 - abs(px - column)) * (1 - abs(py - row))
+    return total
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(-0.3, 1.3, allow_subnormal=False), st.floats(-0.3, 1.3, allow_subnormal=False))
+def test_sample_matches_a_loop(x, y):
+    grid = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
+    got = sample_bilinear(jnp.asarray(grid.reshape(-1, 1)), (3, 5), jnp.array([x, y], jnp.float32))
+    assert float(got[0]) == pytest.approx(loop_sample(grid, np.float32(x), np.float32(y)), abs=2e-5)
+
+
+def test_sample_reproduces_a_plane_and_its_slope():
+    """A bilinear sample of a linear function is that function, and the gradient is its slope."""
+    h, w = 6, 8
+    rows, columns = np.mgrid[:h, :w]
+    plane = jnp.asarray((3.0 * (columns + 0.5) / w - 2.0 * (rows + 0.5) / h).reshape(-1, 1), jnp.float32)
+    at = jnp.array([0.37, 0.61])
+    value, slope = jax.value_and_grad(lambda p: sample_bilinear(plane, (h, w), p)[0])(at)
+    assert float(value) == pytest.approx(3 * 0.37 - 2 * 0.61, abs=1e-5)
+    np.testing.assert_allclose(slope, [3.0, -2.0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("queries", [0, 1])
+def test_few_queries(queries):
+    module = DeformableAttention(8, heads=2, points=3)
+    value, query = jnp.ones((12, 8)), jnp.ones((queries, 8))
+    reference = jnp.full((queries, 1, 2), 0.5)
+    params = module.init(jax.random.key(0), jnp.ones((1, 8)), value, [(3, 4)], jnp.full((1, 1, 2), 0.5))
+    assert module.apply(params, query, value, [(3, 4)], reference).shape == (queries, 8)
+
+
+def test_heads_look_around_their_own_points():
+    """With one reference point per head, a head's point far outside silences that head alone."""
+    module = DeformableAttention(4, heads=2, points=1)
+    rng = np.random.default_rng(1)
+    value, query = (jnp.asarray(rng.normal(size=(n, 4)).astype(np.float32)) for n in (36, 1))
+    centre, outside = [0.5, 0.5], [9.0, 9.0]
+    arguments = (query, value, [(6, 6)])
+    params = module.init(jax.random.key(0), *arguments, jnp.array([[centre, centre]]))
+
+    def out(*reference):
+        return np.asarray(module.apply(params, *arguments, jnp.array([reference])))
+
+    bias = out(outside, outside)
+    np.testing.assert_allclose(
+        out(centre, centre) - bias, out(centre, outside) + out(outside, centre) - 2 * bias, atol=1e-6
+    )
+    np.testing.assert_array_equal(out(centre, centre), np.asarray(module.apply(params, *arguments, jnp.array([[centre]]))))
+    with pytest.raises(ValueError, match="1 or 2 points"):
+        out(centre, centre, centre)
+
+
+def test_compass_points_outward():
+    offsets = compass_offsets(4, 1, 2)[:, 0]
+    np.testing.assert_allclose(offsets[:, 1], 2 * offsets[:, 0], atol=1e-6)
+    np.testing.assert_allclose(offsets[:, 0], [[1, 0], [0, 1], [-1, 0], [0, -1]], atol=1e-6)

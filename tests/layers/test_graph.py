@@ -1,0 +1,128 @@
+"""The scene graph against the reference's numbers, plain loops, and permutations of lanes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tflane_jax.layers.graph import (
+    LaneGraphConvolution,
+    Mlp,
+    RelationshipHead,
+    SceneGraphFeedForward,
+    edge_probabilities,
+)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_lclc_gcn*"), ids=case_id)
+def test_graph_convolution_matches_the_reference(path):
+    case = load_module_case(path)
+    module = LaneGraphConvolution(case.params["weight"].shape[1], case.meta["config"]["edge_weight"])
+    ours = {"weight": "own", "weight_forward": "forward", "weight_backward": "backward"}
+
+    def scalar(torch_params, arrays):
+        params = {ours[name]: {"kernel": value} for name, value in torch_params.items()}
+        out = jax.vmap(lambda x, a: module.apply({"params": params}, x, a))(arrays["input"], arrays["adj"])
+        return (out * case.weights["output"]).sum(), out
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (_, out), (by_param, by_input) = step(case.params, case.inputs)
+    assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
+    gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
+    assert_gradients_close(gradients, case.gradients)
+
+
+def relationship_params(torch_params):
+    """Map the reference's names: the first pair layer is split into the halves that act on each side."""
+
+    def linear(name):
+        return {"kernel": torch_params[f"{name}.weight"].T, "bias": torch_params[f"{name}.bias"]}
+
+    first = linear("classifier.layers.0")
+    half = first["kernel"].shape[0] // 2
+    sides = {
+        f"mlp_{side}": {f"linear_{i}": linear(f"MLP_o{number}.layers.{i}") for i in range(3)}
+        for number, side in ((1, "first"), (2, "second"))
+    }
+    return sides | {
+        "pair_first": {"kernel": first["kernel"][:half], "bias": first["bias"]},
+        "pair_second": {"kernel": first["kernel"][half:]},
+        "pair_hidden": linear("classifier.layers.1"),
+        "pair_out": linear("classifier.layers.2"),
+    }
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_relationship_head*"), ids=case_id)
+def test_relationship_head_matches_the_reference(path):
+    case = load_module_case(path)
+    module = RelationshipHead(128)
+
+    def outputs(torch_params, arrays):
+        params = relationship_params(torch_params)
+        logits = jax.vmap(lambda a, b: module.apply({"params": params}, a, b))(arrays["o1_feats"], arrays["o2_feats"])
+        return {"rel_pred": logits[..., None], "loss_rel": reference_loss(logits, case.inputs)}
+
+    def scalar(torch_params, features):
+        out = outputs(torch_params, features)
+        return sum((out[name] * weight).sum() for name, weight in case.weights.items())
+
+    features = {name: case.inputs[name] for name in ("o1_feats", "o2_feats")}
+    assert_outputs_close(jax.jit(outputs)(case.params, features), without_scalar(case.outputs))
+    by_param, by_input = jax.jit(jax.grad(scalar, argnums=(0, 1)))(case.params, features)
+    gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
+    assert_gradients_close(gradients, case.gradients)
+
+
+def without_scalar(outputs):
+    return {name: value for name, value in outputs.items() if name != "grad_scalar"}
+
+
+def reference_loss(logits, inputs):
+    """Mean focal loss over every pair of the batch (specs section 5), weight 5, from the stored assignments."""
+    import optax
+
+    targets = np.zeros(logits.shape, np.float32)
+    for b in range(len(targets)):
+        o1, o2 = (inputs[f"o{i}.pos_inds.{b}"] for i in (1, 2))
+        g1, g2 = (inputs[f"o{i}.pos_assigned_gt_inds.{b}"] for i in (1, 2))
+        targets[b][np.ix_(o1, o2)] = inputs[f"gt_adj.{b}"][np.ix_(g1, g2)]
+    return 5.0 * optax.losses.sigmoid_focal_loss(logits, targets, alpha=0.25, gamma=2.0).mean()
+
+
+def test_pairs_match_the_joined_form():
+    """U a + V b equals one linear layer on [a | b], pair by pair."""
+    rng = np.random.default_rng(0)
+    a, b = (jnp.asarray(rng.normal(size=(n, 6)).astype(np.float32)) for n in (4, 3))
+    module = RelationshipHead(5)
+    params = module.init(jax.random.key(0), a, b)["params"]
+    got = module.apply({"params": params}, a, b)
+    sides = [Mlp((6, 6, 5)).apply({"params": params[f"mlp_{s}"]}, x) for s, x in (("first", a), ("second", b))]
+    kernel = np.concatenate([params["pair_first"]["kernel"], params["pair_second"]["kernel"]])
+    for i in range(4):
+        for j in range(3):
+            joined = np.concatenate([sides[0][i], sides[1][j]])
+            x = np.maximum(joined @ kernel + params["pair_first"]["bias"], 0)
+            x = np.maximum(x @ params["pair_hidden"]["kernel"] + params["pair_hidden"]["bias"], 0)
+            expected = x @ params["pair_out"]["kernel"] + params["pair_out"]["bias"]
+            assert float(got[i, j]) == pytest.approx(float(expected[0]), abs=1e-5)
+
+
+def test_scene_graph_is_equivariant_and_works_without_lanes():
+    rng = np.random.default_rng(1)
+    x = jnp.asarray(rng.normal(size=(6, 8)).astype(np.float32))
+    adjacency = jnp.asarray(rng.random((6, 6)).astype(np.float32))
+    module = SceneGraphFeedForward(8, 12)
+    params = module.init(jax.random.key(0), x, adjacency)
+    order = rng.permutation(6)
+    out = module.apply(params, x, adjacency)
+    permuted = module.apply(params, x[order], adjacency[order][:, order])
+    np.testing.assert_allclose(out[order], permuted, rtol=1e-5, atol=1e-5)
+    assert module.apply(params, x[:0], adjacency[:0, :0]).shape == (0, 8)
+    assert RelationshipHead(4).init_with_output(jax.random.key(0), x, x[:0])[0].shape == (6, 0)
+
+
+def test_edges_carry_no_gradient():
+    assert float(jax.grad(lambda z: edge_probabilities(z).sum())(jnp.ones((2, 2))).sum()) == 0.0

@@ -1,0 +1,68 @@
+"""Matching costs and the focal loss against the reference's numbers."""
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.golden import case_id, golden_modules, load_module_case
+from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.losses.costs import focal_cost, pairwise_l1
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig, matching_cost
+from tflane_jax.matching import match
+from tflane_jax.scene import LaneGraph, LanePrediction
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("mmdet_match_costs*"), ids=case_id)
+def test_focal_cost_and_inverse_sigmoid(path):
+    case = load_module_case(path)
+    cost = focal_cost(jnp.asarray(case.inputs["cls_pred"]))[:, case.inputs["gt_labels"]]
+    # The reference object carries mmdet's weight 2.
+    np.testing.assert_allclose(2.0 * cost, case.outputs["focal"], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        inverse_sigmoid(jnp.asarray(case.inputs["inv_sigmoid_x"])), case.outputs["inv_sigmoid"], rtol=2e-5, atol=2e-5
+    )
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("mmdet_losses*"), ids=case_id)
+def test_focal_loss(path):
+    case = load_module_case(path)
+    logits, labels = case.inputs["cls_pred"], case.inputs["labels"]
+    one_hot = np.eye(logits.shape[1] + 1, dtype=np.float32)[labels][:, :-1]
+    # Weight 1.5 is the fixture's (its note says so).
+    loss = 1.5 * optax.losses.sigmoid_focal_loss(jnp.asarray(logits), one_hot, alpha=0.25, gamma=2.0)
+    np.testing.assert_allclose(loss, case.outputs["focal_none"], rtol=2e-5, atol=2e-6)
+    assert float(loss.mean()) == pytest.approx(float(case.outputs["focal_mean"]), rel=2e-5)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_lane_assigner*"), ids=case_id)
+def test_lane_assignment(path):
+    case = load_module_case(path)
+    queries, lanes = len(case.inputs["lane_pred"]), len(case.inputs["gt_lanes"])
+    prediction = LanePrediction(
+        points=jnp.asarray(case.inputs["lane_pred"]).reshape(1, queries, -1, 3),
+        logits=jnp.asarray(case.inputs["cls_pred"])[None],
+        successor_logits=jnp.zeros((1, queries, queries)),
+    )
+    truth = LaneGraph.empty(lanes, 11).replace(
+        points=case.inputs["gt_lanes"].reshape(lanes, -1, 3), valid=np.ones(lanes, bool)
+    )
+    cost = matching_cost(prediction, truth, LaneGraphLossConfig())[0]
+    np.testing.assert_allclose(cost, case.outputs["cost"], rtol=1e-4, atol=1e-4)
+    assigned = np.zeros(queries, int)
+    assigned[np.asarray(match(cost, truth.valid).query)] = np.arange(lanes) + 1
+    np.testing.assert_array_equal(assigned, case.outputs["gt_inds"])
+
+
+@pytest.mark.parametrize(("queries", "targets"), [(0, 3), (3, 0), (1, 1), (4, 2)])
+def test_pairwise_l1(queries, targets):
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(queries, 5)), rng.normal(size=(targets, 5))
+    got = np.asarray(pairwise_l1(jnp.asarray(a, jnp.float32), jnp.asarray(b, jnp.float32)))
+    assert got.shape == (queries, targets)
+    for q in range(queries):
+        for n in range(targets):
+            assert got[q, n] == pytest.approx(np.abs(a[q] - b[n]).sum(), rel=1e-5)

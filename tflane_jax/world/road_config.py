@@ -1,0 +1,107 @@
+"""What kinds of road the built-in world draws, and the ranges that it draws their measures from."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+Range = tuple[float, float]
+
+
+class SceneKind(enum.Enum):
+    """The central feature of a road network."""
+
+    ROAD = "road"
+    LANE_DROP = "lane drop"
+    LANE_GAIN = "lane gain"
+    ON_RAMP = "on-ramp"
+    EXIT_RAMP = "exit ramp"
+    T_JUNCTION = "T junction"
+    FOUR_WAY = "four-way intersection"
+    TWO_JUNCTIONS = "two junctions"
+    ROUNDABOUT = "roundabout"
+
+
+@dataclass(frozen=True)
+class RoadConfig:
+    """Measures and probabilities of the procedural road networks. Lengths in metres, speeds in m/s, angles in degrees.
+
+    Attributes:
+        kinds: scene kinds with their relative frequencies.
+        reach: distance from the central feature to the border of the map.
+        ego_reach: distance from the central feature up to which ego routes run; `reach - ego_reach` must cover half
+            the diagonal of the perceived box.
+        vertex_spacing: largest distance between vertices of a line.
+        lane_width: vehicle lanes.
+        ring_lane_width: the lane of a roundabout.
+        bike_width: bike lanes.
+        parking_width: kerb-side parking strips.
+        gutter: between the outermost line and the kerb.
+        wide_median: raised medians from which a turning lane can be carved.
+        narrow_median: raised medians from which it cannot.
+        urban_speed, fast_speed, ramp_speed: speed limits.
+        comfortable_lateral_acceleration: m/s^2, limits the speed on connectors.
+        bend_radius: arcs of streets.
+        fast_bend_radius: arcs of roads with ramps and changing lane counts.
+        corner_radius: kerb roundings of intersections.
+        crossing_width: along the road.
+        solid_before_stop: length of the solid divider before a stop line.
+        taper: length over which a lane opens or closes.
+        fast_taper: the same on fast roads.
+        pocket: length of a turning lane, taper included.
+        skew: largest deviation of the arms of an intersection from the right angle.
+        arm_offset: largest sideways shift of an arm from the intersection's centre.
+        one_way, median, bike, parking: probability for a street.
+        mid_block_crossing: probability for a street without intersection.
+        signals: probability for an intersection.
+        crossings: probability for an arm of an intersection.
+        turn_restriction: probability that an arm must not turn left.
+        sidewalk: distance of the walking line behind the kerb.
+        building_setback: distance of buildings behind the kerb.
+    """
+
+    kinds: tuple[tuple[SceneKind, float], ...] = (
+        (SceneKind.ROAD, 0.22),
+        (SceneKind.LANE_DROP, 0.08),
+        (SceneKind.LANE_GAIN, 0.08),
+        (SceneKind.ON_RAMP, 0.07),
+        (SceneKind.EXIT_RAMP, 0.07),
+        (SceneKind.T_JUNCTION, 0.16),
+        (SceneKind.FOUR_WAY, 0.16),
+        (SceneKind.TWO_JUNCTIONS, 0.10),
+        (SceneKind.ROUNDABOUT, 0.06),
+    )
+    reach: float = 130.0
+    ego_reach: float = 70.0
+    vertex_spacing: float = 1.6
+    lane_width: Range = (2.9, 3.8)
+    ring_lane_width: Range = (4.2, 5.2)
+    bike_width: Range = (1.5, 1.9)
+    parking_width: Range = (2.2, 2.5)
+    gutter: Range = (0.25, 0.6)
+    wide_median: Range = (5.0, 6.5)
+    narrow_median: Range = (1.6, 2.6)
+    urban_speed: Range = (8.3, 14.0)
+    fast_speed: Range = (16.0, 25.0)
+    ramp_speed: Range = (11.0, 16.0)
+    comfortable_lateral_acceleration: float = 2.2
+    bend_radius: Range = (45.0, 200.0)
+    fast_bend_radius: Range = (180.0, 600.0)
+    corner_radius: Range = (4.5, 9.0)
+    crossing_width: Range = (2.6, 4.2)
+    solid_before_stop: float = 25.0
+    taper: Range = (18.0, 26.0)
+    fast_taper: Range = (30.0, 45.0)
+    pocket: Range = (38.0, 46.0)
+    skew: float = 25.0
+    arm_offset: float = 2.0
+    one_way: float = 0.2
+    median: float = 0.35
+    bike: float = 0.25
+    parking: float = 0.35
+    mid_block_crossing: float = 0.3
+    signals: float = 0.6
+    crossings: float = 0.8
+    turn_restriction: float = 0.12
+    sidewalk: float = 1.8
+    building_setback: Range = (4.0, 10.0)

@@ -23,7 +23,7 @@ def draw_lane_attention(
     instance: Int[Array, " t"],
     valid: Bool[Array, " t"],
     lane_valid: Bool[Array, " q"] | None = None,
-    least: float = 0.05,
+    least: float = 0.1,
 ) -> None:
     """Draw how much each lane looks at each road user, over a scene drawn before (`draw_scene`).
 
@@ -68,8 +68,9 @@ def draw_attention_matrix(
         shown = np.where(np.asarray(valid)[None], shown, np.nan)
     ax.set_facecolor("#d5d7db")
     image = ax.imshow(np.ma.masked_invalid(shown), aspect="auto", cmap="magma", vmin=0.0, interpolation="nearest")
-    ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.02)
-    ax.set_title(title, fontsize=9, loc="left")
+    bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.02)
+    bar.ax.tick_params(labelsize=7)
+    _label(ax, title)
     ax.set_xlabel("road user", fontsize=8)
     ax.set_ylabel("lane query", fontsize=8)
 
@@ -111,5 +112,13 @@ def _grid(ax: Axes, allowed: np.ndarray, title: str) -> None:
 
     colours = ListedColormap([style.ROAD, style.LANE_CLEAR])
     ax.imshow(allowed, aspect="auto", cmap=colours, vmin=0, vmax=1, interpolation="nearest")
+    _label(ax, title)
+
+
+def _label(ax: Axes, title: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     ax.set_title(title, fontsize=9, loc="left")
     ax.tick_params(labelsize=7)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))

@@ -42,7 +42,7 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     figure, axes = new_figure(-(-len(groups) // columns), columns, panel=(4.6, 3.2))
     for ax, ((split, group), names) in zip(axes.flat, groups.items(), strict=False):
         ax.set_title(f"{split}: {group}" if split else group, fontsize=9, loc="left")
-        _draw_panel(ax, {name.removeprefix(f"{group}/"): series[split, name] for name in names})
+        _draw_panel(ax, group, {name.removeprefix(f"{group}/"): series[split, name] for name in names})
     hide_unused(axes, len(groups))
     return save_figure(figure, path)
 
@@ -61,7 +61,7 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
     }
 
 
-def _draw_panel(ax: Axes, series: Mapping[str, Series]) -> None:
+def _draw_panel(ax: Axes, group: str, series: Mapping[str, Series]) -> None:
     for number, (name, (steps, values)) in enumerate(series.items()):
         colour = f"C{number % 10}"
         # One point makes no line.
@@ -75,5 +75,5 @@ def _draw_panel(ax: Axes, series: Mapping[str, Series]) -> None:
     ax.set_xlabel("step", fontsize=8)
     ax.tick_params(labelsize=7)
     ax.grid(alpha=0.3, lw=0.5)
-    if len(series) > 1:
+    if list(series) != [group]:
         ax.legend(fontsize=7, frameon=False)

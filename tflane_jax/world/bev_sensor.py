@@ -58,7 +58,7 @@ class BevSensorConfig:
     far_blur: float = 0.8
     far_error: float = 0.8
     lost: float = 0.08
-    invented: float = 0.015
+    invented: float = 0.008
     noise: float = 0.03
 
 

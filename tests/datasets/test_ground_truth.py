@@ -1,0 +1,189 @@
+"""Cutting maps at the perception range, on maps drawn by hand."""
+
+import gc
+
+import numpy as np
+import pytest
+import shapely
+
+from tests.datasets.small_logs import lane_map, segment
+from tflane_jax.datasets.ground_truth import (
+    BOUNDARY_MARGIN,
+    clip_ring,
+    crop_areas,
+    lane_graph,
+    prepare_map,
+    traffic_elements,
+)
+from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
+from tflane_jax.logs import MapElement
+from tflane_jax.scene import AreaType
+
+RANGE = PerceptionRange()
+NO_BOXES, NO_BUILDINGS = np.zeros((0, 7)), np.zeros((0, 5))
+
+
+def crop(vector_map, *, flavour="centerlines", pose=None, capacity=8, points=11, buildings=NO_BUILDINGS):
+    prepared = prepare_map(vector_map, bike_lanes=True)
+    return lane_graph(
+        getattr(prepared, flavour), np.eye(4) if pose is None else pose, RANGE, capacity=capacity, points=points,
+        boxes=NO_BOXES, buildings=buildings,
+    )  # fmt: skip
+
+
+def test_a_lane_is_cut_at_the_border_and_keeps_its_labels():
+    result = crop(lane_map(segment(7, [(-90.0, 2.0), (90.0, 2.0)], is_intersection=True)))
+    graph = result.graph
+    graph.validate()
+    assert graph.valid.tolist() == [True] + [False] * 7
+    np.testing.assert_allclose(graph.points[0, :, 0], np.linspace(-50, 50, 11), atol=1e-5)
+    np.testing.assert_allclose(graph.left[0, :, 1], 3.75)
+    np.testing.assert_allclose(graph.right[0, :, 1], 0.25)
+    assert graph.is_connector[0]
+    assert graph.visibility[0] == 1.0
+    assert result.dropped == 0
+
+
+def test_pose_moves_the_map_into_the_ego_frame():
+    pose = yaw_pose(np.float64(5000.0), np.float64(-700.0), np.float64(np.pi / 2))
+    graph = crop(lane_map(segment(0, [(5000.0, -700.0), (5000.0, -680.0)])), pose=invert_pose(pose)).graph
+    np.testing.assert_allclose(graph.points[0, -1], [20.0, 0.0, 0.0], atol=1e-4)
+
+
+def test_a_boundary_that_is_outside_keeps_the_stretch_beside_the_centerline():
+    graph = crop(lane_map(segment(0, [(0.0, 24.0), (40.0, 24.0), (40.0, 60.0)], width=4.0))).graph
+    np.testing.assert_allclose(graph.left[0, 0, :2], [0.0, 26.0], atol=1e-5)
+    assert graph.left[0, :, 1].min() > 25.0
+    # The centerline ends at 41 of 76 m of its length, and so does the stretch of the boundary.
+    along = np.linalg.norm(np.diff(graph.left[0, :, :2], axis=0), axis=-1).sum()
+    whole = shapely.LineString([(0, 26), (40 - np.sqrt(2), 24 + np.sqrt(2)), (38, 60)]).length
+    assert along == pytest.approx(whole * 41 / 76, abs=1.0)
+
+
+def test_a_lane_cut_in_two_joins_its_neighbours_only_at_its_own_ends():
+    # Leaves the range to the left and comes back.
+    loop = segment(1, [(-20.0, 0.0), (-20.0, 60.0), (20.0, 60.0), (20.0, 0.0)], [2, 3])
+    before = segment(0, [(-40.0, 0.0), (-20.0, 0.0)], [1, 4])
+    after, other, fork = (
+        segment(n, line)
+        for n, line in (
+            (2, [(20.0, 0.0), (40.0, 0.0)]),
+            (3, [(20.0, 0.0), (40.0, 9.0)]),
+            (4, [(-20.0, 0.0), (0.0, 0.0)]),
+        )
+    )
+    result = crop(lane_map(before, loop, after, other, fork), flavour="segments")
+    assert result.lane.tolist() == [0, 1, 1, 2, 3, 4]
+    edges = np.argwhere(result.graph.successor).tolist()
+    assert edges == [[0, 1], [0, 5], [2, 3], [2, 4]]
+
+
+def test_a_joint_outside_the_range_is_no_edge():
+    first = segment(0, [(0.0, 0.0), (0.0, 40.0)], [1])
+    second = segment(1, [(0.0, 40.0), (20.0, 40.0), (20.0, 0.0)])
+    assert not crop(lane_map(first, second), flavour="segments").graph.successor.any()
+
+
+def test_overflow_drops_the_farthest_and_counts():
+    lanes = [segment(i, [(x, 0.0), (x + 5.0, 0.0)]) for i, x in enumerate((40.0, 0.0, 20.0))]
+    result = crop(lane_map(*lanes), capacity=2)
+    assert result.lane.tolist() == [1, 2]
+    assert result.dropped == 1
+
+
+def test_nothing_in_range_and_no_map_at_all():
+    for vector_map in (lane_map(), lane_map(segment(0, [(90.0, 0.0), (120.0, 0.0)]))):
+        result = crop(vector_map)
+        assert not result.graph.valid.any()
+        assert not result.graph.successor.any()
+
+
+def test_visibility_is_the_share_that_nothing_hides():
+    wall = np.array([[10.0, 0.0, 2.0, 100.0, 0.0]])
+    graph = crop(lane_map(segment(0, [(0.0, 0.0), (36.0, 0.0)])), buildings=wall).graph
+    # All from the wall's near face at 9 m on is hidden: a quarter is seen.
+    assert graph.visibility[0] == pytest.approx(0.25, abs=0.011)
+
+
+def test_bike_lanes_are_left_out_before_chains_are_merged():
+    bike = segment(1, [(10.0, 0.0), (20.0, 5.0)], vehicle=False)
+    vector_map = lane_map(segment(0, [(0.0, 0.0), (10.0, 0.0)], [1, 2]), bike, segment(2, [(10.0, 0.0), (20.0, 0.0)]))
+    assert len(prepare_map(vector_map, bike_lanes=True).centerlines.lanes) == 3
+    assert len(prepare_map(vector_map, bike_lanes=False).segments.lanes) == 2
+
+
+def test_a_map_is_prepared_once_and_forgotten_with_it():
+    vector_map = lane_map(segment(0, [(0.0, 0.0), (1.0, 0.0)]))
+    first = prepare_map(vector_map, bike_lanes=True)
+    assert prepare_map(vector_map, bike_lanes=True) is first
+    from tflane_jax.datasets import ground_truth
+
+    key = (id(vector_map), True)
+    assert key in ground_truth._PREPARED
+    del vector_map
+    gc.collect()
+    assert key not in ground_truth._PREPARED
+
+
+def areas_of(*, crossings=(), boundaries=(), capacity=6):
+    vector_map = lane_map(crossings=crossings, road_boundaries=boundaries)
+    prepared = prepare_map(vector_map, bike_lanes=True)
+    return crop_areas(prepared, np.eye(4), RANGE, capacity=capacity, points=20)
+
+
+def ring(*corners):
+    return np.column_stack([np.array([*corners, corners[0]], float), np.zeros(len(corners) + 1)])
+
+
+def test_crossings_stay_whole_if_they_touch_the_range():
+    touching = ring((48.0, 0.0), (60.0, 0.0), (60.0, 4.0), (48.0, 4.0))
+    outside = ring((52.0, 0.0), (60.0, 0.0), (60.0, 4.0), (52.0, 4.0))
+    areas, dropped = areas_of(crossings=(touching, outside))
+    assert areas.category[areas.valid].tolist() == [AreaType.PEDESTRIAN_CROSSING]
+    assert areas.points[0, :, 0].max() > 58.0
+    np.testing.assert_array_equal(areas.points[0, 0], areas.points[0, -1])
+    assert dropped == 0
+
+
+def test_boundaries_are_cut_inside_the_range_and_islands_stay_closed():
+    road = ring((0.0, 10.0), (-80.0, 10.0), (-80.0, -10.0), (80.0, -10.0), (80.0, 10.0))
+    island = ring((5.0, 1.0), (8.0, 1.0), (8.0, -1.0))
+    areas, _ = areas_of(boundaries=(road, island))
+    assert areas.category[areas.valid].tolist() == [AreaType.ROAD_BOUNDARY] * 3
+    ends = areas.points[:2][:, [0, -1], 0]
+    np.testing.assert_allclose(np.abs(ends), 50.0 - BOUNDARY_MARGIN, atol=1e-5)
+    np.testing.assert_array_equal(areas.points[2, 0], areas.points[2, -1])
+
+
+@pytest.mark.parametrize("shift", range(8))
+def test_the_seam_of_a_ring_makes_no_difference(shift):
+    corners = [(0, 10), (-80, 10), (-80, -10), (-10, -10), (-10, -60), (10, -60), (10, -10), (80, -10), (80, 10)]
+    corners = corners[shift:] + corners[:shift]
+    pieces = clip_ring(ring(*corners), RANGE)
+    cut = shapely.LineString([*corners, corners[0]]).intersection(shapely.box(-50, -25, 50, 25))
+    expected = shapely.line_merge(cut)
+    assert len(pieces) == len(expected.geoms) == 3
+    assert sorted(shapely.LineString(p).length for p in pieces) == pytest.approx(
+        sorted(part.length for part in expected.geoms)
+    )
+
+
+def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
+    lanes = (
+        segment(10, [(0.0, 0.0), (10.0, 0.0)], [11]),
+        segment(11, [(10.0, 0.0), (20.0, 0.0)]),
+        segment(12, [(0.0, 9.0), (10.0, 9.0)]),
+    )
+    def element(x, *governed):
+        return MapElement(np.array([x, 1.0, 4.0]), 0.0, 1, 2, governed)
+
+    vector_map = lane_map(*lanes, elements=(element(30.0, 11, 404), element(49.0, 12), element(70.0, 10)))
+    cropped = crop(vector_map, capacity=4)
+    prepared = prepare_map(vector_map, bike_lanes=True)
+    out, dropped = traffic_elements(vector_map, prepared, cropped, np.eye(4), RANGE, capacity=3)
+    out.validate()
+    assert out.valid.tolist() == [True, True, False]
+    assert out.lane.tolist() == [[True, False, False], [False, True, False], [False] * 3, [False] * 3]
+    assert dropped == 0
+    out, dropped = traffic_elements(vector_map, prepared, cropped, np.eye(4), RANGE, capacity=1)
+    assert (out.position[0, 0], dropped) == (30.0, 1)

@@ -8,16 +8,19 @@ Computing Discrete Frechet Distance (1994), for the recursion.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.namespace import namespace
+from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
 
 
-def pad_lines(lines: Sequence[Float[Array, "_ d"]] | Float[Array, "l n d"], dims: int = 3) -> Float[Array, "l n d"]:
+def pad_lines(
+    lines: Sequence[Float[AnyArray, "_ d"]] | Float[AnyArray, "l n d"], dims: int = 3
+) -> Float[np.ndarray, "l n d"]:
     """Stack ragged polylines into one float64 array by repeating each line's last vertex (numpy).
 
     The repetition changes neither the discrete Frechet distance (no coupling gets longer or shorter by standing
@@ -30,18 +33,18 @@ def pad_lines(lines: Sequence[Float[Array, "_ d"]] | Float[Array, "l n d"], dims
     if sizes.min() == 0:
         raise ValueError(f"polyline {int(sizes.argmin())} has no points")
     if (sizes == sizes[0]).all():
-        return np.stack(lines).astype(np.float64) if isinstance(lines, Sequence) else np.asarray(lines, np.float64)
+        return np.asarray(lines, np.float64)
     first = np.cumsum(sizes) - sizes
     index = first[:, None] + np.minimum(np.arange(sizes.max()), sizes[:, None] - 1)
-    return np.concatenate(lines).astype(np.float64)[index]
+    return np.concatenate([np.asarray(line, np.float64) for line in lines])[index]
 
 
-def vertex_distance(a: Float[Array, "*b d"], b: Float[Array, "*b d"]) -> Float[Array, "*b"]:
+def vertex_distance(a: Float[ArrayT, "*b d"], b: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b"]:
     """Return the Euclidean distance between points; leading axes broadcast."""
     return namespace(a, b).sqrt(_squared(a, b))
 
 
-def discrete_frechet(a: Float[Array, "*b n d"], b: Float[Array, "*b m d"]) -> Float[Array, "*b"]:
+def discrete_frechet(a: Float[ArrayT, "*b n d"], b: Float[ArrayT, "*b m d"]) -> Float[ArrayT, "*b"]:
     """Return the discrete Frechet distance between polylines, metres; n, m >= 1, leading axes broadcast.
 
     Directional: a reversed polyline is far away. Never less than the distance of the two first vertices nor of the
@@ -51,15 +54,16 @@ def discrete_frechet(a: Float[Array, "*b n d"], b: Float[Array, "*b m d"]) -> Fl
     # The vertex axes come first: each step of the recursion then works on one contiguous array over all pairs.
     a, b = xp.moveaxis(xp.asarray(a), -2, 0), xp.moveaxis(xp.asarray(b), -2, 0)
     # Minimum and maximum commute with the square, so one root at the end is enough.
-    return xp.sqrt(_frechet_jax(a, b) if xp is jnp else _frechet_numpy(a, b))
+    recursion: Any = _frechet_jax if xp is jnp else _frechet_numpy
+    return xp.sqrt(recursion(a, b))
 
 
 def chamfer(
-    a: Float[Array, "*b n d"],
-    b: Float[Array, "*b m d"],
-    a_valid: Bool[Array, "*b n"] | None = None,
-    b_valid: Bool[Array, "*b m"] | None = None,
-) -> Float[Array, "*b"]:
+    a: Float[ArrayT, "*b n d"],
+    b: Float[ArrayT, "*b m d"],
+    a_valid: Bool[ArrayT, "*b n"] | None = None,
+    b_valid: Bool[ArrayT, "*b m"] | None = None,
+) -> Float[ArrayT, "*b"]:
     """Return half the sum of the mean distances from each vertex to the nearest vertex of the other line, metres.
 
     Not squared, blind to direction. `a_valid` and `b_valid` leave vertices out of both the means and the search
@@ -67,25 +71,25 @@ def chamfer(
     """
     xp = namespace(a, b)
     a, b = xp.asarray(a), xp.asarray(b)
-    a_valid = xp.ones(a.shape[:-1], bool) if a_valid is None else xp.asarray(a_valid)
-    b_valid = xp.ones(b.shape[:-1], bool) if b_valid is None else xp.asarray(b_valid)
+    rows = xp.ones(a.shape[:-1], bool) if a_valid is None else xp.asarray(a_valid)
+    columns = xp.ones(b.shape[:-1], bool) if b_valid is None else xp.asarray(b_valid)
     squared = _squared(a[..., :, None, :], b[..., None, :, :])
-    squared = xp.where(a_valid[..., :, None] & b_valid[..., None, :], squared, xp.inf)
-    return 0.5 * (_valid_mean(squared.min(-1), a_valid) + _valid_mean(squared.min(-2), b_valid))
+    squared = xp.where(rows[..., :, None] & columns[..., None, :], squared, xp.inf)
+    return 0.5 * (_valid_mean(squared.min(-1), rows) + _valid_mean(squared.min(-2), columns))
 
 
-def _valid_mean(squared: Float[Array, "*b n"], valid: Bool[Array, "*b n"]) -> Float[Array, "*b"]:
+def _valid_mean(squared: Float[ArrayT, "*b n"], valid: Bool[ArrayT, "*b n"]) -> Float[ArrayT, "*b"]:
     xp = namespace(squared)
     count = valid.sum(-1)
     total = xp.sqrt(xp.where(valid, squared, 0.0)).sum(-1)
     return xp.where(count > 0, total / xp.maximum(count, 1), xp.inf)
 
 
-def _squared(a: Float[Array, "*b d"], b: Float[Array, "*b d"]) -> Float[Array, "*b"]:
+def _squared(a: Float[ArrayT, "*b d"], b: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b"]:
     # Differences, not |a|^2 + |b|^2 - 2ab: that form loses the distances that lie exactly on a threshold. Summed
     # coordinate by coordinate, so that every caller rounds alike.
-    total = 0.0
-    for axis in range(a.shape[-1]):
+    total = (a[..., 0] - b[..., 0]) ** 2
+    for axis in range(1, a.shape[-1]):
         total = total + (a[..., axis] - b[..., axis]) ** 2
     return total
 

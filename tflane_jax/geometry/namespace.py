@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+AnyArray = np.ndarray | jax.Array
+# For functions that answer in kind.
+ArrayT = TypeVar("ArrayT", np.ndarray, jax.Array)
 
 
 def namespace(*arrays: Any) -> ModuleType:

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.geometry.ranges import PerceptionRange
 
 
-def arc_length(points: Float[Array, "n d"]) -> Float[Array, " n"]:
+def arc_length(points: Float[AnyArray, "n d"]) -> Float[np.ndarray, " n"]:
     """Return the **ground plane** (x, y) distance from the first point to each point along the line, metres.
 
     Lengths are 2-D even for 3-D lines, as in the OpenLane-V2 tools (specs/metrics.md section 6).
@@ -23,7 +24,7 @@ def arc_length(points: Float[Array, "n d"]) -> Float[Array, " n"]:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def resample(points: Float[Array, "n d"], count: int) -> Float[Array, "count d"]:
+def resample(points: Float[AnyArray, "n d"], count: int) -> Float[np.ndarray, "count d"]:
     """Return `count` points equally spaced in ground-plane arc length, both ends included.
 
     At a repeated position the segment after the last repeated vertex counts; a line of length zero gives its
@@ -35,7 +36,7 @@ def resample(points: Float[Array, "n d"], count: int) -> Float[Array, "count d"]
     return sample_at(points, np.linspace(0.0, arc_length(points)[-1], count))
 
 
-def sample_at(points: Float[Array, "n d"], distances: Float[Array, " k"]) -> Float[Array, "k d"]:
+def sample_at(points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"]) -> Float[np.ndarray, "k d"]:
     """Return the points at the given ground-plane distances along the line, clamped to its ends."""
     points = np.asarray(points)
     along = arc_length(points)
@@ -54,7 +55,7 @@ def sample_at(points: Float[Array, "n d"], distances: Float[Array, " k"]) -> Flo
     return np.where(weight == 1.0, points[segment + 1], out)
 
 
-def resample_lines(lines: Sequence[Float[Array, "_ d"]], count: int) -> Float[Array, "l count d"]:
+def resample_lines(lines: Sequence[Float[AnyArray, "_ d"]], count: int) -> Float[np.ndarray, "l count d"]:
     """Return `resample` of every line at once (count >= 2); no line may be empty."""
     if not lines:
         return np.zeros((0, count, 3))
@@ -81,7 +82,7 @@ def resample_lines(lines: Sequence[Float[Array, "_ d"]], count: int) -> Float[Ar
     return np.where(weight == 1.0, points[stop], points[start] + weight * (points[stop] - points[start]))
 
 
-def clip_to_range(points: Float[Array, "n d"], range_: PerceptionRange) -> list[np.ndarray]:
+def clip_to_range(points: Float[AnyArray, "n d"], range_: PerceptionRange) -> list[np.ndarray]:
     """Cut a polyline at the border of the range in x and y.
 
     Returns the pieces inside, in order along the line, with new points exactly on the border (z

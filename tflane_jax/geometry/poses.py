@@ -6,14 +6,16 @@ only millimetres: compose poses in float64 numpy and hand the relative pose to t
 
 from __future__ import annotations
 
-from jaxtyping import Array, Float
+from typing import Any
 
-from tflane_jax.geometry.namespace import namespace
+from jaxtyping import Float
+
+from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
 
 
 def pose_matrix(
-    rotation: Float[Array, "*b d d"], translation: Float[Array, "*b d"]
-) -> Float[Array, "*b d+1 d+1"]:
+    rotation: Float[AnyArray, "*b d d"], translation: Float[AnyArray, "*b d"]
+) -> Float[Any, "*b d+1 d+1"]:
     """Return the homogeneous matrix of `p -> rotation @ p + translation` (SE(2) for d = 2, SE(3) for d = 3)."""
     xp = namespace(rotation, translation)
     top = xp.concatenate([rotation, translation[..., None]], -1)
@@ -22,7 +24,7 @@ def pose_matrix(
     return xp.concatenate([top, bottom], -2)
 
 
-def invert_pose(pose: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
+def invert_pose(pose: Float[AnyArray, "*b n n"]) -> Float[Any, "*b n n"]:
     """Return the inverse motion, using that the rotation is orthonormal."""
     xp = namespace(pose)
     rotation = xp.swapaxes(pose[..., :-1, :-1], -1, -2)
@@ -31,8 +33,8 @@ def invert_pose(pose: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
 
 
 def relative_pose(
-    global_from_target: Float[Array, "*b n n"], global_from_source: Float[Array, "*b n n"]
-) -> Float[Array, "*b n n"]:
+    global_from_target: Float[AnyArray, "*b n n"], global_from_source: Float[AnyArray, "*b n n"]
+) -> Float[Any, "*b n n"]:
     """Return target_from_source: TF-Lane Eq. (1), T_{i-k}^i = Pose_i^-1 . Pose_{i-k}.
 
     Call it in float64: the two poses are far from the origin and their difference is small.
@@ -40,13 +42,13 @@ def relative_pose(
     return invert_pose(global_from_target) @ global_from_source
 
 
-def transform_points(pose: Float[Array, "*b n n"], points: Float[Array, "*b k d"]) -> Float[Array, "*b k d"]:
+def transform_points(pose: Float[AnyArray, "*b n n"], points: Float[AnyArray, "*b k d"]) -> Float[Any, "*b k d"]:
     """Apply `pose` (n = d + 1) to points; leading axes broadcast."""
     xp = namespace(pose, points)
     return points @ xp.swapaxes(pose[..., :-1, :-1], -1, -2) + pose[..., None, :-1, -1]
 
 
-def matrix_from_quaternion(quaternion: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
+def matrix_from_quaternion(quaternion: Float[ArrayT, "*b 4"]) -> Float[ArrayT, "*b 3 3"]:
     """Return the rotation matrix of a quaternion (w, x, y, z) of any non-zero norm."""
     xp = namespace(quaternion)
     q = quaternion / xp.sqrt((quaternion**2).sum(-1, keepdims=True))
@@ -59,7 +61,7 @@ def matrix_from_quaternion(quaternion: Float[Array, "*b 4"]) -> Float[Array, "*b
     return xp.stack([xp.stack(row, -1) for row in rows], -2)
 
 
-def yaw_pose(x: Float[Array, "*b"], y: Float[Array, "*b"], yaw: Float[Array, "*b"]) -> Float[Array, "*b 4 4"]:
+def yaw_pose(x: Float[AnyArray, "*b"], y: Float[AnyArray, "*b"], yaw: Float[AnyArray, "*b"]) -> Float[Any, "*b 4 4"]:
     """Return the SE(3) pose on the ground plane at (x, y) with heading `yaw` (metres, radians)."""
     xp = namespace(x, y, yaw)
     x, y, yaw = xp.broadcast_arrays(xp.asarray(x), xp.asarray(y), xp.asarray(yaw))
@@ -68,6 +70,6 @@ def yaw_pose(x: Float[Array, "*b"], y: Float[Array, "*b"], yaw: Float[Array, "*b
     return pose_matrix(rotation, xp.stack([x + zero, y + zero, zero], -1))
 
 
-def pose_yaw(pose: Float[Array, "*b n n"]) -> Float[Array, "*b"]:
+def pose_yaw(pose: Float[ArrayT, "*b n n"]) -> Float[ArrayT, "*b"]:
     """Return the heading of a pose: the direction of its x axis in the ground plane, radians in (-pi, pi]."""
     return namespace(pose).arctan2(pose[..., 1, 0], pose[..., 0, 0])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.namespace import namespace
+from tflane_jax.geometry.namespace import ArrayT, namespace
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,17 @@ class PerceptionRange:
         """Extent of the first `dims` axes."""
         return tuple(axis[1] - axis[0] for axis in (self.x, self.y, self.z)[:dims])
 
-    def normalise(self, points: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+    def normalise(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b d"]:
         """Map metres to [0, 1] inside the box (d = 2 or 3)."""
         xp, d = namespace(points), points.shape[-1]
         return (points - xp.asarray(self.low(d), points.dtype)) / xp.asarray(self.size(d), points.dtype)
 
-    def denormalise(self, points: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
+    def denormalise(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b d"]:
         """Map [0, 1] inside the box to metres (d = 2 or 3)."""
         xp, d = namespace(points), points.shape[-1]
         return xp.asarray(self.low(d), points.dtype) + points * xp.asarray(self.size(d), points.dtype)
 
-    def contains(self, points: Float[Array, "*b d"]) -> Bool[Array, "*b"]:
+    def contains(self, points: Float[ArrayT, "*b d"]) -> Bool[ArrayT, "*b"]:
         """True where x and y lie inside the box, border included (z is not looked at)."""
         inside_x = (points[..., 0] >= self.x[0]) & (points[..., 0] <= self.x[1])
         return inside_x & (points[..., 1] >= self.y[0]) & (points[..., 1] <= self.y[1])
@@ -72,7 +72,7 @@ class BevGrid:
             [y0 + (r + 0.5) * dy for r in range(self.rows)],
         )
 
-    def pixel(self, points: Float[Array, "*b d"]) -> Float[Array, "*b 2"]:
+    def pixel(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b 2"]:
         """Map metres to continuous (column, row) with cell centres at integers."""
         xp = namespace(points)
         unit = self.range.normalise(points[..., :2])

@@ -45,12 +45,12 @@ def nearest_lanes(
 
     distance = np.full(bound.shape, np.inf)
 
-    def measure(pairs: tuple[np.ndarray, np.ndarray]) -> None:
-        distance[pairs] = relax[pairs[0], 0] * discrete_frechet(truth[pairs[0]], detected[pairs[1]])
+    def measure(lane: np.ndarray, detection: np.ndarray) -> None:
+        distance[lane, detection] = relax[lane, 0] * discrete_frechet(truth[lane], detected[detection])
 
-    guess = bound.argmin(0), np.arange(len(detected))
-    measure(guess)
-    measure(np.nonzero((bound <= distance[guess]) & np.isinf(distance)))
+    guess, every = bound.argmin(0), np.arange(len(detected))
+    measure(guess, every)
+    measure(*np.nonzero((bound <= distance[guess, every]) & np.isinf(distance)))
     return distance.min(0), distance.argmin(0)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
 from tflane_jax.errors import UserError
@@ -130,7 +130,7 @@ def checked_lines(lines: Lines, what: str) -> Float[np.ndarray, "l n 3"]:
     return points
 
 
-def check_shape(array: Array, shape: tuple[int, ...], what: str) -> None:
+def check_shape(array: np.ndarray, shape: tuple[int, ...], what: str) -> None:
     """Raise UserError if the array has another shape or holds a number that is not finite."""
     if array.shape != shape:
         raise UserError(f"{what} has shape {array.shape}, expected {shape}")

@@ -7,14 +7,10 @@ import pytest
 import shapely
 
 from tests.datasets.small_logs import lane_map, segment
-from tflane_jax.datasets.ground_truth import (
-    BOUNDARY_MARGIN,
-    clip_ring,
-    crop_areas,
-    lane_graph,
-    prepare_map,
-    traffic_elements,
-)
+from tflane_jax.datasets import prepared_map
+from tflane_jax.datasets.areas import BOUNDARY_MARGIN, clip_ring, crop_areas
+from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
+from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
 from tflane_jax.logs import MapElement
 from tflane_jax.scene import AreaType
@@ -116,13 +112,11 @@ def test_a_map_is_prepared_once_and_forgotten_with_it():
     vector_map = lane_map(segment(0, [(0.0, 0.0), (1.0, 0.0)]))
     first = prepare_map(vector_map, bike_lanes=True)
     assert prepare_map(vector_map, bike_lanes=True) is first
-    from tflane_jax.datasets import ground_truth
-
     key = (id(vector_map), True)
-    assert key in ground_truth._PREPARED
+    assert key in prepared_map._PREPARED
     del vector_map
     gc.collect()
-    assert key not in ground_truth._PREPARED
+    assert key not in prepared_map._PREPARED
 
 
 def areas_of(*, crossings=(), boundaries=(), capacity=6):

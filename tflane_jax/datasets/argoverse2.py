@@ -6,8 +6,6 @@ map's predecessor lists are incomplete, so that only successors are read.
 
 from __future__ import annotations
 
-import functools
-import json
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,6 +17,7 @@ import numpy as np
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 from tflane_jax.logs import KeyFrame, Log, Tracks
@@ -30,7 +29,6 @@ _BOX_COLUMNS = (*_POSE_COLUMNS, "track_uuid", "category", "length_m", "width_m",
 "num_interior_pts")
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
-_OPENLANE_SPLITS, _OPENLANE_LOGS = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
 
 CATEGORIES: Mapping[str, RoadUser | None] = {
     "REGULAR_VEHICLE": RoadUser.CAR,
@@ -100,11 +98,9 @@ def load_log(
             "use a train or val log"
         )
     tracks = _tracks(boxes, times, categories, folder)
-    moments = _openlane_times(folder.name, openlane) if keyframes == "openlane_v2" else None
-    if keyframes == "annotations":
-        moments = times
-    elif moments is None:
-        moments = times[::_FRAMES_PER_KEYFRAME]
+    moments = times if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
+    if keyframes == "openlane_v2" and openlane is not None:
+        moments = openlane_timestamps(openlane).get(folder.name, moments)
     nearest = np.abs(moments[:, None] - times).argmin(-1)
     return Log(
         name=folder.name,
@@ -196,37 +192,6 @@ def _tracks(
     tracks.occluded[f, k] = boxes["num_interior_pts"] == 0
     tracks.valid[f, k] = True
     return tracks
-
-
-def _openlane_times(log_id: str, folder: Path | None) -> np.ndarray | None:
-    """Return the OpenLane-V2 timestamps of a log, None where the split files do not hold it."""
-    return None if folder is None else openlane_timestamps(folder).get(log_id)
-
-
-@functools.lru_cache(maxsize=4)
-def openlane_timestamps(folder: Path) -> dict[str, np.ndarray]:
-    """Return the frame timestamps (F,) int64 of every Argoverse 2 log that is a segment of OpenLane-V2 subset A.
-
-    Args:
-        folder: holds OpenLane-V2/data_dict_subset_A.json and subset_A_segment_to_av2_log.json (segment to log
-            id).
-    """
-    frames, logs = (_read_json(Path(folder) / name) for name in (_OPENLANE_SPLITS, _OPENLANE_LOGS))
-    return {
-        logs[split][segment]: np.sort([int(name.removesuffix(".json")) for name in names])
-        for split, segments in frames.items()
-        for segment, names in segments.items()
-        if segment in logs.get(split, {})
-    }
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"{path} is missing: it is one of the OpenLane-V2 split files") from error
-    except ValueError as error:
-        raise UserError(f"{path} is not valid json ({error})") from error
 
 
 def check_log(folder: Path) -> list[str]:

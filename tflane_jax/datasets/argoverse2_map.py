@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.polylines import resample
@@ -91,6 +91,6 @@ def _boundaries(areas: list[np.ndarray]) -> tuple[np.ndarray, ...]:
     union = shapely.union_all([shapely.Polygon(a[:, :2]).buffer(0) for a in areas])
     rings = [ring for part in shapely.get_parts(union) for ring in (part.exterior, *part.interiors)]
     vertices = np.concatenate(areas)
-    nearest = cKDTree(vertices[:, :2])
+    nearest = KDTree(vertices[:, :2])
     flat = [np.asarray(ring.coords)[:, :2] for ring in rings]
     return tuple(np.column_stack([ring, vertices[nearest.query(ring)[1], 2]]) for ring in flat)

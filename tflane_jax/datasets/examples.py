@@ -7,8 +7,10 @@ import warnings
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.datasets.areas import crop_areas
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
-from tflane_jax.datasets.ground_truth import crop_areas, lane_graph, prepare_map, traffic_elements
+from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
+from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.logs import Log, Tracks
 from tflane_jax.scene import Example, TrafficFlow

@@ -1,0 +1,60 @@
+"""Masks of attention: true where a query may attend to a key. The one place that makes them."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool
+
+
+def key_mask(valid_keys: Bool[Array, " k"]) -> Bool[Array, "1 k"]:
+    """Return the mask under which every query sees the valid keys."""
+    return valid_keys[None, :]
+
+
+def pair_mask(valid_queries: Bool[Array, " q"], valid_keys: Bool[Array, " k"]) -> Bool[Array, "q k"]:
+    """Return the mask under which valid queries see the valid keys, and invalid ones see nothing."""
+    return valid_queries[:, None] & valid_keys[None, :]
+
+
+@struct.dataclass
+class SpatialMask:
+    """M_s of TF-Lane (Fig. 5): who sees whom among L lane queries and T traffic instances.
+
+    A quadrant is what one fusion module needs, broadcastable to its full size, so that quadrants nobody uses are never
+    built. Rows are queries.
+
+    Attributes:
+        lanes: L.
+        lane_lane: (L, L) the host's own mask, or None: all lanes see all.
+        lane_traffic: (1, T) lanes see valid instances.
+        traffic_lane: (T, 1) valid instances see all lanes.
+        traffic_traffic: (T, T) valid instances see valid instances.
+    """
+
+    lanes: int = struct.field(pytree_node=False)
+    lane_lane: Bool[Array, "l l"] | None
+    lane_traffic: Bool[Array, "1 t"]
+    traffic_lane: Bool[Array, "t 1"]
+    traffic_traffic: Bool[Array, "t t"]
+
+    @classmethod
+    def from_validity(
+        cls, lane_mask: Bool[Array, "l l"] | None, traffic_valid: Bool[Array, " t"], lanes: int
+    ) -> SpatialMask:
+        """Return M_s from the host's L->L mask and the validity of instances (section 3.3)."""
+        return cls(
+            lanes=lanes,
+            lane_lane=lane_mask,
+            lane_traffic=key_mask(traffic_valid),
+            traffic_lane=traffic_valid[:, None],
+            traffic_traffic=pair_mask(traffic_valid, traffic_valid),
+        )
+
+    def dense(self) -> Bool[Array, "l+t l+t"]:
+        """Return the whole matrix, lanes first."""
+        lanes, traffic = self.lanes, self.traffic_traffic.shape[0]
+        lane_lane = jnp.ones((lanes, lanes), bool) if self.lane_lane is None else self.lane_lane
+        top = jnp.concatenate([lane_lane, jnp.broadcast_to(self.lane_traffic, (lanes, traffic))], 1)
+        bottom = jnp.concatenate([jnp.broadcast_to(self.traffic_lane, (traffic, lanes)), self.traffic_traffic], 1)
+        return jnp.concatenate([top, bottom], 0)

@@ -98,7 +98,8 @@ def fill(
     job = _Job(folder, dataset, slots)
     blocks = [range(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
     scenes: dict[int, str] = {}
-    with tqdm(total=count, desc=f"building {dataset.name}", unit="example", disable=not progress) as bar:
+    title = f"building {dataset.name}"
+    with tqdm(total=count, desc=title, unit="example", mininterval=0.5, disable=not progress) as bar:
         for indices, names in _run(job, blocks, min(workers, len(blocks))):
             scenes.update(zip(indices, names, strict=True))
             bar.update(len(indices))

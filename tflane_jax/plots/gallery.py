@@ -128,6 +128,8 @@ def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "sc
         Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
         *(Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()),
         Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"),
+        Line2D([], [], color=style.LIGHT[2], lw=0, marker="o", ms=4, mec="black", label="traffic light"),
+        Line2D([], [], color=style.OTHER_ELEMENT, lw=0, marker="s", ms=4, mec="black", label="traffic sign"),
         *(
             Patch(facecolor=colour, label=f"evidence: {channel.name.lower().replace('_', ' ')}")
             for channel, colour in style.EVIDENCE.items()

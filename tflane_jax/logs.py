@@ -132,6 +132,8 @@ class Log:
         actors: every box that was really there, for line of sight and the obstacle channel (the same object as `tracks`
             where a source has no tracker in between).
         keyframes: moments at which examples are made, in time order.
+        element_attribute: (F, E) attribute of each of the map's elements at each track frame (the state of a light);
+            None where every element keeps its own.
         weather: 0 (clear) to 1 (worst), dims the evidence.
         paint_wear: 0 (fresh) to 1 (gone), dims lane paint.
         seed: root of everything random that is drawn when this log is rendered.
@@ -145,6 +147,7 @@ class Log:
     tracks: Tracks
     actors: Tracks
     keyframes: tuple[KeyFrame, ...]
+    element_attribute: np.ndarray | None = None
     weather: float = 0.0
     paint_wear: float = 0.0
     seed: int = 0

@@ -10,6 +10,7 @@ from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.examples import make_example, occluder_boxes, traffic_flow
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
+from tflane_jax.logs import MapElement
 from tflane_jax.scene import stack_examples
 
 ROAD = lane_map(segment(0, [(900.0, -2000.0), (1100.0, -2000.0)]))
@@ -128,3 +129,16 @@ def test_a_building_hides_ground_and_lanes():
     assert walled.lanes.visibility[0] == pytest.approx(0.68, abs=0.01)
     assert not open_.hidden.any()
     assert walled.hidden[50, 180]
+
+
+def test_a_light_shows_its_state_at_the_key_frame():
+    light = MapElement(np.array([1010.0, -2000.0, 4.0]), 0.0, 1, 1, (0,))
+    sign = MapElement(np.array([1012.0, -2000.0, 2.0]), 0.0, 2, 4, (0,))
+    pose = yaw_pose(1000.0, -2000.0, 0.0)
+    road = dataclasses.replace(ROAD, elements=(light, sign))
+    states = np.array([[1, 4], [2, 4]])
+    plain = log(road, tracks(np.zeros((2, 0, 3))), [pose] * 2, [(1, pose)])
+    for recording, expected in ((plain, [1, 4]), (dataclasses.replace(plain, element_attribute=states), [2, 4])):
+        elements = make_example(recording, 0, ExampleConfig()).traffic_elements
+        assert elements.attribute[:2].tolist() == expected
+        assert elements.lane[0].tolist() == [True, True] + [False] * 22

@@ -171,13 +171,16 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
     def element(x, *governed):
         return MapElement(np.array([x, 1.0, 4.0]), 0.0, 1, 2, governed)
 
-    vector_map = lane_map(*lanes, elements=(element(30.0, 11, 404), element(49.0, 12), element(70.0, 10)))
+    elements = (element(30.0, 11, 404), element(49.0, 12), element(70.0, 10))
+    vector_map = lane_map(*lanes, elements=elements)
     cropped = crop(vector_map, capacity=4)
     prepared = prepare_map(vector_map, bike_lanes=True)
-    out, dropped = traffic_elements(vector_map, prepared, cropped, np.eye(4), RANGE, capacity=3)
+    shown = np.array([1, 2, 3])
+    out, dropped = traffic_elements(elements, shown, prepared, cropped, np.eye(4), RANGE, capacity=3)
     out.validate()
     assert out.valid.tolist() == [True, True, False]
+    assert out.attribute[:2].tolist() == [1, 2]
     assert out.lane.tolist() == [[True, False, False], [False, True, False], [False] * 3, [False] * 3]
     assert dropped == 0
-    out, dropped = traffic_elements(vector_map, prepared, cropped, np.eye(4), RANGE, capacity=1)
+    out, dropped = traffic_elements(elements, shown, prepared, cropped, np.eye(4), RANGE, capacity=1)
     assert (out.position[0, 0], dropped) == (30.0, 1)

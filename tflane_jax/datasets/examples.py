@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.datasets.areas import crop_areas
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
@@ -91,8 +91,9 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         prepared, ego_from_global, config.range, capacity=config.areas, points=config.area_points
     )
     elements, elements_dropped = traffic_elements(
-        log.map, prepared, lanes, ego_from_global, config.range, capacity=config.elements
-    )
+        log.map.elements, _attributes(log, moment.track_frame), prepared, lanes, ego_from_global, config.range,
+        capacity=config.elements,
+    )  # fmt: skip
     flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks)
     _warn_dropped(
         config, lanes=lanes.dropped, segments=segments.dropped, areas=areas_dropped,
@@ -122,6 +123,13 @@ def _buildings(log: Log, ego_from_global: np.ndarray) -> Float[np.ndarray, "b 5"
     blocks = log.map.buildings
     pose = ego_from_global @ yaw_pose(blocks[:, 0], blocks[:, 1], blocks[:, 4])
     return np.stack([pose[:, 0, 3], pose[:, 1, 3], blocks[:, 2], blocks[:, 3], pose_yaw(pose)], -1)
+
+
+def _attributes(log: Log, frame: int) -> Int[np.ndarray, " m"]:
+    """Return what each of the map's traffic elements shows in a track frame."""
+    if log.element_attribute is not None:
+        return log.element_attribute[frame]
+    return np.array([element.attribute for element in log.map.elements], int)
 
 
 def _warn_dropped(config: ExampleConfig, **dropped: int) -> None:

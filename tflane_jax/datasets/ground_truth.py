@@ -6,15 +6,16 @@ both are moved into the ego frame, cut at the perception range and resampled.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.datasets.prepared_map import MapLanes, PreparedMap
 from tflane_jax.geometry import PerceptionRange, transform_points
 from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample_lines, sample_at
-from tflane_jax.logs import VectorMap
+from tflane_jax.logs import MapElement
 from tflane_jax.scene import LaneGraph, TrafficElements
 from tflane_jax.world.line_of_sight import hidden_points
 
@@ -141,7 +142,8 @@ def _position_along(line: np.ndarray, point: np.ndarray) -> float:
 
 
 def traffic_elements(
-    vector_map: VectorMap,
+    elements: Sequence[MapElement],
+    attribute: Int[np.ndarray, " m"],
     prepared: PreparedMap,
     lanes: CroppedLanes,
     ego_from_global: Float[np.ndarray, "4 4"],
@@ -150,21 +152,25 @@ def traffic_elements(
     capacity: int,
 ) -> tuple[TrafficElements, int]:
     """Return lights and signs in range and nearer than `ELEMENT_DISTANCE`, tied to the merged centerlines whose
-    segments they govern, and how many found no room (the farthest)."""
+    segments they govern, and how many found no room (the farthest).
+
+    Args:
+        elements, attribute: the map's elements and what each shows at this moment.
+        lanes: cut from `prepared.centerlines`.
+    """
     out = TrafficElements.empty(capacity, len(lanes.graph.valid))
-    if not vector_map.elements:
+    if not elements:
         return out, 0
-    position = transform_points(ego_from_global, np.stack([e.position for e in vector_map.elements]))
+    position = transform_points(ego_from_global, np.stack([e.position for e in elements]))
     distance = np.linalg.norm(position[:, :2], axis=-1)
     found = np.flatnonzero(range_.contains(position) & (distance < ELEMENT_DISTANCE))
     kept = np.sort(found[np.argsort(distance[found], kind="stable")[:capacity]])
     for row, number in enumerate(kept):
-        element = vector_map.elements[number]
-        governed = [prepared.chain_of[s] for s in element.lanes if s in prepared.chain_of]
+        governed = [prepared.chain_of[s] for s in elements[number].lanes if s in prepared.chain_of]
         out.lane[: len(lanes.lane), row] = np.isin(lanes.lane, governed)
     n = len(kept)
     out.position[:n] = position[kept]
-    out.category[:n] = [vector_map.elements[i].category for i in kept]
-    out.attribute[:n] = [vector_map.elements[i].attribute for i in kept]
+    out.category[:n] = [elements[i].category for i in kept]
+    out.attribute[:n] = np.asarray(attribute)[kept]
     out.valid[:n] = True
     return out, len(found) - n

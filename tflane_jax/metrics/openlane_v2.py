@@ -122,9 +122,9 @@ class GroupedCenterlineMetrics:
     A true lane is `occluded` if its visibility is below `occluded_below`, else `clear`. Every frame is matched once,
     with all lanes and all detections, by the official rules. Then, for the group S of lanes:
 
-    - DET_l counts the true lanes in S and the detections whose nearest true lane (the one that the official matching
-      looks at: least relaxed Frechet distance, however far) lies in S, false positives included. Detections in frames
-      without true lanes count only in `all`;
+    - DET_l counts the true lanes in S and the detections whose nearest true lane lies in S, false positives included.
+      Nearest is the least relaxed Frechet distance, however large (below 3 m it is the lane that the official matching
+      looks at). Detections in frames without true lanes count only in `all`;
     - TOP_ll pools the vertex precisions of the lanes in S; their neighbours may lie outside S.
 
     So `all` is the official number, occluded and clear share out its lanes and its vertices exactly, and its detections

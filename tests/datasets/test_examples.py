@@ -116,6 +116,21 @@ def test_same_log_same_bits():
         np.testing.assert_array_equal(a, b)
 
 
+def test_what_stands_in_invalid_slots_changes_nothing():
+    valid = np.random.default_rng(0).random((30, 5)) < 0.6
+    position = np.random.default_rng(1).uniform(-20.0, 20.0, (30, 5, 3))
+    clean = tracks(position, valid=valid)
+    garbage = tracks(np.where(valid[..., None], position, np.nan), np.where(valid, 0.0, np.nan), valid=valid)
+    first, second = (
+        make_example(log(ROAD, recorded, POSES, [(22, POSES[22])]), 0, ExampleConfig()) for recorded in (clean, garbage)
+    )
+    np.testing.assert_array_equal(first.bev, second.bev)
+    np.testing.assert_array_equal(first.hidden, second.hidden)
+    seen = first.traffic_flow.valid
+    np.testing.assert_array_equal(seen, second.traffic_flow.valid)
+    np.testing.assert_array_equal(first.traffic_flow.position[seen], second.traffic_flow.position[seen])
+
+
 def test_a_building_hides_ground_and_lanes():
     building = np.array([[1020.0, -2000.0, 4.0, 30.0, 0.0]])
     pose = yaw_pose(1000.0, -2000.0, 0.0)

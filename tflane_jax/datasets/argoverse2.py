@@ -25,8 +25,9 @@ from tflane_jax.scene import Example, RoadUser
 
 ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
 _POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_BOX_COLUMNS = (*_POSE_COLUMNS, "track_uuid", "category", "length_m", "width_m", "height_m",
-"num_interior_pts")
+_BOX_COLUMNS = (
+    *_POSE_COLUMNS, "track_uuid", "category", "length_m", "width_m", "height_m", "num_interior_pts",
+)  # fmt: skip
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
 

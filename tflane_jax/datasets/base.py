@@ -16,9 +16,9 @@ from tflane_jax.world.bev_sensor import BevSensorConfig
 class ExampleConfig:
     """Sizes and ranges of an `Example`.
 
-    The capacities hold the two Argoverse 2 logs at hand with room to spare (55 lane segments, 29 centerlines,
-    7 road boundaries, 114 traffic tracks of which 60 at once); what does not fit is left out, farthest first,
-    with a `TruncationWarning`.
+    The capacities hold the two Argoverse 2 logs at hand with room to spare (58 lane segments, 28 centerlines, 11
+    areas, 39 instances near the vehicle); what does not fit is left out, farthest first, with a
+    `TruncationWarning`.
 
     Attributes:
         range: in which lanes, areas and elements are truth.

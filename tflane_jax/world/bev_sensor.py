@@ -109,10 +109,10 @@ def render_bev(
     lost = min(config.lost * severity * (1.0 + weather), 1.0)
     evidence *= np.clip((lattice.noise(rng, 1, _LOST_PATCH) - ndtri(lost)) * 2.0 + 0.5, 0.0, 1.0)
     invented = min(config.invented * severity * (1.0 + weather), 1.0)
-    evidence += np.clip((lattice.noise(rng, len(BevChannel), _INVENTED_PATCH) + ndtri(invented)) * 0.8, 0.0,
-    0.6)
-    # The obstacle channel shows what hides, on ground that is itself hidden.
+    patches = lattice.noise(rng, len(BevChannel), _INVENTED_PATCH) + ndtri(invented)
+    # Evidence of the ground is hidden with it; a face that is seen stands on ground that it hides.
     evidence[: BevChannel.OBSTACLE] *= visible
+    evidence += visible * np.clip(patches * 0.8, 0.0, 0.6)
     noise = rng.standard_normal(evidence.shape, np.float32)
     evidence += config.noise * severity * (1.0 + weather) * noise
     return np.round(255.0 * np.clip(evidence, 0.0, 1.0)).astype(np.uint8).transpose(1, 2, 0)

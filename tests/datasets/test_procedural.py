@@ -1,0 +1,85 @@
+import pickle
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from tflane_jax.datasets import procedural
+from tflane_jax.datasets.cache import cached
+from tflane_jax.datasets.loading import count, load_arrays
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.errors import UserError
+
+CONFIG = ProceduralConfig(split="val", scenes=2, first=5)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return ProceduralDataset(CONFIG)
+
+
+def test_splits_own_disjoint_ranges_of_scene_ids():
+    everything = [ProceduralConfig(split, procedural.SCENES_PER_SPLIT) for split in ("train", "val", "test")]
+    ends = []
+    for config in everything:
+        dataset = ProceduralDataset(config)
+        ends.append((dataset.scene_id(0), dataset.scene_id(len(dataset) - 1)))
+    assert ends == [(0, 10**8 - 1), (10**8, 2 * 10**8 - 1), (2 * 10**8, 3 * 10**8 - 1)]
+
+
+@pytest.mark.parametrize(("scenes", "first"), [(-1, 0), (1, -1), (1, 10**8), (10**8 + 1, 0)])
+def test_scenes_outside_the_split_are_refused(scenes, first):
+    with pytest.raises(UserError, match="train has scenes 0 to 99999999"):
+        ProceduralDataset(ProceduralConfig(scenes=scenes, first=first))
+
+
+def test_frames_of_a_scene_follow_each_other(dataset):
+    frames = CONFIG.world.keyframes
+    assert len(dataset) == 2 * frames
+    assert [dataset.scene_id(i) - 10**8 for i in range(len(dataset))] == [5] * frames + [6] * frames
+    infos = [dataset.info(i) for i in range(len(dataset))]
+    assert len({info.scene for info in infos}) == 2
+    times = [info.timestamp_ns for info in infos[:frames]]
+    assert times == sorted(set(times))
+    previous = [bool(dataset.example(i).has_previous) for i in (0, 1, frames)]
+    assert previous == [False, True, False]
+
+
+@pytest.mark.parametrize("index", [-1, 2 * CONFIG.world.keyframes])
+def test_there_is_nothing_outside(dataset, index):
+    with pytest.raises(IndexError, match="procedural-val"):
+        dataset.example(index)
+
+
+def test_an_example_depends_on_its_scene_alone(dataset):
+    """Same bits from another dataset that holds the scene elsewhere, and after a round trip through pickle."""
+    frames = CONFIG.world.keyframes
+    other = pickle.loads(pickle.dumps(ProceduralDataset(replace(CONFIG, scenes=1, first=6))))
+    procedural._simulated.cache_clear()
+    jax.tree.map(np.testing.assert_array_equal, other.example(1), dataset.example(frames + 1))
+
+
+def test_scenes_are_simulated_once_for_all_their_frames(monkeypatch):
+    calls = []
+    simulate = procedural.simulate
+    monkeypatch.setattr(procedural, "simulate", lambda *args: (calls.append(args[0]), simulate(*args))[1])
+    procedural._simulated.cache_clear()
+    dataset = ProceduralDataset(CONFIG)
+    for index in range(len(dataset)):
+        dataset.info(index)
+        dataset.example(index)
+    assert calls == [10**8 + 5, 10**8 + 6]
+    procedural._simulated.cache_clear()
+
+
+def test_the_cache_holds_the_same_examples(tmp_path, dataset):
+    kept = cached(dataset, root=tmp_path, workers=1, progress=False)
+    arrays = load_arrays(kept, progress=False)
+    assert count(arrays) == len(dataset)
+    for index in (0, len(dataset) - 1):
+        example = dataset.example(index)
+        example.validate()
+        jax.tree.map(np.testing.assert_array_equal, kept.example(index), example)
+        jax.tree.map(lambda a, b, i=index: np.testing.assert_array_equal(a[i], b), arrays, example)
+        assert kept.info(index).scene == dataset.info(index).scene

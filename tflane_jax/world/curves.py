@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -41,8 +42,7 @@ def grid_with(stations: Sequence[float], spacing: float) -> Float[np.ndarray, " 
     stops = np.unique(np.asarray(stations, np.float64))
     stops = stops[np.concatenate([[True], np.diff(stops) > 1e-6])]
     pieces = [
-        np.linspace(a, b, int(np.ceil((b - a) / spacing)), endpoint=False)
-        for a, b in zip(stops[:-1], stops[1:], strict=True)
+        np.linspace(a, b, int(np.ceil((b - a) / spacing)), endpoint=False) for a, b in pairwise(stops)
     ]
     return np.concatenate([*pieces, stops[-1:]])
 
@@ -175,6 +175,18 @@ def blend(
     before = np.minimum(along - lead[:, None], 0.0)[..., None]
     after = np.maximum(along - (lead + middle)[:, None], 0.0)[..., None]
     return xy + before * u[:, None] + after * v[:, None], np.arctan2(slope[..., 1], slope[..., 0])
+
+
+def arc_length(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Return the distance along the line to each point, metres."""
+    steps = np.diff(points, axis=0)
+    return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+
+
+def points_at(line: Float[np.ndarray, "n 2"], distances: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k 2"]:
+    """Return the points at distances along the line, clamped to its ends."""
+    along = arc_length(line)
+    return np.stack([np.interp(distances, along, line[:, i]) for i in range(2)], -1)
 
 
 def offset_polyline(points: Float[np.ndarray, "n 2"], distance: float) -> Float[np.ndarray, "n 2"]:

@@ -12,7 +12,8 @@ from tflane_jax.world import intersections, roundabouts
 from tflane_jax.world.lane_network import LaneNetwork
 from tflane_jax.world.layout_junctions import JunctionPlan, JunctionsPlan, seen_from_end
 from tflane_jax.world.layouts import ArmPlan
-from tflane_jax.world.movements import Approach, lay_connectors, plan_movements, set_priorities
+from tflane_jax.world.movements import Approach, lay_connectors, plan_movements
+from tflane_jax.world.right_of_way import phases, set_priorities
 from tflane_jax.world.road_config import RoadConfig
 from tflane_jax.world.roundabouts import Ring
 from tflane_jax.world.site import Site
@@ -154,9 +155,12 @@ def _lay_intersection(
         movements, approaches, network, config.comfortable_lateral_acceleration, config.vertex_spacing,
         corner_radius=junction.corner_radius,
     )  # fmt: skip
-    set_priorities(ids, movements, approaches, network, index, junction.signalised)
-    if junction.signalised:
-        green = int(rng.integers(2))
+    # Lights make sense only where there is traffic to hold back.
+    used = sorted({p for p, a in zip(phases(approaches), approaches, strict=True) if a.incoming})
+    signalised = junction.signalised and len(used) > 1
+    set_priorities(ids, movements, approaches, network, index, signalised)
+    if signalised:
+        green = int(rng.choice(used))
         site.elements += traffic_lights(approaches, green, beyond=1.7 * float(distances.mean()))
     site.elements += signs(approaches, movements, [m.arm.style.median > 0 for m in mouths])
 
@@ -168,7 +172,7 @@ def _lay_roundabout(
     movements = [movement for movement, _ in planned]
     ids = lay_connectors(
         movements, approaches, network, config.comfortable_lateral_acceleration, config.vertex_spacing,
-        corner_radius=np.inf,
+        corner_radius=None,
     )  # fmt: skip
     for connector, (_, circulating) in zip(ids, planned, strict=True):
         if circulating is not None:
@@ -178,10 +182,11 @@ def _lay_roundabout(
 def _ring_corners(
     ring: Ring, around: Sequence[ArmPlan], distances: Float[np.ndarray, " arms"]
 ) -> list[Float[np.ndarray, "n 2"]]:
-    following = np.roll(np.arange(len(around)), -1)
+    arms = [a.arm for a in around]
+    pairs = [(i, (i + 1) % len(arms)) for i in range(len(arms))]
     return [
-        roundabouts.kerb_corner(ring, around[i].arm, around[j].arm, float(distances[i]), float(distances[j]))
-        for i, j in enumerate(following)
+        roundabouts.kerb_corner(ring, arms[i], arms[j], float(distances[i]), float(distances[j]))
+        for i, j in pairs
     ]
 
 

@@ -128,7 +128,7 @@ class LaneNetwork:
         entered = {j for i in inside for j in self.drafts[i].successors}
         length = {i: _length(self.drafts[i]) for i in inside}
         ways: list[tuple[int, ...]] = []
-        stack = [(i,) for i in sorted(inside - entered, reverse=True)]
+        stack: list[tuple[int, ...]] = [(i,) for i in sorted(inside - entered, reverse=True)]
         while stack:
             way = stack.pop()
             onward = [j for j in self.drafts[way[-1]].successors if j in inside and j not in way]

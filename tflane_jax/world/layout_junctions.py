@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.world.cross_sections import Place
 from tflane_jax.world.layouts import (
     ArmPlan,
     StreetStyle,
@@ -18,7 +19,6 @@ from tflane_jax.world.layouts import (
     left_pocket,
 )
 from tflane_jax.world.road_config import RoadConfig, SceneKind
-from tflane_jax.world.streets import Place
 
 
 @dataclass(frozen=True)
@@ -194,5 +194,6 @@ def seen_from_end(link: ArmPlan, distance: float) -> ArmPlan:
 
     The axis is the same line: `centred` shifts it to the same place from both ends.
     """
-    return replace(link, origin=along(link.origin, link.heading, distance), heading=link.heading + np.pi, style=link.style.reversed())
+    origin = along(link.origin, link.heading, distance)
+    return replace(link, origin=origin, heading=link.heading + np.pi, style=link.style.reversed())
 

@@ -6,9 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tflane_jax.world.cross_sections import ExtraLane, Place, SidePlan
 from tflane_jax.world.layouts import StreetStyle, centred, chance, draw, draw_style, left_pocket
 from tflane_jax.world.road_config import RoadConfig, SceneKind
-from tflane_jax.world.streets import ExtraLane, Place, SidePlan, StreetPlan
+from tflane_jax.world.streets import StreetPlan
+
+# Roads run on beyond the reach of the map by this much, for bends bring their ends nearer, metres.
+_BEYOND = 14.0
+_LONGEST_ARC = 90.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,8 @@ def _plan_changing(rng: np.random.Generator, kind: SceneKind, config: RoadConfig
     )  # fmt: skip
     place = Place.RIGHT if chance(rng, 0.6) else left_pocket(style)
     taper = draw(rng, config.fast_taper if fast else config.taper)
-    middle, length = config.reach + draw(rng, (-25.0, 25.0)), 2 * config.reach
+    half = config.reach + _BEYOND
+    middle, length = half + draw(rng, (-25.0, 25.0)), 2 * half
     if kind is SceneKind.LANE_DROP:
         extra = ExtraLane(place, 0.0, middle, merges=taper)
     else:
@@ -102,12 +108,12 @@ def _plan_ramp(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) ->
     taper = draw(rng, config.fast_taper)
     enters = kind is SceneKind.ON_RAMP
     # The lane beside the road lies around the middle of the map; the ramp runs off towards its border.
-    near, far = config.reach + draw(rng, (-35.0, -15.0)), config.reach + draw(rng, (30.0, 50.0))
+    half = config.reach + _BEYOND
+    near, far = half + draw(rng, (-35.0, -15.0)), half + draw(rng, (30.0, 50.0))
     if enters:
         extra = ExtraLane(Place.RIGHT, near, far, merges=taper)
     else:
-        length = 2 * config.reach
-        extra = ExtraLane(Place.RIGHT, length - far, length - near, forks=taper)
+        extra = ExtraLane(Place.RIGHT, 2 * half - far, 2 * half - near, forks=taper)
     style = replace(style, forward=replace(style.forward, extras=(extra,)))
     street = _through(style, _winding(rng, config, config.fast_bend_radius), rng, config)
     ramp = RampPlan(
@@ -125,9 +131,9 @@ def ramp_side(road: StreetStyle) -> SidePlan:
 def _through(
     style: StreetStyle, bends: tuple[tuple[float, float], ...], rng: np.random.Generator, config: RoadConfig
 ) -> StreetPlan:
-    heading = draw(rng, (-np.pi, np.pi))
+    heading, half = draw(rng, (-np.pi, np.pi)), config.reach + _BEYOND
     return StreetPlan(
-        origin=centred(np.zeros(2), heading, style), heading=heading, start=-config.reach, stop=config.reach,
+        origin=centred(np.zeros(2), heading, style), heading=heading, start=-half, stop=half,
         forward=style.forward, backward=style.backward, speed=style.speed,
         ego=(-config.ego_reach, config.ego_reach), bends=bends,
     )  # fmt: skip
@@ -140,12 +146,16 @@ def _winding(
     if chance(rng, 0.25):
         return ((0.0, 0.0),)
     knots: list[tuple[float, float]] = []
-    station = -config.reach
-    while station < config.reach:
-        peak = 0.0 if chance(rng, 0.25) else float(np.copysign(1.0 / draw(rng, radius), rng.uniform(-1, 1)))
-        # No arc turns by more than about 60 degrees, lest the road runs back into itself.
-        longest = 1.0 / max(abs(peak), 1.0 / 80.0)
+    turned = 0.0
+    half = config.reach + _BEYOND
+    station = -half
+    while station < half:
+        # A road that has turned far turns back, lest it runs into itself.
+        hand = rng.uniform(-1, 1) if abs(turned) < 0.4 else -turned
+        peak = 0.0 if chance(rng, 0.25) else float(np.copysign(1.0 / draw(rng, radius), hand))
+        longest = 1.0 / max(abs(peak), 1.0 / _LONGEST_ARC)
         arc = draw(rng, (0.4, 1.0)) * longest
+        turned += peak * arc
         knots += [(station, peak), (station + arc, peak)]
         station += arc + draw(rng, (20.0, 35.0))
     return tuple(knots)

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.world.cross_sections import Place, SidePlan
 from tflane_jax.world.curves import direction, right_of
 from tflane_jax.world.intersections import Arm
 from tflane_jax.world.road_config import Range, RoadConfig
-from tflane_jax.world.streets import Place, SidePlan, StreetPlan
+from tflane_jax.world.streets import StreetPlan
 
 # A raised median keeps at least this width beside a turning lane carved out of it, metres.
 LEAST_MEDIAN = 1.2

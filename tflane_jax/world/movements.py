@@ -1,4 +1,4 @@
-"""Movements through an intersection: which lane leads where, connector curves, right of way and signal phases."""
+"""Movements through an intersection: which lane leads where, and the connector curves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from tflane_jax.scene import LineType
 from tflane_jax.world.curves import blend, right_of, wrap
@@ -14,9 +14,9 @@ from tflane_jax.world.lane_network import Draft, LaneEnd, LaneNetwork
 
 LEFT, THROUGH, RIGHT = 1, 0, -1
 # A way that turns by less than this, and less than the other ways, runs straight on.
-_STRAIGHT = np.deg2rad(50.0)
-# Traffic on two connectors collides if their centerlines come nearer than about a vehicle's width, metres.
-_CONFLICT = 2.2
+STRAIGHT = np.deg2rad(50.0)
+# Between a turning lane and the kerb at the corner, metres.
+_KERB_CLEARANCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _ways(approaches: Sequence[Approach], arm: int) -> dict[int, int]:
     ways: dict[int, int] = {}
     if turns:
         straight = min(turns, key=lambda j: abs(turns[j]))
-        if abs(turns[straight]) < _STRAIGHT:
+        if abs(turns[straight]) < STRAIGHT:
             ways[THROUGH] = straight
         for j in sorted(turns, key=lambda j: abs(turns[j])):
             if j != ways.get(THROUGH):
@@ -173,7 +173,7 @@ def lay_connectors(
     network: LaneNetwork,
     lateral_acceleration: float,
     spacing: float,
-    corner_radius: float,
+    corner_radius: float | None,
 ) -> list[int]:
     """Add a connector segment for each movement, tangent to both of its lanes, and return their ids.
 
@@ -183,7 +183,7 @@ def lay_connectors(
         network: receives the segments.
         lateral_acceleration: comfortable, m/s^2; limits the speed in curves.
         spacing: largest distance between vertices, metres.
-        corner_radius: of the kerbs, around which right turns stay concentric, metres.
+        corner_radius: of the kerbs' roundings, around which turns must keep, metres; None where there are none.
     """
     if not movements:
         return []
@@ -192,7 +192,10 @@ def lay_connectors(
     inbound = np.array([m.source.heading for m in movements])
     onward = np.array([m.sink.heading for m in movements])
     count = max(int(np.ceil(1.2 * np.linalg.norm(stop - start, axis=-1).max() / spacing)), 6) + 1
-    radius = np.array([_largest_radius(m, approaches, corner_radius) for m in movements])
+    radius = np.full(len(movements), np.inf)
+    if corner_radius is not None:
+        turns = [k for k, m in enumerate(movements) if m.turn != THROUGH]
+        radius[turns] = [_largest_radius(movements[k], approaches, corner_radius) for k in turns]
     center, heading = blend(start, inbound, stop, onward, count, radius)
     share = np.linspace(0.0, 1.0, count)
     widths = np.array([[m.source.width, m.sink.width] for m in movements])
@@ -215,12 +218,19 @@ def lay_connectors(
 
 
 def _largest_radius(m: Movement, approaches: Sequence[Approach], corner_radius: float) -> float:
-    """Return the radius at which a right turn keeps clear of the kerb's rounding; other turns are free."""
-    if m.turn != RIGHT:
-        return np.inf
-    before = np.hypot(*(m.source.center - approaches[m.arm].incoming_kerb))
-    after = np.hypot(*(m.sink.center - approaches[m.target].outgoing_kerb))
-    return corner_radius + float(min(before, after))
+    """Return the radius up to which a turn keeps clear of the kerb's rounding at the corner that it goes around."""
+    arm, target = approaches[m.arm], approaches[m.target]
+    if m.turn == RIGHT:
+        kerbs = arm.incoming_kerb, target.outgoing_kerb
+    else:
+        kerbs = arm.outgoing_kerb, target.incoming_kerb
+    to_kerb = float(min(np.hypot(*(m.source.center - kerbs[0])), np.hypot(*(m.sink.center - kerbs[1]))))
+    clear = min(to_kerb, 0.5 * max(m.source.width, m.sink.width) + _KERB_CLEARANCE)
+    half_gap = 0.5 * (np.pi - abs(float(wrap(m.sink.heading - m.source.heading))))
+    # The rounding's circle must lie inside the turn's with `clear` to spare; both touch the sides of the corner, so
+    # that their centres are (radius - corner_radius - to_kerb) / sin(half_gap) apart.
+    slope = 1.0 / np.sin(half_gap)
+    return float(((corner_radius + to_kerb) * slope - corner_radius - clear) / max(slope - 1.0, 1e-6))
 
 
 def _connector_speeds(
@@ -236,72 +246,3 @@ def _connector_speeds(
     tightest = np.quantile(curvature, 0.8, axis=1)
     limit = np.array([min(approaches[m.arm].speed, approaches[m.target].speed) for m in movements])
     return np.minimum(np.sqrt(lateral_acceleration / np.maximum(tightest, 1e-6)), limit)
-
-
-def conflicts(ids: Sequence[int], movements: Sequence[Movement], network: LaneNetwork) -> Bool[np.ndarray, "c c"]:
-    """Return which connectors come so near to each other that their traffic could collide.
-
-    Those of one arm part and do not collide, but for bicycles that go straight on beside a vehicle that turns.
-    """
-    lines = []
-    for connector in ids:
-        draft = network.drafts[connector]
-        line = 0.5 * (draft.left + draft.right)
-        lines.append(line[np.linspace(0, len(line) - 1, 15).round().astype(int)])
-    points = np.stack(lines).astype(np.float32)
-    flat = points.reshape(-1, 2)
-    square = ((flat[:, None] - flat[None]) ** 2).sum(-1)
-    c = len(ids)
-    near = square.reshape(c, 15, c, 15).min((1, 3)) < _CONFLICT**2
-    arm = np.array([m.arm for m in movements])
-    vehicle = np.array([m.source.vehicle for m in movements])
-    return near & ((arm[:, None] != arm[None]) | (vehicle[:, None] != vehicle[None]))
-
-
-def phases(approaches: Sequence[Approach]) -> list[int]:
-    """Return the signal phase of each arm: arms that face each other are green together."""
-    phase = [-1] * len(approaches)
-    following = 0
-    for i, approach in enumerate(approaches):
-        if phase[i] >= 0:
-            continue
-        phase[i] = following
-        for j in range(i + 1, len(approaches)):
-            facing = abs(float(wrap(approaches[j].heading - approach.heading + np.pi))) < _STRAIGHT
-            if phase[j] < 0 and facing:
-                phase[j] = following
-                break
-        following += 1
-    return phase
-
-
-def set_priorities(
-    ids: Sequence[int],
-    movements: Sequence[Movement],
-    approaches: Sequence[Approach],
-    network: LaneNetwork,
-    intersection: int,
-    signalised: bool,
-) -> None:
-    """Enter right of way, and signal phases where there are signals, into the network.
-
-    Of two conflicting connectors the one of higher rank goes first: major before minor arm, straight before right
-    before left, then by arm. A strict order has no circles, so traffic that obeys it never waits for itself. Under
-    signals only connectors that are green together yield to one another.
-    """
-    meet = conflicts(ids, movements, network)
-    phase = phases(approaches)
-    order = {THROUGH: 0, RIGHT: 1, LEFT: 2}
-    ranks = [
-        (0 if signalised else approaches[m.arm].minor, order[m.turn], m.arm) for m in movements
-    ]
-    for a, connector in enumerate(ids):
-        before = {
-            ids[b]
-            for b in np.flatnonzero(meet[a])
-            if ranks[b] < ranks[a] and (not signalised or phase[movements[a].arm] == phase[movements[b].arm])
-        }
-        if before:
-            network.let_pass(connector, before)
-        if signalised:
-            network.signal_phase[connector] = (intersection, phase[movements[a].arm])

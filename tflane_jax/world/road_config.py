@@ -61,14 +61,14 @@ class RoadConfig:
     """
 
     kinds: tuple[tuple[SceneKind, float], ...] = (
-        (SceneKind.ROAD, 0.22),
-        (SceneKind.LANE_DROP, 0.08),
-        (SceneKind.LANE_GAIN, 0.08),
-        (SceneKind.ON_RAMP, 0.07),
-        (SceneKind.EXIT_RAMP, 0.07),
-        (SceneKind.T_JUNCTION, 0.16),
-        (SceneKind.FOUR_WAY, 0.16),
-        (SceneKind.TWO_JUNCTIONS, 0.10),
+        (SceneKind.ROAD, 0.16),
+        (SceneKind.LANE_DROP, 0.06),
+        (SceneKind.LANE_GAIN, 0.06),
+        (SceneKind.ON_RAMP, 0.06),
+        (SceneKind.EXIT_RAMP, 0.06),
+        (SceneKind.T_JUNCTION, 0.20),
+        (SceneKind.FOUR_WAY, 0.20),
+        (SceneKind.TWO_JUNCTIONS, 0.14),
         (SceneKind.ROUNDABOUT, 0.06),
     )
     reach: float = 130.0

@@ -1,8 +1,8 @@
 """Procedural road networks: the static half of the built-in world.
 
 `build_road_network` draws a scene kind, plans its streets (`layout_roads`, `layout_junctions`), lays them out as lane
-segments (`streets`, `intersections`, `movements`, `roundabouts`, `through_roads`, `junction_networks`) and furnishes the
-roadside. All of it is metres in one global frame around the central feature, right-hand traffic, z = 0.
+segments (`through_roads`, `junction_networks`) and furnishes the roadside. All of it is metres in one global frame
+around the central feature, right-hand traffic, z = 0.
 """
 
 from __future__ import annotations

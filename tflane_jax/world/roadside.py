@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.geometry.polylines import arc_length, resample
-from tflane_jax.world.curves import direction, offset_polyline, right_of
+from tflane_jax.world.curves import arc_length, direction, offset_polyline, points_at, right_of
 from tflane_jax.world.road_config import Range
 from tflane_jax.world.site import Site
 from tflane_jax.world.streets import Side
@@ -65,7 +64,7 @@ def buildings(
     """
     plots = [_plots(rng, kerb, setback, density) for kerb in site.kerbs]
     boxes = np.concatenate([*plots, np.zeros((0, 5))])
-    road = np.concatenate([resample(k, int(arc_length(k)[-1] / 2.0) + 2) for k in site.kerbs])
+    road = np.concatenate([points_at(k, np.arange(0.0, arc_length(k)[-1] + 2.0, 2.0)) for k in site.kerbs])
     axes = np.concatenate([street.forward.line.xy[::2] for street in site.streets])
     free = ~_contains(boxes, np.concatenate([road, axes]), _BUILDING_CLEARANCE).any(1)
     boxes = boxes[free]
@@ -84,12 +83,9 @@ def _plots(
     back, built = rng.uniform(*setback, count), rng.random(count) < density
     middle = np.cumsum(length + gap) - 0.5 * length
     keep = built & (middle < total)
-    along = arc_length(line)
-    xy = np.stack([np.interp(middle, along, line[:, i]) for i in range(2)], -1)
-    ahead = np.stack([np.interp(middle + 3.0, along, line[:, i]) for i in range(2)], -1)
-    behind = np.stack([np.interp(middle - 3.0, along, line[:, i]) for i in range(2)], -1)
-    heading = np.arctan2(ahead[:, 1] - behind[:, 1], ahead[:, 0] - behind[:, 0])
-    xy = xy + (back + 0.5 * depth)[:, None] * right_of(heading)
+    front = points_at(line, middle + 3.0) - points_at(line, middle - 3.0)
+    heading = np.arctan2(front[:, 1], front[:, 0])
+    xy = points_at(line, middle) + (back + 0.5 * depth)[:, None] * right_of(heading)
     return np.concatenate([xy, np.stack([length, depth, heading], -1)], -1)[keep]
 
 
@@ -114,8 +110,8 @@ def _apart(boxes: Float[np.ndarray, "b 5"]) -> Bool[np.ndarray, " b"]:
         + (grid[:, 1:] * boxes[:, None, 3:4]) * across[:, None]
     )
     hit = _contains(boxes, points.reshape(-1, 2), 0.0).reshape(len(boxes), len(boxes), len(grid)).any(-1)
-    hit |= hit.T
+    hit = np.logical_or(hit, hit.T)
     keep = np.ones(len(boxes), bool)
-    for i in range(len(boxes)):
-        keep[i] = not (hit[i, :i] & keep[:i]).any()
+    for i, row in enumerate(hit):
+        keep[i] = not np.any(row[:i] & keep[:i])
     return keep

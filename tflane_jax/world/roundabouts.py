@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -92,7 +93,7 @@ def lay_ring(
     # Going round: past arm 0's entry, to arm 1's exit, to arm 1's entry, ...
     stops = np.stack([headings + ring.half_angle, np.roll(headings, -1) - ring.half_angle], 1).reshape(-1)
     stops = stops[0] + np.concatenate([[0.0], np.cumsum(np.diff(stops, append=stops[0]) % (2 * np.pi))])
-    ids = [_arc(ring, a, b, network, spacing) for a, b in zip(stops[:-1], stops[1:], strict=True)]
+    ids = [_arc(ring, a, b, network, spacing) for a, b in pairwise(stops.tolist())]
     for k, segment in enumerate(ids):
         following = ids[(k + 1) % len(ids)]
         network.weld(segment, following, keep=following)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.world.cross_sections import SidePlan
 from tflane_jax.world.curves import ReferenceLine, direction
 from tflane_jax.world.lane_network import LaneNetwork
 from tflane_jax.world.layout_roads import RampPlan, RoadPlan, ramp_side
 from tflane_jax.world.road_config import RoadConfig
 from tflane_jax.world.site import Site
-from tflane_jax.world.streets import SidePlan, Street, StreetPlan, build_street
+from tflane_jax.world.streets import Street, StreetPlan, build_street
 
 # Medians keep this distance from the lines of the lanes beside them, metres.
 _MEDIAN_MARGIN = 0.3
@@ -76,6 +77,8 @@ def _add_ramp(
     line = side.line
     attach = extra.start if ramp.enters else extra.stop
     at = int(np.argmin(np.abs(line.s - attach)))
+    # Routes on the ramp, which runs beside the road for long, must not come near the road's end either.
+    ego = config.ego_reach - abs(attach - 0.5 * line.s[-1])
     lane = ramp_side(plan.style)
     bare = SidePlan(lanes=0, gutter=lane.gutter)
     # The ramp's axis is the left line of its lane and runs away from the road.
@@ -88,7 +91,7 @@ def _add_ramp(
         StreetPlan(
             origin=join, heading=float(line.heading[at]) + (np.pi if ramp.enters else 0.0),
             start=0.0, stop=config.reach, forward=bare if ramp.enters else lane,
-            backward=lane if ramp.enters else bare, speed=ramp.speed, ego=(0.0, config.ego_reach), bends=bends,
+            backward=lane if ramp.enters else bare, speed=ramp.speed, ego=(0.0, ego), bends=bends,
         ),
         network, config.solid_before_stop, config.vertex_spacing,
     )  # fmt: skip
@@ -96,7 +99,7 @@ def _add_ramp(
         slip = branch.backward.exits[0].segment
         network.weld(slip, first, keep=first)
         gore = branch.forward.kerb_line
-        nose, on_road = _gore(gore, side.line, side.plan.kerb(0.0))
+        nose, on_road = _gore(gore, side.line, float(side.plan.kerb(0.0)))
         kerbs = [
             np.concatenate([side.kerb_line[: on_road + 1], gore[nose:]]),
             np.concatenate([branch.backward.kerb_line[:-1], side.kerb_line[at:]]),
@@ -105,7 +108,7 @@ def _add_ramp(
         slip = branch.forward.entries[0].segment
         network.weld(last, slip, keep=last)
         gore = branch.backward.kerb_line[::-1]
-        nose, on_road = _gore(gore, side.line, side.plan.kerb(0.0))
+        nose, on_road = _gore(gore, side.line, float(side.plan.kerb(0.0)))
         kerbs = [
             np.concatenate([side.kerb_line[: at + 1], branch.forward.kerb_line[1:]]),
             np.concatenate([gore[nose:][::-1], side.kerb_line[on_road:]]),

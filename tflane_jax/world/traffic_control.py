@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from tflane_jax.logs import MapElement
-from tflane_jax.world.curves import direction, right_of
+from tflane_jax.world.curves import direction, right_of, wrap
 from tflane_jax.world.lane_network import LaneEnd
-from tflane_jax.world.movements import LEFT, RIGHT, THROUGH, Approach, Movement, phases
+from tflane_jax.world.movements import LEFT, RIGHT, STRAIGHT, THROUGH, Approach, Movement
+from tflane_jax.world.right_of_way import phases
 
 LIGHT, SIGN = 1, 2
 # OpenLane-V2 attributes of traffic elements.
@@ -65,11 +66,8 @@ def signs(approaches: Sequence[Approach], movements: Sequence[Movement], medians
                     out.append(_element(lane.center, _LIGHT_HEIGHT, lane, SIGN, attribute, (lane.segment,)))
         beside = lanes[-1].right + 1.2 * right_of(lanes[-1].heading)
         governed = tuple(lane.segment for lane in lanes)
-        banned = [
-            (NO_LEFT_TURN, LEFT) if turn == LEFT else (NO_RIGHT_TURN, RIGHT)
-            for turn in _present(approaches, i) - offered
-        ]
-        for attribute, _ in sorted(banned):
+        banned = _present(approaches, i) - offered
+        for attribute in sorted(NO_LEFT_TURN if turn == LEFT else NO_RIGHT_TURN for turn in banned):
             out.append(_element(beside, _SIGN_HEIGHT, lanes[-1], SIGN, attribute, governed))
         if median:
             out.append(_element(beside, _SIGN_HEIGHT + 0.8, lanes[-1], SIGN, NO_U_TURN, governed))
@@ -79,10 +77,8 @@ def signs(approaches: Sequence[Approach], movements: Sequence[Movement], medians
 def _present(approaches: Sequence[Approach], arm: int) -> set[int]:
     """Return the turns, LEFT and RIGHT, towards which an arm lies, whether it may be entered or not."""
     ahead = approaches[arm].heading + np.pi
-    turns = [
-        (other.heading - ahead + np.pi) % (2 * np.pi) - np.pi for j, other in enumerate(approaches) if j != arm
-    ]
-    return {LEFT if t > 0 else RIGHT for t in turns if abs(t) > np.deg2rad(50.0)}
+    turns = [float(wrap(other.heading - ahead)) for j, other in enumerate(approaches) if j != arm]
+    return {LEFT if t > 0 else RIGHT for t in turns if abs(t) > STRAIGHT}
 
 
 def _element(

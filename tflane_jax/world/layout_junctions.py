@@ -73,8 +73,14 @@ def plan_junctions(rng: np.random.Generator, kind: SceneKind, config: RoadConfig
         _arm(rng, np.zeros(2), heading, main, config, minor=False),
         _arm(rng, np.zeros(2), heading + np.pi + kink, main.reversed(), config, minor=False),
     ]
-    arms = [_with_pockets(rng, arm, 0.5 if major > 1 else 0.2, config) for arm in arms]
     side = _draw_side(rng, minor, config)
+    # The side streets lie to the left of `heading` and, at a four-way intersection, to its right.
+    into_left, into_right = side.forward.lanes > 0, four and side.backward.lanes > 0
+    probability = 0.5 if major > 1 else 0.25
+    arms = [
+        _with_pockets(rng, arms[0], probability * into_right, probability * into_left, config),
+        _with_pockets(rng, arms[1], probability * into_left, probability * into_right, config),
+    ]
     skew = np.deg2rad(draw(rng, (-config.skew, config.skew))) if chance(rng, 0.5) else 0.0
     left = heading + np.pi / 2 + skew
     shift = draw(rng, (-config.arm_offset, config.arm_offset)) if chance(rng, 0.4) else 0.0
@@ -161,14 +167,14 @@ def _arm(
 
 
 def _with_pockets(
-    rng: np.random.Generator, arm: ArmPlan, probability: float, config: RoadConfig
+    rng: np.random.Generator, arm: ArmPlan, left: float, right: float, config: RoadConfig
 ) -> ArmPlan:
-    """Give the incoming side of an arm turning lanes."""
+    """Give the incoming side of an arm turning lanes to the left and to the right with these probabilities."""
     pockets: list[Place] = []
-    if chance(rng, probability):
+    if chance(rng, left) and not arm.no_left:
         pockets.append(left_pocket(arm.style))
     incoming = arm.style.backward
-    if not incoming.bike and incoming.lanes < 3 and chance(rng, 0.4 * probability):
+    if chance(rng, 0.5 * right) and not incoming.bike and incoming.lanes < 3:
         pockets.append(Place.RIGHT)
     incoming = replace(
         incoming, pockets=tuple(pockets), pocket_length=draw(rng, config.pocket), taper=draw(rng, config.taper)

@@ -118,7 +118,8 @@ def test_heads_look_around_their_own_points():
     np.testing.assert_allclose(
         out(centre, centre) - bias, out(centre, outside) + out(outside, centre) - 2 * bias, atol=1e-6
     )
-    np.testing.assert_array_equal(out(centre, centre), np.asarray(module.apply(params, *arguments, jnp.array([[centre]]))))
+    together = np.asarray(module.apply(params, *arguments, jnp.array([[centre]])))
+    np.testing.assert_array_equal(out(centre, centre), together)
     with pytest.raises(ValueError, match="1 or 2 points"):
         out(centre, centre, centre)
 

@@ -1,0 +1,1 @@
+"""Comparing configurations over seeds, and the statistics that say what a difference is worth."""

@@ -191,7 +191,8 @@ def lay_connectors(
     stop = np.stack([m.sink.center for m in movements])
     inbound = np.array([m.source.heading for m in movements])
     onward = np.array([m.sink.heading for m in movements])
-    count = max(int(np.ceil(1.2 * np.linalg.norm(stop - start, axis=-1).max() / spacing)), 6) + 1
+    # Turns are tighter than streets bend: closer vertices keep the joints' angles small.
+    count = max(int(np.ceil(1.6 * np.linalg.norm(stop - start, axis=-1).max() / spacing)), 6) + 1
     radius = np.full(len(movements), np.inf)
     if corner_radius is not None:
         turns = [k for k, m in enumerate(movements) if m.turn != THROUGH]

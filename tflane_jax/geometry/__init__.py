@@ -3,6 +3,15 @@
 Functions take numpy or jax arrays and answer in kind, so that the same line runs in float64 on the host and under jit.
 """
 
+from tflane_jax.geometry.cameras import (
+    crop_intrinsics,
+    ground_points,
+    inside_image,
+    project,
+    resize_intrinsics,
+)
+from tflane_jax.geometry.distances import chamfer, discrete_frechet
+from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample, resample_lines, sample_at
 from tflane_jax.geometry.poses import (
     invert_pose,
     matrix_from_quaternion,
@@ -17,11 +26,23 @@ from tflane_jax.geometry.ranges import BevGrid, PerceptionRange
 __all__ = [
     "BevGrid",
     "PerceptionRange",
+    "arc_length",
+    "chamfer",
+    "clip_to_range",
+    "crop_intrinsics",
+    "discrete_frechet",
+    "ground_points",
+    "inside_image",
     "invert_pose",
     "matrix_from_quaternion",
     "pose_matrix",
     "pose_yaw",
+    "project",
     "relative_pose",
+    "resample",
+    "resample_lines",
+    "resize_intrinsics",
+    "sample_at",
     "transform_points",
     "yaw_pose",
 ]

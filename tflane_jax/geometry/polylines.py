@@ -1,8 +1,4 @@
-"""Polylines: arc length, resampling, clipping and the two curve distances of lane metrics.
-
-Resampling and clipping of ragged lines run in numpy (host); the distances run in numpy or under jit on fixed
-shapes.
-"""
+"""Polylines on the host: arc length, resampling and clipping of ragged lines (numpy)."""
 
 from __future__ import annotations
 
@@ -118,16 +114,23 @@ def _inside_interval(
         step = b[:, axis] - a[:, axis]
         parallel = step == 0.0
         inside &= ~parallel | ((low <= a[:, axis]) & (a[:, axis] <= high))
-        inverse = 1.0 / np.where(parallel, 1.0, step)
-        t0, t1 = (low - a[:, axis]) * inverse, (high - a[:, axis]) * inverse
+        t0, t1 = _crossing(a, b, axis, low), _crossing(a, b, axis, high)
         enter = np.where(parallel, enter, np.maximum(enter, np.minimum(t0, t1)))
         leave = np.where(parallel, leave, np.minimum(leave, np.maximum(t0, t1)))
     return enter, leave, inside & (enter <= leave)
 
 
+def _crossing(a: np.ndarray, b: np.ndarray, axis: int, border: float) -> np.ndarray:
+    """Return where each segment a-b meets the border, 0 at a and 1 at b; NaN for a parallel one."""
+    step = b[:, axis] - a[:, axis]
+    return (border - a[:, axis]) / np.where(step == 0.0, np.nan, step)
+
+
 def _on_segment(a: np.ndarray, b: np.ndarray, t: np.ndarray, range_: PerceptionRange) -> np.ndarray:
     point = a + t[:, None] * (b - a)
-    # Rounding must not leave a cut end a hair outside the box, nor move a vertex of the line.
-    point[:, 0] = np.clip(point[:, 0], *range_.x)
-    point[:, 1] = np.clip(point[:, 1], *range_.y)
+    # Rounding must leave a cut end neither a hair outside the box nor a hair inside, nor move a vertex of the line.
+    for axis, borders in enumerate((range_.x, range_.y)):
+        point[:, axis] = np.clip(point[:, axis], *borders)
+        for border in borders:
+            point[_crossing(a, b, axis, border) == t, axis] = border
     return np.where(t[:, None] == 0.0, a, np.where(t[:, None] == 1.0, b, point))

@@ -45,7 +45,9 @@ def relative_pose(
 def transform_points(pose: Float[AnyArray, "*b n n"], points: Float[AnyArray, "*b k d"]) -> Float[Any, "*b k d"]:
     """Apply `pose` (n = d + 1) to points; leading axes broadcast."""
     xp = namespace(pose, points)
-    return points @ xp.swapaxes(pose[..., :-1, :-1], -1, -2) + pose[..., None, :-1, -1]
+    rotated = points @ xp.swapaxes(pose[..., :-1, :-1], -1, -2)
+    shift = pose[..., None, :-1, -1]
+    return rotated + shift.reshape((1,) * (rotated.ndim - shift.ndim) + shift.shape)
 
 
 def matrix_from_quaternion(quaternion: Float[ArrayT, "*b 4"]) -> Float[ArrayT, "*b 3 3"]:

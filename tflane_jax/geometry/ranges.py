@@ -31,13 +31,13 @@ class PerceptionRange:
 
     def normalise(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b d"]:
         """Map metres to [0, 1] inside the box (d = 2 or 3)."""
-        xp, d = namespace(points), points.shape[-1]
-        return (points - xp.asarray(self.low(d), points.dtype)) / xp.asarray(self.size(d), points.dtype)
+        d = points.shape[-1]
+        return (points - _like(points, self.low(d))) / _like(points, self.size(d))
 
     def denormalise(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b d"]:
         """Map [0, 1] inside the box to metres (d = 2 or 3)."""
-        xp, d = namespace(points), points.shape[-1]
-        return xp.asarray(self.low(d), points.dtype) + points * xp.asarray(self.size(d), points.dtype)
+        d = points.shape[-1]
+        return _like(points, self.low(d)) + points * _like(points, self.size(d))
 
     def contains(self, points: Float[ArrayT, "*b d"]) -> Bool[ArrayT, "*b"]:
         """True where x and y lie inside the box, border included (z is not looked at)."""
@@ -74,6 +74,11 @@ class BevGrid:
 
     def pixel(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b 2"]:
         """Map metres to continuous (column, row) with cell centres at integers."""
-        xp = namespace(points)
         unit = self.range.normalise(points[..., :2])
-        return unit * xp.asarray([self.columns, self.rows], points.dtype) - 0.5
+        return unit * _like(unit, (self.columns, self.rows)) - 0.5
+
+
+def _like(points: Float[ArrayT, "*b d"], values: tuple[float, ...]) -> Float[ArrayT, "*b d"]:
+    # Of the same rank: the library runs with jax_numpy_rank_promotion="raise".
+    xp = namespace(points)
+    return xp.asarray(values, points.dtype).reshape((1,) * (points.ndim - 1) + (len(values),))

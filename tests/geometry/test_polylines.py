@@ -1,0 +1,148 @@
+"""Polylines: arc length, resampling and clipping against the official cases, shapely and plain interpolation."""
+
+import gzip
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from shapely import LineString, box
+
+from tests.shared import shared_root
+from tflane_jax.geometry import PerceptionRange, pose_matrix, transform_points
+from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample, sample_at
+
+QUICK = settings(max_examples=60, deadline=None, derandomize=True)
+RANGE = PerceptionRange((-10.0, 10.0), (-5.0, 5.0))
+GOLDEN = shared_root() / "golden/metrics/resample/cases.json.gz"
+
+
+def golden_cases():
+    if not GOLDEN.exists():
+        return []
+    with gzip.open(GOLDEN, "rt") as file:
+        return json.load(file)["cases"]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", golden_cases(), ids=lambda case: f"{len(case['points'])}to{case['n']}")
+def test_golden_resampling(case):
+    expected = np.array(case["expected"])
+    np.testing.assert_allclose(resample(np.array(case["points"]), case["n"]), expected, rtol=0, atol=1e-9)
+
+
+def random_line(seed, points, dims=3, grid=False):
+    rng = np.random.default_rng(seed)
+    line = rng.uniform(-15, 15, (points, dims))
+    # On a grid: repeated vertices, segments along the border and vertices exactly on it.
+    return np.round(line / 5) * 5 if grid else line
+
+
+@QUICK
+@given(seed=st.integers(0, 10**6), points=st.integers(2, 9), count=st.integers(2, 20))
+def test_resampling_equals_interpolation_over_ground_length(seed, points, count):
+    line = random_line(seed, points)
+    along = np.array([0.0, *np.cumsum([np.hypot(*(b - a)[:2]) for a, b in pairwise(line)])])
+    np.testing.assert_allclose(arc_length(line), along, atol=1e-12)
+    distances = np.linspace(0, along[-1], count)
+    expected = np.stack([np.interp(distances, along, line[:, axis]) for axis in range(3)], -1)
+    out = resample(line, count)
+    np.testing.assert_allclose(out, expected, atol=1e-9)
+    np.testing.assert_array_equal(out[[0, -1]], line[[0, -1]])
+    assert arc_length(out)[-1] <= along[-1] + 1e-9
+
+
+@QUICK
+@given(seed=st.integers(0, 10**6), points=st.integers(2, 9), count=st.integers(2, 12))
+def test_resampling_commutes_with_motion_and_reversal(seed, points, count):
+    line = random_line(seed, points)
+    yaw = seed % 7
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    pose = pose_matrix(turn, np.array([3.0, -40.0, 2.0]))
+    np.testing.assert_allclose(resample(transform_points(pose, line), count),
+                               transform_points(pose, resample(line, count)), atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(resample(line[::-1], count), resample(line, count)[::-1], atol=1e-9)
+
+
+def test_resampling_a_straight_line_is_even_and_again_is_the_same():
+    out = resample(np.array([[0.0, 0, 0], [1, 0, 1], [1, 0, 1], [10, 0, 10]]), 11)
+    np.testing.assert_allclose(out, np.arange(11)[:, None] * [1, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(resample(out, 11), out, atol=1e-12)
+
+
+@pytest.mark.parametrize("line", [np.ones((1, 3)), np.ones((4, 3)), np.array([[1.0, 1, 1], [1, 1, 9]])])
+def test_line_without_ground_length_repeats_its_first_point(line):
+    np.testing.assert_array_equal(resample(line, 5), np.ones((5, 3)))
+
+
+def test_no_points_and_distances_beyond_the_ends():
+    with pytest.raises(ValueError, match="without points"):
+        resample(np.zeros((0, 3)), 5)
+    line = np.array([[0.0, 0.0], [2.0, 0.0]])
+    np.testing.assert_array_equal(sample_at(line, np.array([-1.0, 0.5, 3.0])), [[0, 0], [0.5, 0], [2, 0]])
+    assert sample_at(line, np.zeros(0)).shape == (0, 2)
+
+
+@QUICK
+@given(seed=st.integers(0, 10**6), points=st.integers(2, 12), grid=st.booleans())
+def test_clipping_equals_shapely(seed, points, grid):
+    line = random_line(seed, points, grid=grid)
+    assume(arc_length(line)[-1] > 0)
+    pieces = clip_to_range(line, RANGE)
+    for piece in pieces:
+        assert RANGE.contains(piece).all()
+        assert arc_length(piece)[-1] > 0
+    frame = box(RANGE.x[0], RANGE.y[0], RANGE.x[1], RANGE.y[1])
+    segments = [LineString(line[i : i + 2, :2]) for i in range(points - 1) if (line[i, :2] != line[i + 1, :2]).any()]
+    # Segment by segment, because shapely merges what a line covers twice.
+    expected = sum(segment.intersection(frame).length for segment in segments)
+    assert sum(arc_length(piece)[-1] for piece in pieces) == pytest.approx(expected, abs=1e-9)
+    ends = [end for piece in pieces for end in (piece[0], piece[-1])]
+    own = {tuple(vertex) for vertex in line}
+    for end in ends:
+        on_border = np.isin(end[0], RANGE.x) or np.isin(end[1], RANGE.y)
+        assert on_border or tuple(end) in own
+
+
+@QUICK
+@given(seed=st.integers(0, 10**6), points=st.integers(2, 12), grid=st.booleans())
+def test_clipping_cuts_exactly_where_the_line_leaves(seed, points, grid):
+    line = random_line(seed, points, grid=grid)
+    pieces = clip_to_range(line, RANGE)
+    # Sampled finely in the line's own parameter, a piece is a run of points inside: as many runs of some length as
+    # pieces (a touch at one point is no piece), in the same order.
+    t = np.linspace(0, points - 1, 4_000 * (points - 1) + 1)
+    dense = np.stack([np.interp(t, np.arange(points), line[:, axis]) for axis in range(3)], -1)
+    inside = RANGE.contains(dense)
+    starts = np.flatnonzero(np.diff(np.concatenate([[False], inside]).astype(int)) == 1)
+    stops = np.flatnonzero(np.diff(np.concatenate([inside, [False]]).astype(int)) == -1)
+    long = [(i, j) for i, j in zip(starts, stops, strict=True) if arc_length(dense[i : j + 1])[-1] > 0.02]
+    clear = [piece for piece in pieces if arc_length(piece)[-1] > 0.02]
+    assert len(long) == len(clear)
+    for (i, j), piece in zip(long, clear, strict=True):
+        np.testing.assert_allclose(piece[[0, -1]], dense[[i, j]], atol=0.01)
+
+
+def test_clipping_keeps_a_line_inside_and_drops_touches():
+    line = np.array([[-9.0, 0, 1], [0, 1, 2], [9, 0, 3]])
+    (piece,) = clip_to_range(line, RANGE)
+    np.testing.assert_array_equal(piece, line)
+    assert clip_to_range(np.array([[10.0, 8, 0], [10, 5, 0], [14, 5, 0]]), RANGE) == []
+    assert clip_to_range(np.array([[0.0, 8, 0], [9, 8, 0]]), RANGE) == []
+    for size in (0, 1):
+        assert clip_to_range(np.zeros((size, 3)), RANGE) == []
+
+
+def test_clipping_beside_a_parallel_border_moves_no_point_sideways():
+    # Half a metre from the border x = 10, cut at half of its length.
+    (piece,) = clip_to_range(np.array([[9.5, -10, 0], [9.5, 0, 0]]), RANGE)
+    np.testing.assert_array_equal(piece, [[9.5, -5, 0], [9.5, 0, 0]])
+
+
+def test_clipping_interpolates_height_and_splits():
+    line = np.array([[0.0, 0, 0], [20, 0, 10], [20, 2, 10], [0, 2, 0]])
+    first, second = clip_to_range(line, RANGE)
+    np.testing.assert_allclose(first, [[0, 0, 0], [10, 0, 5]])
+    np.testing.assert_allclose(second, [[10, 2, 5], [0, 2, 0]])

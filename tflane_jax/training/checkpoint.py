@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import serialization
 
@@ -139,7 +140,8 @@ class Checkpoints:
         leaves = jax.tree_util.tree_map_with_path(
             lambda path, _: tree["/".join(entry.key for entry in path)], serialization.to_state_dict(template)
         )
-        return jax.device_put(_with_keys(serialization.from_state_dict(template, leaves), template))
+        state: TrainState = serialization.from_state_dict(template, leaves)  # pyright: ignore[reportAssignmentType]
+        return jax.device_put(_with_keys(state, template))
 
     def arrays(self, step: int) -> dict[str, np.ndarray]:
         """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError where they are damaged."""
@@ -201,7 +203,7 @@ def _checksums(folder: Path) -> dict[str, int]:
 
 
 def _is_key(leaf: Any) -> bool:
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _plain(state: TrainState) -> dict[str, np.ndarray]:

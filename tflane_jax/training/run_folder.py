@@ -5,6 +5,7 @@
     metrics.jsonl             records; tensorboard/ holds the same
     checkpoints/              see training.checkpoint
     curves.png, pictures/     drawn at every evaluation
+    evaluations/              tables of `tflane eval`
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from tflane_jax.errors import UserError
 
 Start = Literal["new", "resume", "overwrite"]
 _CONTENT = ("config.json", "config.txt", "provenance.json", "metrics.jsonl", "metrics.jsonl.tmp", "tensorboard",
-            "checkpoints", "curves.png", "pictures", "run.lock")  # fmt: skip
+            "checkpoints", "curves.png", "pictures", "evaluations", "run.lock")  # fmt: skip
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -58,14 +59,7 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
     Raises:
         UserError: the folder is not what `start` says, another process trains into it, or it cannot be written.
     """
-    holds_run = (folder / "config.json").exists()
-    if start == "new" and holds_run:
-        raise UserError(f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
-                        "or choose another folder with --out")  # fmt: skip
-    if start == "resume" and not holds_run:
-        raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
-    if not holds_run and folder.is_dir() and (other := {p.name for p in folder.iterdir()} - set(_CONTENT)):
-        raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
+    check_start(folder, start)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = open(folder / "run.lock", "a")  # noqa: SIM115 (held open while the run lasts)
@@ -77,6 +71,18 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
             for name in _CONTENT:
                 _delete(folder / name)
         yield
+
+
+def check_start(folder: Path, start: Start) -> None:
+    """Raise UserError where the folder is not what `start` says; see `claimed`. Nothing is written."""
+    holds_run = (folder / "config.json").exists()
+    if start == "new" and holds_run:
+        raise UserError(f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
+                        "or choose another folder with --out")  # fmt: skip
+    if start == "resume" and not holds_run:
+        raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
+    if not holds_run and folder.is_dir() and (other := {p.name for p in folder.iterdir()} - set(_CONTENT)):
+        raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
 
 
 def _lock(file: int, folder: Path) -> None:

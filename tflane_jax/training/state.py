@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -56,8 +56,14 @@ def init_states(
         return init_state(task, optimizer, key, example)
 
     if len(seeds) == 1:
-        return jax.jit(init)(keys[0], example)
-    return jax.jit(jax.vmap(init, in_axes=(0, None)))(keys, example)
+        return _run_once(init, keys[0], example)
+    return _run_once(jax.vmap(init, in_axes=(0, None)), keys, example)
+
+
+def _run_once(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function compiled without optimisation: for one call the compiler takes longer than the program."""
+    compiled = jax.jit(function).lower(*arguments).compile({"xla_backend_optimization_level": "0"})
+    return compiled(*arguments)
 
 
 def with_params(state: TrainState, params: Params, optimizer: optax.GradientTransformation) -> TrainState:

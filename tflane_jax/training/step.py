@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Literal
 
-import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -55,7 +54,25 @@ def _guarded(update: UpdateStep) -> UpdateStep:
         finite = metrics["finite"].all()
         return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state), metrics
 
-    return jax.jit(chex.assert_max_traces(guarded, n=1), donate_argnums=0)
+    return jax.jit(_traced_once(guarded), donate_argnums=0)
+
+
+def _traced_once(update: UpdateStep) -> UpdateStep:
+    """Refuse a second trace of this very function.
+
+    Not `chex.assert_max_traces`: that counts by source and call stack, so that training two models from one line of a
+    script would fail.
+    """
+    traces = 0
+
+    def checked(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
+        nonlocal traces
+        traces += 1
+        if traces > 1:
+            raise AssertionError("the update step was traced twice: shapes or types of state or batch have changed")
+        return update(state, batch)
+
+    return checked
 
 
 def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:

@@ -1,0 +1,151 @@
+"""Checkpoints: the same bits back, and a clear message for everything that can be wrong with a folder."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.training.stub import LineTask, line_arrays
+from tflane_jax.errors import UserError
+from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import init_states
+
+CONFIG = {"class": "RunConfig", "training": {"steps": 9}}
+
+
+def state_of(seeds=(0,), features=3):
+    example = jax.tree.map(lambda leaf: leaf[0], line_arrays())
+    optimizer = make_optimizer(OptimConfig(warmup_steps=0), 9)
+    return init_states(LineTask(features), optimizer, seeds, example)
+
+
+@pytest.fixture(scope="module")
+def state():
+    return state_of()
+
+
+def saved(folder, state, scores, **settings):
+    checkpoints = Checkpoints(folder, best_metric="score", **settings)
+    for step, score in scores:
+        metrics = {} if score is None else {"score": score}
+        marked = state.replace(step=jnp.int32(step))
+        checkpoints.save(marked, Manifest(step=step, config=CONFIG, metrics=metrics, progress={"seconds": 0.1}))
+    return checkpoints
+
+
+def words(state):
+    return jax.tree.map(np.array, state.replace(key=jax.random.key_data(state.key)))
+
+
+@pytest.mark.parametrize("seeds", [(0,), (5, 6)])
+def test_round_trip_is_exact(tmp_path, seeds):
+    state = state_of(seeds)
+    odd = jax.tree.map(lambda leaf: leaf * np.float32(1 / 3), state.params)  # full mantissas
+    odd["line"]["bias"] = odd["line"]["bias"].at[..., 0].set(jnp.nan).at[..., 1].set(-0.0)
+    state = state.replace(params=odd)
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(state, Manifest(step=3, config=CONFIG))
+    restored = Checkpoints(tmp_path).restore(3, state)
+    assert jax.tree.structure(restored) == jax.tree.structure(state)
+    for before, after in zip(jax.tree.leaves(words(state)), jax.tree.leaves(words(restored)), strict=True):
+        assert (before.tobytes(), before.dtype, before.shape) == (after.tobytes(), after.dtype, after.shape)
+    np.testing.assert_array_equal(
+        checkpoints.params(3)["line"]["kernel"], np.asarray(state.ema_params["line"]["kernel"])
+    )
+
+
+def test_the_last_ones_and_the_best_are_kept(tmp_path, state):
+    scores = [(1, 0.5), (2, 0.9), (3, 0.9), (4, 0.1), (5, None), (6, None)]
+    checkpoints = saved(tmp_path, state, scores, keep=2)
+    assert checkpoints.steps() == [2, 5, 6]
+    assert (checkpoints.find("best"), checkpoints.find("last"), checkpoints.find(5)) == (2, 6, 5)
+    assert checkpoints.manifest(2).config == CONFIG
+    assert checkpoints.manifest(2).progress == {"seconds": 0.1}
+
+
+def test_saving_a_step_again_replaces_it(tmp_path, state):
+    checkpoints = saved(tmp_path, state, [(1, None), (1, 0.7)])
+    assert checkpoints.steps() == [1]
+    assert checkpoints.manifest(1).metrics == {"score": 0.7}
+
+
+def test_leftovers_of_a_killed_write_are_no_checkpoint(tmp_path, state):
+    leftover = tmp_path / ".writing-123"
+    (leftover / "state").mkdir(parents=True)
+    checkpoints = Checkpoints(tmp_path)
+    assert checkpoints.steps() == []
+    saved(tmp_path, state, [(1, None)])
+    assert not leftover.exists()
+    assert checkpoints.steps() == [1]
+
+
+@pytest.mark.parametrize(
+    ("which", "message"),
+    [("best", "ask for `last`"), (7, "no checkpoint of step 7, only 4")],
+)
+def test_asking_for_what_is_not_there(tmp_path, state, which, message):
+    with pytest.raises(UserError, match=message):
+        saved(tmp_path, state, [(4, None)]).find(which)
+
+
+def test_asking_an_empty_run(tmp_path):
+    with pytest.raises(UserError, match="holds no checkpoint"):
+        Checkpoints(tmp_path / "nothing").find("last")
+
+
+def largest_file(folder):
+    return max((p for p in (folder / "state").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size)
+
+
+@pytest.mark.parametrize("damage", ["flipped bit", "truncated", "file missing", "no manifest", "broken manifest"])
+def test_damage_is_named_with_the_remedy(tmp_path, state, damage):
+    checkpoints = saved(tmp_path, state, [(1, None), (2, None)])
+    folder = checkpoints.path(2)
+    file = largest_file(folder)
+    content = bytearray(file.read_bytes())
+    if damage == "flipped bit":
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+    elif damage == "truncated":
+        file.write_bytes(content[:-1])
+    elif damage == "file missing":
+        file.unlink()
+    elif damage == "no manifest":
+        (folder / "manifest.json").unlink()
+    else:
+        (folder / "manifest.json").write_text('{"step": 2, "conf')
+    with pytest.raises(UserError) as error:
+        checkpoints.restore(2, state)
+    assert str(folder) in str(error.value)
+    assert "delete that folder; the run can go on from step 1" in str(error.value)
+    checkpoints.restore(1, state)
+
+
+def test_a_checkpoint_of_another_model_is_refused(tmp_path, state):
+    checkpoints = saved(tmp_path, state, [(1, None)])
+    with pytest.raises(UserError, match=r"does not fit.*line/bias is float32\[3\], not float32\[4\]"):
+        checkpoints.restore(1, state_of(features=4))
+    with pytest.raises(UserError, match="another model, optimiser or number of seeds"):
+        checkpoints.restore(1, state_of(seeds=(0, 1)))
+    wider = state.replace(params={**state.params, "extra": {"kernel": jnp.zeros(2)}})
+    with pytest.raises(UserError, match="params/extra/kernel"):
+        checkpoints.restore(1, wider)
+
+
+def test_a_layout_of_the_future_is_refused(tmp_path, state):
+    checkpoints = saved(tmp_path, state, [(1, None)])
+    manifest = checkpoints.path(1) / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"version": 1', '"version": 2'))
+    with pytest.raises(UserError, match="layout version 2"):
+        checkpoints.restore(1, state)
+
+
+def test_a_full_disk_is_a_message_and_leaves_nothing(tmp_path, state, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tflane_jax.training.checkpoint._save_tree", full)
+    with pytest.raises(UserError, match="No space left on device"):
+        saved(tmp_path, state, [(1, None)])
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,208 @@
+"""The training program: same bits on a rerun and after a kill, and a clean end for everything that can go wrong."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.shared import ROOT
+from tests.training.stub import LineTask, line_arrays
+from tests.training.stub_run import CONFIG, OPTIM, RESOLVED, run, score
+from tflane_jax.errors import UserError
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.loop import train
+from tflane_jax.training.records import read_records
+
+
+def arrays(folder: Path, step: int = 30) -> dict[str, bytes]:
+    return {name: leaf.tobytes() for name, leaf in Checkpoints(folder / "checkpoints").arrays(step).items()}
+
+
+def timeless(folder: Path) -> list[dict]:
+    return [{k: v for k, v in record.items() if k != "seconds"} for record in read_records(folder / "metrics.jsonl")]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that was never stopped."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    result = run(folder)
+    assert (result.step, result.stopped_by) == (30, None)
+    assert result.metrics == score(Checkpoints(folder / "checkpoints").params(30))
+    return folder
+
+
+def test_a_rerun_gives_the_same_bits(whole, tmp_path):
+    run(tmp_path / "run")
+    assert arrays(tmp_path / "run") == arrays(whole)
+    assert timeless(tmp_path / "run") == timeless(whole)
+
+
+def test_another_seed_gives_other_bits(whole, tmp_path):
+    run(tmp_path / "run", config=dataclasses.replace(CONFIG, seeds=(1,)))
+    assert arrays(tmp_path / "run") != arrays(whole)
+
+
+def test_a_killed_run_goes_on_to_the_same_bits(whole, tmp_path):
+    folder = tmp_path / "run"
+    for start, kill, last in (("new", "evaluation:20", 14), ("resume", "checkpoint:28", 21)):
+        command = [sys.executable, "-m", "tests.training.stub_run", str(folder), start, kill]
+        ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
+        assert ended.returncode == -signal.SIGKILL, ended.stderr
+        assert Checkpoints(folder / "checkpoints").steps()[-1] == last
+    # What a killed process had begun to write.
+    with open(folder / "metrics.jsonl", "a") as file:
+        file.write('{"step": 28, "spl')
+    result = run(folder, start="resume")
+    assert result.step == 30
+    assert arrays(folder) == arrays(whole)
+    assert timeless(folder) == timeless(whole)
+    assert len(json.loads((folder / "provenance.json").read_text())) == 3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_step_and_keeps_it(whole, tmp_path, number):
+    def evaluate_and_signal(params):
+        os.kill(os.getpid(), number)
+        return score(params)
+
+    before = signal.getsignal(number)
+    result = run(tmp_path / "run", evaluate=evaluate_and_signal)
+    assert signal.getsignal(number) is before
+    assert (result.step, result.stopped_by) == (10, number)
+    run(tmp_path / "run", start="resume")
+    assert arrays(tmp_path / "run") == arrays(whole)
+
+
+def test_a_complete_run_resumes_to_itself(whole):
+    before = arrays(whole)
+    assert run(whole, start="resume").step == 30
+    assert arrays(whole) == before
+
+
+def test_records_are_means_over_the_steps_between(whole, tmp_path):
+    run(tmp_path / "run", config=dataclasses.replace(CONFIG, log_every=1))
+    single = [r["loss"] for r in timeless(tmp_path / "run") if r["split"] == "train"]
+    records = timeless(whole)
+    train_records = [r for r in records if r["split"] == "train"]
+    assert [r["step"] for r in train_records] == [4, 8, 12, 16, 20, 24, 28, 30]
+    means = [np.mean(single[i : min(i + 4, 30)]) for i in range(0, 30, 4)]
+    np.testing.assert_allclose([r["loss"] for r in train_records], means, rtol=1e-12)
+    assert [r["step"] for r in records if r["split"] == "val"] == [10, 20, 30]
+    assert {"loss", "loss/fit", "loss/explosive", "grad_norm", "learning_rate"} < train_records[0].keys()
+
+
+def test_the_folder_tells_where_the_numbers_come_from(whole):
+    assert json.loads((whole / "config.json").read_text()) == RESOLVED
+    start, *_ = json.loads((whole / "provenance.json").read_text())
+    assert start["packages"]["jax"].startswith("0.1")
+    assert start["git"] is None or len(start["git"]["commit"]) == 40
+    assert list((whole / "tensorboard").glob("events.*"))
+    assert Checkpoints(whole / "checkpoints", best_metric="score").manifest(30).config == RESOLVED
+
+
+def test_several_seeds_train_side_by_side(whole, tmp_path):
+    result = run(tmp_path / "run", config=dataclasses.replace(CONFIG, seeds=(0, 5)))
+    together = Checkpoints(tmp_path / "run" / "checkpoints").params(30)["line"]["kernel"]
+    alone = Checkpoints(whole / "checkpoints").params(30)["line"]["kernel"]
+    np.testing.assert_allclose(together[0], alone, atol=1e-5)
+    last = timeless(tmp_path / "run")[-1]
+    assert result.metrics["score"] == pytest.approx(np.mean(last["score"]))
+    assert len(last["score"]) == 2
+
+
+def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, tmp_path):
+    # The largest value of the arrays comes in the batch of some step; the infinite term is met there.
+    limit = float(line_arrays()["x"].max()) - 1e-3
+    folder = tmp_path / "run"
+    with pytest.raises(UserError, match=r"step \d+, seed 0: .*loss/explosive = inf.*is not finite") as error:
+        run(folder, task=LineTask(blow_up=limit))
+    kept = Checkpoints(folder / "checkpoints").steps()[-1]
+    assert f"step {kept + 1}," in str(error.value)
+    assert str(Checkpoints(folder / "checkpoints").path(kept)) in str(error.value)
+    # That state is the one of the run that never met it.
+    short = dataclasses.replace(CONFIG, checkpoint_every=1, eval_every=1000, keep_checkpoints=40)
+    run(tmp_path / "other", config=short)
+    assert arrays(folder, kept) == arrays(tmp_path / "other", kept)
+
+
+def test_fine_tuning_starts_from_the_best_average(whole, tmp_path):
+    config = dataclasses.replace(CONFIG, steps=1, init_from=str(whole))
+    run(tmp_path / "run", config=config, optim=dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0))
+    best = Checkpoints(whole / "checkpoints", best_metric="score")
+    start = Checkpoints(tmp_path / "run" / "checkpoints").params(1)["line"]["kernel"]
+    np.testing.assert_allclose(start, best.params(best.find("best"))["line"]["kernel"], rtol=1e-6)
+    with pytest.raises(UserError, match="holds another model"):
+        run(tmp_path / "other", config=dataclasses.replace(config, steps=9), task=LineTask(features=2))
+
+
+def test_drawing_sees_every_evaluation(tmp_path):
+    seen = []
+    run(tmp_path / "run", draw=lambda folder, step, params, records: seen.append((folder, step, len(records))))
+    assert [step for _, step, _ in seen] == [10, 20, 30]
+    assert seen[-1][2] == len(read_records(tmp_path / "run" / "metrics.jsonl"))
+
+
+def test_folders_that_are_not_fit_are_refused(whole, tmp_path):
+    with pytest.raises(UserError, match=r"already holds a run.*--resume.*--overwrite"):
+        run(whole)
+    with pytest.raises(UserError, match="holds no run to resume"):
+        run(tmp_path / "nothing", start="resume")
+    with pytest.raises(UserError, match=r"another configuration \(training\.best_metric: score there, other here\)"):
+        run(whole, start="resume", resolved=RESOLVED | {"training": RESOLVED["training"] | {"best_metric": "other"}})
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").touch()
+    for start in ("new", "overwrite"):
+        with pytest.raises(UserError, match=r"cat\.jpg"):
+            run(tmp_path / "photos", start=start)
+    assert (tmp_path / "photos" / "cat.jpg").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="cannot write to"):
+        run(tmp_path / "file" / "run")
+
+
+def test_overwriting_starts_again_and_spares_foreign_files(tmp_path):
+    folder = tmp_path / "run"
+    short = dataclasses.replace(CONFIG, steps=10)
+    run(folder)
+    (folder / "notes.txt").touch()
+    run(folder, start="overwrite", config=short)
+    assert Checkpoints(folder / "checkpoints").steps() == [7, 10]
+    assert timeless(folder)[-1]["step"] == 10
+    assert (folder / "notes.txt").exists()
+
+
+def test_two_processes_never_share_a_folder(tmp_path):
+    def second(params):
+        with pytest.raises(UserError, match="another process is training"):
+            run(tmp_path / "run", start="resume")
+        return score(params)
+
+    run(tmp_path / "run", evaluate=second, config=dataclasses.replace(CONFIG, steps=10))
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [({"steps": 0}, "steps"), ({"batch_size": 0}, "batch_size"), ({"log_every": 0}, "log_every"),
+     ({"seeds": ()}, "seeds"), ({"seeds": (1, 1)}, "seeds")],
+)  # fmt: skip
+def test_settings_that_cannot_work_are_named(tmp_path, change, name):
+    with pytest.raises(UserError, match=rf"training\.{name} is"):
+        run(tmp_path / "run", config=dataclasses.replace(CONFIG, **change))
+    assert not (tmp_path / "run").exists()
+
+
+def test_training_needs_no_evaluation(tmp_path):
+    config = dataclasses.replace(CONFIG, steps=3)
+    result = train(
+        LineTask(), line_arrays(), tmp_path / "run", config=config, optim=dataclasses.replace(OPTIM, warmup_steps=0),
+        resolved=RESOLVED, progress=False,
+    )  # fmt: skip
+    assert (result.step, result.metrics) == (3, {})
+    assert Checkpoints(tmp_path / "run" / "checkpoints").find("last") == 3

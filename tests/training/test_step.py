@@ -1,0 +1,137 @@
+"""The update step: one trace, safety against non-finite numbers, averaging, several seeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.training.stub import LineTask, line_arrays
+from tflane_jax.training.batches import batch_indices
+from tflane_jax.training.rng import stream
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import init_states, per_seed
+from tflane_jax.training.step import make_multi_seed_step, make_update_step, moving_average
+
+OPTIM = OptimConfig(lr=0.01, warmup_steps=2)
+STEPS = 20
+ARRAYS = line_arrays()
+
+
+def fresh(seeds=(0,)):
+    example = jax.tree.map(lambda leaf: leaf[0], ARRAYS)
+    return init_states(LineTask(), make_optimizer(OPTIM, STEPS), seeds, example)
+
+
+def batch_of(seed, step, size=4):
+    return jax.tree.map(lambda leaf: leaf[batch_indices(seed, step, 20, size)], ARRAYS)
+
+
+def test_steps_are_plain_adamw_on_the_tasks_gradient():
+    task, optimizer = LineTask(), make_optimizer(OPTIM, STEPS)
+    state, update = fresh(), make_update_step(task, OPTIM, STEPS)
+    value_and_grad, optimizer_update = jax.jit(jax.value_and_grad(task.loss, has_aux=True)), jax.jit(optimizer.update)
+    params, opt_state, average = (jax.tree.map(jnp.copy, t) for t in (state.params, state.opt_state, state.params))
+    for step in range(4):
+        batch = batch_of(0, step)
+        key = stream(jax.random.key(0), "dropout", step)
+        (loss, terms), grads = value_and_grad(params, batch, key)
+        updates, opt_state = optimizer_update(grads, opt_state, params)
+        params = optax.apply_updates(params, updates)
+        decay = min(OPTIM.ema_decay, (1 + step) / (10 + step))
+        average = jax.tree.map(lambda a, p, d=decay: d * a + (1 - d) * p, average, params)
+
+        state, metrics = update(state, batch)
+        np.testing.assert_allclose(metrics["loss"], loss, rtol=1e-5)
+        np.testing.assert_allclose(metrics["loss/fit"], terms["fit"], rtol=1e-5)
+        norm = np.sqrt(sum(np.square(np.asarray(g)).sum() for g in jax.tree.leaves(grads)))
+        np.testing.assert_allclose(metrics["grad_norm"], norm, rtol=1e-5)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), state.params, params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4), state.ema_params, average)
+    assert state.step == 4
+
+
+def test_learning_rate_is_that_of_the_update():
+    state, update = fresh(), make_update_step(LineTask(), OPTIM, STEPS)
+    rates = []
+    for step in range(3):
+        state, metrics = update(state, batch_of(0, step))
+        rates.append(float(metrics["learning_rate"]))
+    np.testing.assert_allclose(rates, [0.01 / 3, 0.01 * 2 / 3, 0.01], rtol=1e-5)
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
+def test_one_trace_and_an_error_for_a_second(seeds):
+    state = fresh(seeds)
+    if len(seeds) == 1:
+        update = make_update_step(LineTask(), OPTIM, STEPS)
+    else:
+        update = make_multi_seed_step(LineTask(), OPTIM, STEPS, batch="shared")
+    for step in range(3):
+        state, _ = update(state, batch_of(0, step))
+    with pytest.raises(AssertionError, match="traced"):
+        update(state, batch_of(0, 0, size=5))
+
+
+@pytest.mark.parametrize("poison", ["loss", "gradient"])
+def test_non_finite_numbers_leave_the_state_as_it_was(poison):
+    class Poisoned(LineTask):
+        def loss(self, params, batch, key):
+            loss, terms = super().loss(params, batch, key)
+            if poison == "loss":
+                return loss + jnp.where(batch["bad"].any(), jnp.nan, 0.0), terms
+            # sqrt(0) is finite, its gradient is not.
+            return loss + jnp.sqrt(jnp.where(batch["bad"].any(), 0.0 * loss, 1.0)), terms
+
+    state, update = fresh(), make_update_step(Poisoned(), OPTIM, STEPS)
+    good, bad = ({**batch_of(0, 0), "bad": np.full(4, flag)} for flag in (False, True))
+    state, metrics = update(state, good)
+    assert metrics["finite"]
+    before = jax.tree.map(np.array, state.replace(key=jax.random.key_data(state.key)))
+    state, metrics = update(state, bad)
+    assert not metrics["finite"]
+    assert np.isfinite(metrics["loss"]) == (poison == "gradient")
+    after = jax.tree.map(np.array, state.replace(key=jax.random.key_data(state.key)))
+    jax.tree.map(np.testing.assert_array_equal, after, before)
+
+
+def test_one_bad_seed_holds_all_seeds():
+    state = fresh((0, 1))
+    update = make_multi_seed_step(LineTask(blow_up=100.0), OPTIM, STEPS, batch="per_seed")
+    batch = jax.tree.map(lambda a, b: np.stack([a, b]), batch_of(0, 0), batch_of(1, 0))
+    batch["x"][1, 0, 0] = 1000.0
+    state, metrics = update(state, batch)
+    assert metrics["finite"].tolist() == [True, False]
+    assert state.step.tolist() == [0, 0]
+
+
+def test_several_seeds_start_with_the_bits_of_each_alone():
+    alone, together = fresh((8,)), per_seed(fresh((3, 8)), (3, 8))[1]
+    jax.tree.map(np.testing.assert_array_equal, alone.params, together.params)
+
+
+@pytest.mark.parametrize("sharing", ["shared", "per_seed"])
+def test_several_seeds_are_each_as_if_alone(sharing):
+    seeds = (3, 8, 11)
+    together = fresh(seeds)
+    update = make_multi_seed_step(LineTask(), OPTIM, STEPS, batch=sharing)
+    single = make_update_step(LineTask(), OPTIM, STEPS)
+    alone = jax.tree.map(jnp.copy, per_seed(together, seeds))
+    for step in range(6):
+        each = [batch_of(seed if sharing == "per_seed" else 0, step) for seed in seeds]
+        stacked = each[0] if sharing == "shared" else jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+        together, metrics = update(together, stacked)
+        results = [single(state, batch) for state, batch in zip(alone, each, strict=True)]
+        alone = [state for state, _ in results]
+        np.testing.assert_allclose(metrics["loss"], [m["loss"] for _, m in results], rtol=1e-5)
+    for one, same in zip(alone, per_seed(together, seeds), strict=True):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), one.params, same.params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), one.ema_params, same.ema_params)
+
+
+@pytest.mark.parametrize(
+    ("step", "decay", "expected"), [(0, 0.999, 0.1), (8, 0.999, 0.5), (10**6, 0.999, 0.999), (5, 0.0, 0.0)]
+)
+def test_moving_average(step, decay, expected):
+    average = moving_average({"w": jnp.array([1.0])}, {"w": jnp.array([0.0])}, step, decay)
+    np.testing.assert_allclose(average["w"], [expected], rtol=1e-6)

@@ -1,0 +1,77 @@
+"""Predicting a whole dataset and measuring the lanes of it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from tflane_jax.metrics.frames import detections_from_prediction, truth_from_example
+from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
+from tflane_jax.scene import Example, LanePrediction, Prediction
+from tflane_jax.training.task import Params, Task
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def predict_batch(task: Task, params: Params, batch: Any) -> Any:
+    """Return the answers for a batch (leading axis on every leaf); compiled once per task and shape."""
+    return jax.vmap(task.predict, in_axes=(None, 0))(params, batch)
+
+
+def predictions(task: Task, params: Params, arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]:
+    """Yield the answers for all examples in order: their indices and a stacked tree of numpy arrays.
+
+    Args:
+        task, params: the model; hashable, see `Task`.
+        arrays: stacked examples, numpy leaves with a leading axis.
+        batch_size: examples predicted at a time. The last batch is filled up and cut, so that one program serves all.
+    """
+    params, examples = jax.device_put(params), len(jax.tree.leaves(arrays)[0])
+    for start in range(0, examples, batch_size):
+        indices = range(start, min(start + batch_size, examples))
+        filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
+        batch = jax.tree.map(lambda leaf, rows=filled: np.take(leaf, rows, axis=0), arrays)
+        answers, kept = jax.device_get(predict_batch(task, params, batch)), slice(len(indices))
+        yield indices, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
+
+
+def evaluate_lanes(task: Task, params: Params, arrays: Example, batch_size: int = 16) -> GroupedCenterlineMetrics:
+    """Return the filled accumulator of OpenLane-V2's centerline metrics (groups all, occluded, clear) of a dataset.
+
+    Args:
+        task: predicts lanes.
+        params: of the task.
+        arrays: stacked examples with `lanes`.
+        batch_size: see `predictions`.
+
+    Raises:
+        ValueError: the task predicts no lanes.
+    """
+    metrics = GroupedCenterlineMetrics()
+    for indices, answer in predictions(task, params, arrays, batch_size):
+        lanes = _lanes(answer)
+        for row, index in enumerate(indices):
+            truth = jax.tree.map(lambda leaf, i=index: leaf[i], arrays.lanes)
+            found = jax.tree.map(lambda leaf, i=row: leaf[i], lanes)
+            metrics.update(detections_from_prediction(found), truth_from_example(truth))
+    return metrics
+
+
+def scores(metrics: GroupedCenterlineMetrics) -> dict[str, float]:
+    """Return the metrics as "group/name", without counts: what a run records and checkpoints are chosen by."""
+    computed = metrics.compute()
+    return {
+        f"{group}/{name}": value
+        for group, values in computed.items()
+        for name, value in values.items()
+        if name not in ("frames", "lanes")
+    }
+
+
+def _lanes(answer: Prediction) -> LanePrediction:
+    if answer.lanes is None:
+        raise ValueError("this task predicts no lanes, so there is nothing to measure")
+    return answer.lanes

@@ -1,0 +1,251 @@
+"""The command line: train, resume, evaluate and predict on fake examples, and what it says when something is wrong."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_prediction
+from tests.shared import ROOT
+from tflane_jax.cli import build_parser, main
+from tflane_jax.scene import Prediction
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.records import read_records
+
+CONFIG = '''"""A tiny model for the tests of the command line."""
+
+from dataclasses import replace
+
+from tflane_jax.config import EvaluationConfig, RunConfig
+from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+
+
+def get_config():
+    return RunConfig(
+        task=LaneGraphTask(TopoNetConfig(traffic_flow=TrafficFlowConfig(TrafficFlowPriorConfig(max_instances=4)))),
+        optim=OptimConfig(lr=0.01, warmup_steps=1),
+        training=TrainingConfig(steps=4, batch_size=2, log_every=2, eval_every=2, checkpoint_every=2),
+        evaluation=EvaluationConfig(batch_size=2, pictures=1),
+    )
+
+
+def ablations():
+    return {"baseline": replace(get_config(), task=LaneGraphTask())}
+'''
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fakes():
+    """Fake examples, and instead of the model one that moves a fixed prediction: it compiles in no time."""
+
+    def open_fake(source, *, progress=True):
+        return FakeDataset(FakeConfig(5))
+
+    def init(task, key, example):
+        return {"shift": {"kernel": jax.random.normal(key, (1, 3))}}
+
+    def loss(task, params, batch, key):
+        points = (params["shift"]["kernel"] ** 2).mean() + batch.lanes.valid.mean()
+        return points, {"points": points}
+
+    def predict(task, params, example):
+        prediction = jax.tree.map(jnp.asarray, fake_prediction(0))
+        return Prediction(prediction.replace(points=prediction.points + params["shift"]["kernel"][None]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for function in (init, loss, predict):
+            patch.setattr(LaneGraphTask, function.__name__, function)
+        for module in ("runs", "commands.predict"):
+            patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
+        yield
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    path = tmp_path_factory.mktemp("configs") / "tiny.py"
+    path.write_text(CONFIG)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, config):
+    folder = tmp_path_factory.mktemp("runs") / "tiny"
+    assert main(["train", "--config", str(config), "--out", str(folder), "--training.seeds", "3"]) == 0
+    return folder
+
+
+def test_help_is_instant_and_imports_nothing_slow():
+    code = "import sys; from tflane_jax.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
+    started = time.perf_counter()
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert time.perf_counter() - started < 2.0  # 0.1 s on an idle machine
+    assert not {"jax", "numpy", "flax", "tyro", "matplotlib"} & set(loaded.split())
+
+
+def test_a_run_folder_holds_everything(trained):
+    names = {path.name for path in trained.iterdir()}
+    assert names == {"config.json", "config.txt", "provenance.json", "metrics.jsonl", "tensorboard", "checkpoints",
+                     "curves.png", "pictures", "run.lock"}  # fmt: skip
+    assert sorted(p.name for p in (trained / "pictures").iterdir()) == ["step_00000002.png", "step_00000004.png"]
+    assert "training.seeds = [3]\n" in (trained / "config.txt").read_text()
+    validation = [r for r in read_records(trained / "metrics.jsonl") if r["split"] == "val"]
+    assert [r["step"] for r in validation] == [2, 4]
+    assert {"all/DET_l", "all/TOP_ll", "occluded/DET_l", "clear/DET_l"} < validation[0].keys()
+
+
+def test_training_again_needs_a_word(trained, config, capsys):
+    before = sorted((trained / "checkpoints").rglob("*"))
+    assert main(["train", "--config", str(config), "--out", str(trained)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"tflane: {trained} already holds a run")
+    assert said.count("\n") == 1
+    assert sorted((trained / "checkpoints").rglob("*")) == before
+
+
+def test_resume_needs_the_folder_only(trained, capsys):
+    assert main(["train", "--resume", "--out", str(trained)]) == 0
+    assert "4 steps" in capsys.readouterr().out
+    assert main(["train", "--resume", "--out", str(trained), "--optim.lr", "1"]) == 2
+    assert "its own configuration" in capsys.readouterr().err
+
+
+def test_evaluation_prints_and_writes_the_table(trained, capsys):
+    assert main(["eval", str(trained), "--split", "val", "--checkpoint", "last"]) == 0
+    said = capsys.readouterr().out
+    assert "OpenLane-V2 centerline v2.1" in said
+    written = json.loads((trained / "evaluations" / "procedural-val-step4.json").read_text())
+    assert (written["meta"]["step"], written["meta"]["max_instances"]) == (4, None)
+    assert "v2.1" in written["meta"]["protocol"]
+    rows = {row["lanes of"]: row for row in written["rows"]}
+    assert {group: row["lanes"] for group, row in rows.items()} == {"all": 10, "occluded": 5, "clear": 5}
+    recorded = [r for r in read_records(trained / "metrics.jsonl") if r["split"] == "val"][-1]
+    assert rows["all"]["DET_l"] == recorded["all/DET_l"]
+    assert (trained / "evaluations" / "procedural-val-step4.md").read_text().strip() in said
+
+
+def test_traffic_flow_can_be_limited(trained, tmp_path, capsys):
+    assert main(["eval", str(trained), "--max-instances", "0", "--out", str(tmp_path / "none")]) == 0
+    assert json.loads((tmp_path / "none.json").read_text())["meta"]["max_instances"] == 0
+    assert main(["eval", str(trained), "--max-instances", "5"]) == 2
+    assert "outside 0 to 4" in capsys.readouterr().err
+
+
+def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
+    out = tmp_path / "predictions"
+    assert main(["predict", str(trained), "--count", "2", "--out", str(out), "--threshold", "0"]) == 0
+    assert {p.name for p in out.iterdir()} == {"predictions.npz", "predictions.json", "pictures.png"}
+    arrays, plain = np.load(out / "predictions.npz"), json.loads((out / "predictions.json").read_text())
+    assert arrays["points"].shape == (2, 6, POINTS, 3)
+    assert arrays["timestamp_ns"].tolist() == [10**18, 10**18 + 4]
+    for i, frame in enumerate(plain["frames"]):
+        assert (frame["scene"], frame["timestamp_ns"]) == (arrays["scene"][i], arrays["timestamp_ns"][i])
+        assert [lane["score"] for lane in frame["lanes"]] == sorted(arrays["scores"][i].tolist(), reverse=True)
+        for lane in frame["lanes"]:
+            np.testing.assert_array_equal(np.float32(lane["points"]), arrays["points"][i, lane["query"]])
+        for link in frame["successors"]:
+            a, b = (frame["lanes"][link[end]]["query"] for end in ("from", "to"))
+            assert link["score"] == arrays["successor"][i, a, b] >= 0.5
+
+
+def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):
+    folder = tmp_path / "baseline"
+    assert main(["train", "--config", f"{config}:baseline", "--out", str(folder), "--training.steps", "2"]) == 0
+    assert main(["eval", str(folder), "--max-instances", "0"]) == 2
+    assert "without traffic flow" in capsys.readouterr().err
+
+
+def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
+    folder = tmp_path / "seeds"
+    arguments = ["--training.seeds", "0", "1", "--training.steps", "2"]
+    assert main(["train", "--config", f"{config}:baseline", "--out", str(folder), *arguments]) == 0
+    assert main(["eval", str(folder), "--out", str(tmp_path / "table")]) == 0
+    rows = [r for r in json.loads((tmp_path / "table.json").read_text())["rows"] if r["lanes of"] == "all"]
+    assert [row["seed"] for row in rows] == [0, 1, "mean", "std"]
+    values = [row["DET_l"] for row in rows]
+    np.testing.assert_allclose(values[2:], [np.mean(values[:2]), np.std(values[:2], ddof=1)])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train"], "say what to train"),
+        (["train", "--config", "nowhere.py"], "config file nowhere.py does not exist"),
+        (["train", "--resume"], "say which run to resume"),
+        (["train", "--resume", "--out", "nowhere"], "nowhere holds no run"),
+        (["train", "--config", "CONFIG", "--optim.learning_rate", "1"], "unknown setting --optim.learning_rate"),
+        (["train", "--config", "CONFIG", "--optim.ll", "1"], "did you mean --optim.lr"),
+        (["train", "--config", "CONFIG", "--optim.lr", "high"], "could not convert string to float: 'high'"),
+        (["train", "--config", "CONFIG:no_such"], "has no ablation no_such, only baseline"),
+        (["eval", "nowhere"], "holds no checkpoint"),
+        (["eval", "RUN", "--checkpoint", "77"], "has no checkpoint of step 77, only 2, 4"),
+        (["eval", "RUN", "--data", "argoverse2"], "needs --root"),
+        (["eval", "RUN", "--root", "logs"], "add --data argoverse2"),
+        (["predict", "RUN", "--out", "RUN/config.json"], "cannot write to"),
+        (["predict", "RUN", "--count", "0", "--out", "x"], "nothing to predict"),
+        (["data", "check", "nowhere"], "nowhere holds no Argoverse 2 log"),
+    ],
+)
+def test_errors_are_one_line_without_a_traceback(arguments, message, config, trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    arguments = [a.replace("CONFIG", str(config)).replace("RUN", str(trained)) for a in arguments]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.startswith("tflane: ")
+    assert said.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "arguments", [["evaluate"], ["eval", "run", "--splt", "val"], ["eval", "run", "--checkpoint", "x"]]
+)
+def test_unknown_words_exit_with_2(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_help_of_a_config_lists_its_settings(config, capsys):
+    assert main(["train", "--config", str(config), "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "--overwrite" in said
+    assert "task.model.traffic_flow.prior.max_instances = 4\n" in said
+
+
+def test_every_command_has_help(capsys):
+    help_of = re.findall(r"^    (\w+) ", build_parser().format_help(), re.M)
+    assert help_of == ["train", "eval", "predict", "data", "demo", "bench"]
+    for command in help_of[1:]:
+        with pytest.raises(SystemExit) as ended:
+            main([command, "--help"])
+        assert ended.value.code == 0
+        assert capsys.readouterr().out.startswith(f"usage: tflane {command}")
+
+
+def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
+    import signal
+
+    from tflane_jax import runs
+
+    def interrupting(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        return evaluate(*arguments)
+
+    evaluate = runs.evaluate_lanes
+    monkeypatch.setattr(runs, "evaluate_lanes", interrupting)
+    folder = tmp_path / "stopped"
+    assert main(["train", "--config", f"{config}:baseline", "--out", str(folder)]) == 130
+    said = capsys.readouterr().err
+    assert f"stopped by SIGINT after step 2; go on with: tflane train --resume --out {folder}" in said

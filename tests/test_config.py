@@ -1,0 +1,175 @@
+"""Configurations: files, overrides, text and JSON, and the golden text of every shipped configuration."""
+
+import dataclasses
+import enum
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from tests.shared import ROOT
+from tflane_jax.config import LogData, RunConfig, apply_overrides, load_ablations, load_config
+from tflane_jax.config_io import from_json, settings, to_json, to_text
+from tflane_jax.errors import UserError
+from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+
+GOLDEN = Path(__file__).parent / "golden_configs"
+FLOW = RunConfig(task=LaneGraphTask(TopoNetConfig(traffic_flow=TrafficFlowConfig())))
+
+
+def shipped() -> dict[str, str]:
+    """Return name -> reference of every configuration and ablation under configs/."""
+    found = {"default": ""}
+    for path in sorted((ROOT / "configs").rglob("*.py")):
+        if path.name.startswith("_"):
+            continue
+        reference = path.relative_to(ROOT).as_posix()
+        name = reference.removeprefix("configs/").removesuffix(".py").replace("/", ".")
+        found[name] = reference
+        if "def ablations(" in path.read_text(encoding="utf-8"):
+            found |= {f"{name}.{ablation}": f"{reference}:{ablation}" for ablation in load_ablations(str(path))}
+    return found
+
+
+@pytest.mark.parametrize(("name", "reference"), shipped().items())
+def test_shipped_configurations_have_not_changed_silently(name, reference, monkeypatch, tmp_path):
+    monkeypatch.chdir(ROOT)
+    text = to_text(load_config(reference) if reference else RunConfig())
+    golden = GOLDEN / f"{name}.txt"
+    if not golden.exists() or golden.read_text(encoding="utf-8") != text:
+        (tmp_path / golden.name).write_text(text, encoding="utf-8")
+        pytest.fail(f"{name} has changed; if that is meant: cp {tmp_path / golden.name} {golden}")
+
+
+def test_every_golden_text_has_its_configuration():
+    assert {path.stem for path in GOLDEN.glob("*.txt")} == set(shipped())
+
+
+@pytest.mark.parametrize(
+    "config", [RunConfig(), FLOW, RunConfig(data=LogData(Path("a"), Path("b/c"), Path("d"), openlane=Path("e")))]
+)
+def test_json_round_trip(config):
+    assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config
+    assert hash(config) == hash(from_json(RunConfig, to_json(config)))
+
+
+class Colour(enum.Enum):
+    RED = "crimson"
+
+
+@dataclass(frozen=True)
+class Inner:
+    pairs: tuple[tuple[Colour, float], ...] = ((Colour.RED, 0.5),)
+
+
+@dataclass(frozen=True)
+class Other:
+    size: int = 1
+
+
+@dataclass(frozen=True)
+class Outer:
+    part: Inner | Other | None = None
+    mode: Literal["a", "b"] = "a"
+    rate: float = 1.0
+    path: Path | None = None
+
+
+def test_text_is_one_line_per_setting():
+    assert to_text(Outer(Inner(), path=Path("x/y"))) == (
+        "part = Inner\npart.pairs = [['RED', 0.5]]\nmode = 'a'\nrate = 1.0\npath = 'x/y'\n"
+    )
+
+
+@pytest.mark.parametrize("value", [Outer(), Outer(Inner(), "b", 2.5, Path("p")), Outer(Other(3)), Outer(Inner(()))])
+def test_every_kind_of_setting_comes_back(value):
+    assert from_json(Outer, json.loads(json.dumps(to_json(value)))) == value
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mode": "c"}, "setting mode cannot be 'c'"),
+        ({"rate": "fast"}, "setting rate cannot be 'fast'"),
+        ({"rate": True}, "setting rate cannot be True"),
+        ({"speed": 3}, "setting speed is unknown"),
+        ({"part": {"class": "os.system", "size": 1}}, "setting part cannot be"),
+        ({"part": {"class": "Other", "size": 1.5}}, r"setting part\.size cannot be 1\.5"),
+        ({"part": {"class": "Inner", "pairs": [["BLUE", 1.0]]}}, r"setting part\.pairs cannot be 'BLUE'"),
+        ({"class": "Inner"}, "should be a Outer"),
+    ],
+)
+def test_json_that_does_not_fit_is_named(change, message):
+    with pytest.raises(UserError, match=message):
+        from_json(Outer, to_json(Outer()) | change)
+
+
+def test_settings_that_a_file_lacks_take_their_defaults():
+    assert from_json(Outer, {"class": "Outer", "rate": 2.0}) == Outer(rate=2.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changed"),
+    [
+        ([], {}),
+        (["--optim.lr", "1e-3"], {"optim.lr": 1e-3}),
+        (["--optim.lr=1e-3", "--training.seeds", "4", "5"], {"optim.lr": 1e-3, "training.seeds": (4, 5)}),
+        (["--training.init-from", "runs/a"], {"training.init_from": "runs/a"}),
+        (
+            ["--task.model.traffic_flow.prior.top_instances", "0"],
+            {"task.model.traffic_flow.prior.top_instances": 0},
+        ),
+        (["--data.world.severity", "1"], {"data.world.severity": 1.0}),
+    ],
+)
+def test_overrides_change_what_they_name(arguments, changed):
+    before, after = dict(settings(FLOW)), dict(settings(apply_overrides(FLOW, arguments)))
+    differing = {k: v for k, v in after.items() if v != before[k] and not dataclasses.is_dataclass(v)}
+    assert differing == changed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--optim.lrr", "1"], r"unknown setting --optim\.lrr: did you mean --optim\.lr\?"),
+        (["--lr", "1"], r"did you mean --optim\.lr\?"),
+        (["--xyz", "1"], "see --help for all settings"),
+        (["--training.steps", "1.5"], "invalid literal|could not"),
+        (["--training.steps"], "Missing value"),
+        (["--task.losses.matcher", "magic"], "invalid choice 'magic'"),
+        (["stray"], "stray"),
+    ],
+)
+def test_overrides_that_are_wrong_are_named_in_a_line(arguments, message):
+    with pytest.raises(UserError, match=message) as error:
+        apply_overrides(FLOW, arguments)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("x = 1", r"has no function get_config\(\)"),
+        ("def get_config():\n    return 3", "gave a int, not a RunConfig"),
+        ("def get_config():\n    y = 1\n    return y / 0", "line 3: ZeroDivisionError"),
+        ("import no_such_module", "line 1: ModuleNotFoundError"),
+        ("def get_config(:", "line 1: SyntaxError"),
+    ],
+)
+def test_config_files_that_are_wrong_are_named(tmp_path, content, message):
+    path = tmp_path / "broken.py"
+    path.write_text(content)
+    with pytest.raises(UserError, match=message) as error:
+        load_config(str(path))
+    assert str(path) in str(error.value)
+
+
+def test_config_files_that_are_not_there(tmp_path):
+    with pytest.raises(UserError, match="does not exist"):
+        load_config(str(tmp_path / "nothing.py"))
+    (tmp_path / "config.txt").touch()
+    with pytest.raises(UserError, match="no Python file"):
+        load_config(str(tmp_path / "config.txt"))

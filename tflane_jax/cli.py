@@ -1,0 +1,148 @@
+"""`tflane`, the command line: what each command takes. What it does is in `tflane_jax.commands`, imported when needed.
+
+Nothing slow is imported here, so that `tflane --help` is instant.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tflane_jax.errors import UserError
+
+_OVERRIDES = """Any setting of the configuration can be changed by its dotted name, say --optim.lr 1e-3.
+`tflane train --config FILE --help` lists them all with their values."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
+    parser = build_parser()
+    options, rest = parser.parse_known_args(arguments)
+    if rest and not options.takes_overrides:
+        parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
+    try:
+        command = getattr(importlib.import_module(f"tflane_jax.commands.{options.module}"), options.function)
+        return (command(options, rest) if options.takes_overrides else command(options)) or 0
+    except UserError as error:
+        print(f"tflane: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("tflane: stopped", file=sys.stderr)
+        return 128 + signal.SIGINT
+    except BrokenPipeError:  # `tflane ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 128 + signal.SIGPIPE
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(prog="tflane", description="Lane perception with priors, in JAX.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _train(commands)
+    _evaluate(commands)
+    _predict(commands)
+    _data(commands)
+    _demo(commands)
+    _bench(commands)
+    return parser
+
+
+def _command(commands, name: str, text: str, *, function: str, module: str, epilog: str = "", **more):
+    parser = commands.add_parser(
+        name, help=text, description=text[0].upper() + text[1:] + ".", epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter, **more,
+    )  # fmt: skip
+    parser.set_defaults(module=module, function=function, takes_overrides=False)
+    return parser
+
+
+def _train(commands) -> None:
+    # Its help is printed by the command itself, because with a config it lists that config's settings.
+    parser = _command(commands, "train", "train a model", module="train", function="run", epilog=_OVERRIDES,
+                      add_help=False)  # fmt: skip
+    parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (.py), or one of its ablations")
+    parser.add_argument("--out", metavar="RUN", type=Path, help="run folder (default runs/<name of the config file>)")
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument("--resume", action="store_const", const="resume", dest="start",
+                       help="go on with the run in --out (its own configuration, --config not needed)")  # fmt: skip
+    start.add_argument("--overwrite", action="store_const", const="overwrite", dest="start",
+                       help="delete the run in --out first")  # fmt: skip
+    parser.add_argument("-h", "--help", action="store_true", dest="wants_help", help="show this and exit")
+    parser.set_defaults(start="new", takes_overrides=True, usage=parser.format_help())
+
+
+def _checkpoint(text: str) -> int | str:
+    if text in ("best", "last"):
+        return text
+    if text.isdecimal():
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a step")
+
+
+def _run_arguments(parser: argparse.ArgumentParser, split: str) -> None:
+    parser.add_argument("run", metavar="RUN", type=Path, help="run folder")
+    parser.add_argument("--checkpoint", metavar="best|last|STEP", type=_checkpoint,
+                        help="default best, or last where nothing was evaluated")  # fmt: skip
+    _split_arguments(parser, split)
+    parser.add_argument("--max-instances", type=int, metavar="N", help="use at most N road users; 0 is no traffic flow")
+
+
+def _split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
+    parser.add_argument("--split", choices=("train", "val", "test"), default=split, help=f"default {split}")
+    parser.add_argument("--data", choices=("procedural", "argoverse2"),
+                        help="take other data than the configuration's")  # fmt: skip
+    parser.add_argument("--root", metavar="PATH", help="a log or a folder of logs, for --data argoverse2")
+    parser.add_argument("--openlane", metavar="PATH", help="folder of the OpenLane-V2 split files, if there is one")
+
+
+def _evaluate(commands) -> None:
+    parser = _command(commands, "eval", "evaluate a trained run", module="evaluate", function="run")
+    _run_arguments(parser, "test")
+    parser.add_argument("--out", metavar="STEM", type=Path,
+                        help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)")  # fmt: skip
+
+
+def _predict(commands) -> None:
+    parser = _command(commands, "predict", "write predictions and pictures", module="predict", function="run")
+    _run_arguments(parser, "val")
+    parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
+    parser.add_argument("--threshold", type=float, default=0.3,
+                        help="least score of a lane in JSON and pictures (default 0.3)")  # fmt: skip
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write")
+
+
+def _data(commands) -> None:
+    parser = commands.add_parser("data", help="look at datasets", description="Look at datasets.")
+    inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    show = _command(inner, "show", "draw samples of a dataset and count what is in it", module="data", function="show")
+    show.add_argument("--config", metavar="FILE", help="config file whose data to show (default: the built-in world)")
+    _split_arguments(show, "train")
+    show.add_argument("--count", type=int, default=8, help="examples (default 8)")
+    show.add_argument("--out", metavar="FILE", type=Path, default=Path("samples.png"),
+                      help="picture (default samples.png)")  # fmt: skip
+    check = _command(inner, "check", "say what a folder of Argoverse 2 logs lacks", module="data", function="check")
+    check.add_argument("root", metavar="PATH", help="a log or a folder of logs")
+    build = _command(inner, "build", "make the built-in world's examples ahead of training", module="data",
+                     function="build", epilog=_OVERRIDES)  # fmt: skip
+    build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
+    build.set_defaults(takes_overrides=True)
+
+
+def _demo(commands) -> None:
+    parser = _command(commands, "demo", "train with and without traffic flow, evaluate both, in under ten minutes",
+                      module="demo", function="run")  # fmt: skip
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default runs/demo")
+
+
+def _bench(commands) -> None:
+    parser = _command(commands, "bench", "run the benchmarks of a source checkout", module="bench", function="run")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/bench"), help="default runs/bench")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

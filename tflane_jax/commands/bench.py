@@ -1,0 +1,20 @@
+"""`tflane bench`: the benchmarks live beside the package in a source checkout, not in it."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import tflane_jax
+from tflane_jax.errors import UserError
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run `python -m benchmarks` from the checkout."""
+    root = Path(tflane_jax.__file__).parent.parent
+    if not (root / "benchmarks" / "__main__.py").is_file():
+        raise UserError(f"no benchmarks beside the package ({root}): run tflane bench from a source checkout")
+    command = [sys.executable, "-m", "benchmarks", "--out", str(options.out.absolute())]
+    return subprocess.run(command, cwd=root, check=False).returncode

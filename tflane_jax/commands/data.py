@@ -1,0 +1,60 @@
+"""`tflane data show`, `data check` and `data build`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from tflane_jax.commands.sources import chosen_source, source_name
+from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.datasets.argoverse2 import check_log, find_logs, load_log
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.plots import dataset_summary, format_table, show_dataset
+from tflane_jax.runs import open_dataset, spread
+from tflane_jax.scene import stack_examples
+
+
+def show(options: argparse.Namespace) -> int:
+    """Draw samples and print what they hold."""
+    config = RunConfig() if options.config is None else load_config(options.config)
+    source = chosen_source(config, options)
+    # Not from the cache: a few examples are made sooner than all of them.
+    dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else open_dataset(source)
+    picture = show_dataset(
+        dataset, options.count, options.out, ground=source.example.sensor.grid.range, view=source.example.range
+    )
+    indices = spread(dataset, options.count)
+    rows = dataset_summary(stack_examples([dataset.example(index) for index in indices]))
+    print(format_table(rows, title=f"{source_name(source)}: the {len(indices)} examples drawn"))
+    print(f"\nwritten to {picture}")
+    return 0
+
+
+def check(options: argparse.Namespace) -> int:
+    """Say of every log what it lacks; exit code 2 where one lacks something."""
+    lacking = 0
+    for folder in find_logs(Path(options.root)):
+        faults = check_log(folder)
+        lacking += bool(faults)
+        if faults:
+            print(f"{folder}: cannot be read", *(f"  - {fault}" for fault in faults), sep="\n")
+            continue
+        log = load_log(folder)
+        print(f"{folder}: ok, {len(log.keyframes)} key frames, {log.tracks.frames} annotated frames, "
+              f"{len(log.tracks.uuid)} road users, {len(log.map.segments)} lane segments")  # fmt: skip
+    return 2 if lacking else 0
+
+
+def build(options: argparse.Namespace, overrides: Sequence[str]) -> int:
+    """Fill the cache for every split of a configuration."""
+    config = RunConfig() if options.config is None else load_config(options.config)
+    config = apply_overrides(config, overrides)
+    for split in ("train", "val", "test"):
+        source = config.data.source(split)
+        if isinstance(source, ProceduralConfig):
+            dataset = open_dataset(source)
+            print(f"{split}: {len(dataset)} examples ready")
+        else:
+            print(f"{split}: real logs are read when they are needed, nothing to build")
+    return 0

@@ -1,0 +1,15 @@
+"""`tflane demo`."""
+
+from __future__ import annotations
+
+import argparse
+
+from tflane_jax.training.runtime import configure_jax
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train, evaluate and draw the comparison."""
+    from tflane_jax.demo import main  # pyright: ignore[reportMissingImports]
+
+    configure_jax()
+    return main(options.out)

@@ -1,0 +1,96 @@
+"""`tflane predict`: predictions as arrays, as plain JSON, and as pictures.
+
+predictions.npz, arrays over F frames and Q queries:
+    points (F, Q, P, 3) metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1, [f, i, j] lane j
+    continues lane i; scene (F,) and timestamp_ns (F,), where the frame comes from.
+
+predictions.json, lanes from `threshold` on, best first:
+    {"run", "step", "seed", "threshold", "frames": [{"source", "scene", "timestamp_ns",
+     "lanes": [{"query", "score", "points": [[x, y, z], ...]}, ...],
+     "successors": [{"from": position in lanes, "to": position in lanes, "score"}, ...]}, ...]}
+    with the successors whose score is at least 0.5.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import expit
+
+from tflane_jax.commands.sources import chosen_source
+from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.errors import UserError
+from tflane_jax.plots import save_examples
+from tflane_jax.runs import limit_instances, open_dataset, open_run, predict_examples, spread, titles
+from tflane_jax.training.run_folder import write_json
+from tflane_jax.training.runtime import configure_jax
+
+_SUCCESSOR_THRESHOLD = 0.5
+
+
+def run(options: argparse.Namespace) -> int:
+    """Predict with the first seed and write everything into --out."""
+    configure_jax()
+    trained = open_run(options.run, options.checkpoint)
+    task = trained.config.task
+    if options.max_instances is not None:
+        task = limit_instances(task, options.max_instances)
+    source = chosen_source(trained.config, options)
+    dataset = open_dataset(source)
+    if options.count < 1 or len(dataset) == 0:
+        raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
+    indices = spread(dataset, options.count)
+    examples, lanes = predict_examples(task, trained.params[0], dataset, indices)
+    infos = [dataset.info(index) for index in indices]
+    points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
+    successor = expit(lanes.successor_logits)
+
+    _make_folder(options.out)
+    arrays = {"points": points, "scores": scores, "successor": successor}
+    arrays["scene"] = np.array([info.scene for info in infos])
+    arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
+    temporary = options.out / ".predictions.tmp.npz"
+    np.savez_compressed(temporary, **arrays)
+    temporary.replace(options.out / "predictions.npz")
+    frames = [
+        _frame(info, points[i], scores[i], successor[i], options.threshold) for i, info in enumerate(infos)
+    ]
+    head = {"run": str(options.run), "step": trained.step, "seed": trained.config.training.seeds[0]}
+    write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
+    save_examples(
+        options.out / "pictures.png", examples, {f"{options.run.name}, step {trained.step}": lanes},
+        titles=titles(dataset, indices), ground=source.example.sensor.grid.range, view=source.example.range,
+        threshold=options.threshold,
+    )  # fmt: skip
+    print(f"{len(indices)} frames written to {options.out}: predictions.npz, predictions.json, pictures.png")
+    return 0
+
+
+def _frame(
+    info: FrameInfo, points: Float[np.ndarray, "q p 3"], scores: Float[np.ndarray, " q"],
+    successor: Float[np.ndarray, "q q"], threshold: float,
+) -> dict[str, Any]:  # fmt: skip
+    order = np.argsort(-scores, kind="stable")
+    kept = order[scores[order] >= threshold]
+    links = successor[np.ix_(kept, kept)]
+    return {
+        "source": info.source,
+        "scene": info.scene,
+        "timestamp_ns": int(info.timestamp_ns),
+        "lanes": [{"query": int(q), "score": float(scores[q]), "points": points[q].tolist()} for q in kept],
+        "successors": [
+            {"from": i, "to": j, "score": float(links[i, j])}
+            for i, j in np.argwhere(links >= _SUCCESSOR_THRESHOLD).tolist()
+        ],
+    }
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror or error}") from error

@@ -1,0 +1,57 @@
+"""`tflane train`."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config_io import to_text
+from tflane_jax.errors import UserError
+from tflane_jax.runs import resumable_config, train_run
+from tflane_jax.training.runtime import configure_jax
+
+
+def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
+    """Train, or print the help."""
+    if options.wants_help:
+        print(options.usage)
+        if options.config:
+            print(f"settings of {options.config}:\n\n{to_text(load_config(options.config))}")
+        return 0
+    if options.config is None and options.start != "resume":
+        raise UserError("say what to train: --config FILE (configs/ has some), or --resume with --out RUN")
+    out = options.out or _default_folder(options.config)
+    config = _config(options, out, overrides)
+
+    configure_jax()
+    result = train_run(config, out, start=options.start)
+    if result.stopped_by is not None:
+        name = signal.Signals(result.stopped_by).name
+        print(f"stopped by {name} after step {result.step}; go on with: tflane train --resume --out {out}",
+              file=sys.stderr)  # fmt: skip
+        return 128 + result.stopped_by
+    print(f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in "
+          f"{result.compile_seconds:.1f} s")  # fmt: skip
+    for name, value in result.metrics.items():
+        print(f"  {name} = {value:.4f}")
+    print(f"evaluate with: tflane eval {out}")
+    return 0
+
+
+def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) -> RunConfig:
+    if options.config is not None:
+        return apply_overrides(load_config(options.config), overrides)
+    if overrides:
+        raise UserError(f"a run is resumed with its own configuration: leave {overrides[0]} out")
+    return resumable_config(out)
+
+
+def _default_folder(config: str | None) -> Path:
+    if config is None:
+        raise UserError("say which run to resume: --out RUN")
+    path, _, ablation = config.partition(".py:")
+    return Path("runs") / (f"{Path(path).stem}-{ablation}" if ablation else Path(path).stem)

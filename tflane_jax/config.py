@@ -1,0 +1,207 @@
+"""A run's configuration: what the parts' own configurations are assembled into, where files and overrides enter.
+
+A config file is Python with `get_config() -> RunConfig` and, if it likes, `ablations() -> dict[str, RunConfig]`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import importlib.util
+import io
+import re
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from tflane_jax.config_io import settings
+from tflane_jax.datasets.argoverse2 import Argoverse2Config, Keyframes
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.errors import UserError
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.simulate import WorldConfig
+
+Split = Literal["train", "val", "test"]
+Source = ProceduralConfig | Argoverse2Config
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class WorldData:
+    """The built-in world for every split.
+
+    Attributes:
+        train, val, test: number of scenes of each split.
+        world: roads, traffic, tracker.
+        example: what is in an example, and its capacities.
+    """
+
+    train: int = 2000
+    val: int = 100
+    test: int = 200
+    world: WorldConfig = WorldConfig()
+    example: ExampleConfig = ExampleConfig()
+
+    def source(self, split: Split) -> ProceduralConfig:
+        """Return the dataset of a split."""
+        return ProceduralConfig(split, scenes=getattr(self, split), world=self.world, example=self.example)
+
+
+@dataclass(frozen=True)
+class LogData:
+    """Real Argoverse 2 logs.
+
+    Attributes:
+        train, val, test: a log or a folder of logs for each split.
+        keyframes: which moments become examples.
+        openlane: folder of the OpenLane-V2 split files, which name the exact moments.
+        example: what is in an example, and its capacities.
+    """
+
+    train: Path
+    val: Path
+    test: Path
+    keyframes: Keyframes = "openlane_v2"
+    openlane: Path | None = None
+    example: ExampleConfig = ExampleConfig()
+
+    def source(self, split: Split) -> Argoverse2Config:
+        """Return the dataset of a split."""
+        return Argoverse2Config(getattr(self, split), self.keyframes, self.openlane, self.example)
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Evaluation while training and after it.
+
+    Attributes:
+        batch_size: examples predicted at a time; changes no number.
+        pictures: examples of the validation split that are drawn, spread evenly over it.
+    """
+
+    batch_size: int = 16
+    pictures: int = 4
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run.
+
+    Attributes:
+        task: model, priors and losses.
+        data: examples.
+        optim: optimiser.
+        training: the program.
+        evaluation: metrics and pictures.
+    """
+
+    task: LaneGraphTask = LaneGraphTask()
+    data: WorldData | LogData = WorldData()
+    optim: OptimConfig = OptimConfig()
+    training: TrainingConfig = TrainingConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+
+def load_config(reference: str) -> RunConfig:
+    """Return the configuration of a file, `path.py`, or one of its ablations, `path.py:name`.
+
+    Raises:
+        UserError: no such file, function or ablation, or an exception inside the file (named with its line).
+    """
+    path, _, ablation = reference.partition(".py:")
+    if not ablation:
+        return _called(Path(path), "get_config", RunConfig)
+    ablations = load_ablations(f"{path}.py")
+    if ablation not in ablations:
+        raise UserError(f"config file {path}.py has no ablation {ablation}, only {', '.join(ablations)}")
+    return ablations[ablation]
+
+
+def load_ablations(path: str) -> dict[str, RunConfig]:
+    """Return the ablations of a config file by name; raises UserError like `load_config`."""
+    return _called(Path(path), "ablations", dict)
+
+
+def _called(path: Path, function: str, kind: type[T]) -> T:
+    """Run a config file and return what one of its functions gives."""
+    if not path.is_file():
+        raise UserError(f"config file {path} does not exist")
+    spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise UserError(f"config file {path} is no Python file (.py)")
+    module = importlib.util.module_from_spec(spec)
+    with _named_errors(path):
+        spec.loader.exec_module(module)
+    if not hasattr(module, function):
+        raise UserError(f"config file {path} has no function {function}()")
+    with _named_errors(path):
+        value = getattr(module, function)()
+    if not isinstance(value, kind):
+        raise UserError(f"{function}() in config file {path} gave a {type(value).__name__}, not a {kind.__name__}")
+    return value
+
+
+@contextlib.contextmanager
+def _named_errors(path: Path):
+    try:
+        yield
+    except Exception as error:
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else "?"
+        raise UserError(f"config file {path}, line {line}: {type(error).__name__}: {error}") from error
+
+
+def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
+    """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
+
+    Raises:
+        UserError: an unknown setting (with the names closest to it), or a value of the wrong type.
+    """
+    import tyro
+
+    _check_names(config, arguments)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            return tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
+    except SystemExit as error:
+        raise UserError(_without_boxes(said.getvalue())) from error
+
+
+def override_names(config: RunConfig) -> list[str]:
+    """Return the dotted names of all settings that arguments can change."""
+    return [name for name, value in settings(config) if not dataclasses.is_dataclass(value)]
+
+
+def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
+    known = override_names(config)
+    for argument in arguments:
+        if not argument.startswith("--"):
+            continue
+        name = argument[2:].partition("=")[0].replace("-", "_")
+        if name not in known and name.replace(".no_", ".") not in known:
+            close = _closest(name, known)
+            hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
+            raise UserError(f"unknown setting --{name}: {hint}")
+
+
+def _closest(name: str, known: list[str]) -> list[str]:
+    """Return up to three names like `name`: as a whole, else by the last part alone."""
+    whole = difflib.get_close_matches(name, known, 3, 0.75)
+    last = name.rpartition(".")[2]
+    parts = difflib.get_close_matches(last, sorted({k.rpartition(".")[2] for k in known}), 3, 0.75)
+    return (whole or [k for part in parts for k in known if k.rpartition(".")[2] == part])[:3]
+
+
+def _without_boxes(text: str) -> str:
+    """Return what tyro says as one line: no frame, no title, nothing after the message itself."""
+    # A title, a rule (if there is no frame), the message, a rule, hints.
+    lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
+    paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
+    return paragraphs[0].replace("\n", " ")

@@ -1,0 +1,115 @@
+"""Configurations (trees of frozen dataclasses) as text, as JSON, and back from JSON.
+
+Reading walks the type hints of the classes that the program expects, so that a file can name settings but never code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tflane_jax.errors import UserError
+
+T = TypeVar("T")
+
+
+def settings(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every setting by its dotted name; a nested configuration comes before its own settings."""
+    for field in dataclasses.fields(config):
+        name, value = prefix + field.name, getattr(config, field.name)
+        yield name, value
+        if dataclasses.is_dataclass(value):
+            yield from settings(value, f"{name}.")
+
+
+def to_text(config: Any) -> str:
+    """Return one line `a.b.c = value` per setting; a nested configuration's own line names its class."""
+    return "".join(
+        f"{name} = {type(value).__name__ if dataclasses.is_dataclass(value) else repr(_plain(value))}\n"
+        for name, value in settings(config)
+    )
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """Return plain JSON; each configuration's class stands under "class", enumerations by the name of the member."""
+    content = {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    return {"class": type(config).__name__, **content}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return to_json(value)
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, enum.Enum):
+        return value.name
+    return str(value) if isinstance(value, Path) else value
+
+
+def from_json(kind: type[T], content: Any) -> T:
+    """Return the configuration of class `kind` that `to_json` wrote.
+
+    Settings that the file does not have take their defaults, so that runs of an older version can be read.
+
+    Raises:
+        UserError: names the setting that this version does not know or cannot read.
+    """
+    return _dataclass(kind, content, "")
+
+
+def _dataclass(kind: Any, content: Any, path: str) -> Any:
+    if not isinstance(content, dict) or content.get("class") != kind.__name__:
+        raise UserError(f"setting {path or 'at the top'} should be a {kind.__name__}, not {content!r:.80}")
+    hints = typing.get_type_hints(kind)
+    names = {field.name for field in dataclasses.fields(kind)}
+    unknown = sorted(content.keys() - names - {"class"})
+    if unknown:
+        raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax")
+    values = {name: _value(hints[name], content[name], path + name) for name in names & content.keys()}
+    return kind(**values)
+
+
+def _value(hint: Any, content: Any, path: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return _member(arguments, content, path)
+    if dataclasses.is_dataclass(hint):
+        return _dataclass(hint, content, f"{path}.")
+    if origin is tuple and isinstance(content, list):
+        repeated = len(arguments) == 2 and arguments[1] is Ellipsis
+        kinds = [arguments[0]] * len(content) if repeated else arguments
+        if len(kinds) == len(content):
+            return tuple(_value(k, item, path) for k, item in zip(kinds, content, strict=True))
+    if origin is typing.Literal and content in arguments:
+        return content
+    if hint is Path and isinstance(content, str):
+        return Path(content)
+    if isinstance(hint, type) and issubclass(hint, enum.Enum) and content in hint.__members__:
+        return hint[content]
+    if hint is float and type(content) is int:
+        return float(content)
+    if isinstance(hint, type) and type(content) is hint:
+        return content
+    raise UserError(f"setting {path} cannot be {content!r:.80}")
+
+
+def _member(kinds: tuple[Any, ...], content: Any, path: str) -> Any:
+    """Read the member of a union that fits: None, the class that is named, or the first plain type."""
+    if content is None and type(None) in kinds:
+        return None
+    if isinstance(content, dict):
+        named = [k for k in kinds if dataclasses.is_dataclass(k) and getattr(k, "__name__", "") == content.get("class")]
+        if named:
+            return _dataclass(named[0], content, f"{path}.")
+    for kind in kinds:
+        if not dataclasses.is_dataclass(kind) and kind is not type(None):
+            try:
+                return _value(kind, content, path)
+            except UserError:
+                continue
+    raise UserError(f"setting {path} cannot be {content!r:.80}")

@@ -23,7 +23,7 @@ def sample_bilinear(
         location: (x, y) in [0, 1] across the grid's outer borders; cell centres lie at (i + 0.5) / size.
     """
     h, w = shape
-    pixel = location * jnp.array([w, h], location.dtype) - 0.5
+    pixel = location * jnp.broadcast_to(jnp.array([w, h], location.dtype), location.shape) - 0.5
     corner = jnp.floor(pixel)
     fraction = pixel - corner
     corner = corner.astype(jnp.int32)

@@ -41,7 +41,8 @@ def test_shipped_configurations_have_not_changed_silently(name, reference, monke
     golden = GOLDEN / f"{name}.txt"
     if not golden.exists() or golden.read_text(encoding="utf-8") != text:
         (tmp_path / golden.name).write_text(text, encoding="utf-8")
-        pytest.fail(f"{name} has changed; if that is meant: cp {tmp_path / golden.name} {golden}")
+        change = f"diff {golden} {tmp_path / golden.name}"
+        pytest.fail(f"{name} has changed ({change}); if that is meant: python -m tests.test_config")
 
 
 def test_every_golden_text_has_its_configuration():
@@ -173,3 +174,16 @@ def test_config_files_that_are_not_there(tmp_path):
     (tmp_path / "config.txt").touch()
     with pytest.raises(UserError, match="no Python file"):
         load_config(str(tmp_path / "config.txt"))
+
+
+def write_golden_texts() -> None:
+    """Accept every configuration as it is now: `python -m tests.test_config`."""
+    for path in GOLDEN.glob("*.txt"):
+        path.unlink()
+    for name, reference in shipped().items():
+        config = load_config(str(ROOT / reference)) if reference else RunConfig()
+        (GOLDEN / f"{name}.txt").write_text(to_text(config), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_golden_texts()

@@ -37,7 +37,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     print(f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in "
           f"{result.compile_seconds:.1f} s")  # fmt: skip
     for name, value in result.metrics.items():
-        print(f"  {name} = {value:.4f}")
+        if "@" not in name:  # single thresholds are in metrics.jsonl
+            print(f"  {name} = {value:.4f}")
     print(f"evaluate with: tflane eval {out}")
     return 0
 

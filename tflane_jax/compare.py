@@ -22,11 +22,10 @@ from tqdm import tqdm
 
 from tflane_jax.ablations.comparison import Variant, compact, summarise
 from tflane_jax.config import RunConfig
-from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.runs import limit_instances, open_dataset, open_run, predict_examples, titles, train_run
-from tflane_jax.scene import Example
+from tflane_jax.runs import limit_instances, load_split, open_dataset, open_run, predict_examples, titles, train_run
+from tflane_jax.scene import Example, stack_examples
 from tflane_jax.training.evaluate import evaluate_lanes, scores
 from tflane_jax.training.run_folder import write_json
 from tflane_jax.training.runtime import configure_jax
@@ -65,7 +64,7 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
     Raises:
         UserError: the configurations do not test on the same examples, or a training failed.
     """
-    if len({config.data.test for config in configs.values()}) > 1:
+    if len({config.data.source("test") for config in configs.values()}) > 1:
         raise UserError("the configurations have different test data (data.test): their numbers cannot be compared")
     plan = {
         name: [
@@ -75,12 +74,12 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
         for name, config in configs.items()
     }
     for config in configs.values():  # before any worker starts, so that nobody builds the same data twice
-        for source in (config.data.train, config.data.val, config.data.test):
-            open_dataset(source)
+        for split in ("train", "val", "test"):
+            open_dataset(config.data.source(split))
     # Seed by seed, so that a comparison stopped early has pairs.
     train_all([plan[name][i] for i in range(len(seeds)) for name in plan], jobs)
 
-    arrays = load_arrays(open_dataset(next(iter(configs.values())).data.test), parts=TRAINING_PARTS)
+    arrays = load_split(next(iter(configs.values())), "test")
     variants: list[Variant] = []
     protocol = ""
     for name, trainings in plan.items():
@@ -166,14 +165,15 @@ def draw_comparison(models: dict[str, Job], arrays: Example, path: Path, count: 
         from tflane_jax.plots import save_examples
     except UserError:
         return None
-    source = next(iter(models.values())).config.data.test
+    source = next(iter(models.values())).config.data.source("test")
     dataset = open_dataset(source)
     hidden = (arrays.lanes.valid & (arrays.lanes.visibility < 0.5)).sum(-1)
     indices = np.argsort(-hidden, kind="stable")[:count].tolist()
-    examples, lanes = None, {}
+    examples = stack_examples([dataset.example(index) for index in indices])
+    lanes = {}
     for name, job in models.items():
         run = open_run(job.folder, "last")
-        examples, lanes[name] = predict_examples(run.config.task, run.params[0], dataset, indices)
+        _, lanes[name] = predict_examples(run.config.task, run.params[0], dataset, indices)
     save_examples(
         path, examples, lanes, titles=titles(dataset, indices),
         ground=source.example.sensor.grid.range, view=source.example.range,

@@ -1,7 +1,7 @@
 """`tflane demo`: the main job on the built-in world, small enough for two cores and ten minutes.
 
-The same host is trained twice, on BEV evidence alone and with traffic flow, and both are evaluated on scenes that neither
-has seen. One short run of each: the README has the longer comparison over several seeds.
+The same host is trained twice, on BEV evidence alone and with traffic flow, and both are evaluated on scenes that
+neither has seen. One short run of each: the README has the longer comparison over several seeds.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.compare import compare
-from tflane_jax.config import DataConfig, EvaluationConfig, RunConfig
-from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -23,11 +22,7 @@ STEPS = 900
 def configs() -> dict[str, RunConfig]:
     """Return the demo's two configurations: the baseline and the same with traffic flow."""
     baseline = RunConfig(
-        data=DataConfig(
-            train=ProceduralConfig(split="train", scenes=400),
-            val=ProceduralConfig(split="val", scenes=10),
-            test=ProceduralConfig(split="test", scenes=50),
-        ),
+        data=WorldData(train=400, val=10, test=50),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, ema_decay=0.99),
         training=TrainingConfig(steps=STEPS, log_every=25, eval_every=STEPS // 2, checkpoint_every=300),
         evaluation=EvaluationConfig(pictures=2),

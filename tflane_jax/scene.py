@@ -11,13 +11,19 @@ Host-side recordings in global coordinates (maps, poses, tracks) live in `tflane
 from __future__ import annotations
 
 import enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import chex
 import jax
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
+
+# Leaves are numpy on the host and jax on the device, and either may be indexed, reduced and handed on.
+if TYPE_CHECKING:
+    from typing import Any as Array
+else:
+    Array = np.ndarray | jax.Array
 
 
 class RoadUser(enum.IntEnum):

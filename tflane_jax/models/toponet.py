@@ -82,7 +82,7 @@ class TopoNet(nn.Module):
         if example.bev is None:
             raise ValueError("this model reads BEV evidence, and the example has none (bev is None)")
         features = EvidenceEncoder(self.config.encoder, name="encoder")(example.bev)
-        shapes = (features.shape[:2],)
+        shapes = ((features.shape[0], features.shape[1]),)
         bev = features.reshape(-1, features.shape[-1])
 
         queries, position, reference = LaneQueries(config, name="queries")()

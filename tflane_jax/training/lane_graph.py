@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import jax
 from jaxtyping import Array, Float
 
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import Example, Prediction
+from tflane_jax.scene import Example, LanePrediction, Prediction
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class LaneGraphTask:
 
     def init(self, key: jax.Array, example: Example) -> dict[str, Any]:
         """Return fresh parameters; `example` gives shapes only."""
-        return self.model.build().init(key, example)["params"]
+        return dict(self.model.build().init(key, example)["params"])
 
     def loss(
         self, params: dict[str, Any], batch: Example, key: jax.Array
@@ -36,7 +36,7 @@ class LaneGraphTask:
         del key
         module = self.model.build()
         outputs = jax.vmap(lambda example: module.apply({"params": params}, example))(batch)
-        return lane_graph_loss(outputs, batch.lanes, self.losses)
+        return lane_graph_loss(cast(LanePrediction, outputs), batch.lanes, self.losses)
 
     def predict(self, params: dict[str, Any], example: Example) -> Prediction:
         """Return the last decoder layer's answer for one example."""

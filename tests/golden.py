@@ -20,6 +20,7 @@ CLAIMS = {
     "metrics/openlanev2_centerline": "tests/metrics/test_openlane_v2.py",
     "metrics/resample": "tests/geometry/test_polylines.py",
     "modules/custom_msda_decoder*": "tests/layers/test_deformable.py",
+    "modules/mha_*": "tests/layers/test_attention.py",
     "modules/mmdet_losses*": "tests/losses/test_costs.py",
     "modules/mmdet_match_costs*": "tests/losses/test_costs.py",
     "modules/msda_func*": "tests/layers/test_deformable.py",

@@ -1,12 +1,14 @@
-"""Masked attention whose empty rows are exactly zero.
+"""Masked attention whose empty rows are exactly zero, and multi-head attention on top of it.
 
 Library attention returns the mean of the masked values for a query whose keys are all masked; here such a query gets 0
-and contributes no gradient, so that an absent prior equals no prior. Masked keys and values may hold anything.
+and contributes no gradient, so that an absent prior equals no prior. What stands in masked slots may be anything, NaN
+included. Softmax and its gradient are written out, which decides the speed on CPU (`benchmarks/attention_masks.py`).
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import flax.linen as nn
 import jax
@@ -16,71 +18,190 @@ from jaxtyping import Array, Bool, Float
 
 Mask = Bool[Array, "#q #k"] | Bool[Array, "#h #q #k"]
 
+# Logits per head that are held at once. Larger problems go through blocks of queries, whose logits stay in the cache
+# and are computed again for the gradient: 4,000 x 4,000 is several times faster so, and needs no gigabyte.
+BLOCK = 2**19
+
 
 def masked_attention(
     query: Float[Array, "h q d"], key: Float[Array, "h k d"], value: Float[Array, "h k e"], mask: Mask | None = None
 ) -> Float[Array, "h q e"]:
     """Return softmax(query key^T / sqrt(d)) value over the keys that `mask` allows, for one example.
 
+    Softmax runs in float32 also for bfloat16 inputs. A key that no query may see, and a query that may see no key, have
+    no influence and zero gradients even if they hold NaN; the query's result is 0.
+
     Args:
         query, key, value: heads first.
         mask: true where a query may attend to a key; None allows all. Rank 2 holds for all heads.
     """
-    if key.shape[1] == 0 or query.shape[1] == 0:
-        return jnp.zeros((*query.shape[:2], value.shape[-1]), value.dtype)
-    if mask is None:
-        return _attend(query, key, value, None)
-    mask = mask if mask.ndim == 3 else mask[None]
-    # A key that no query may see is padding: 0 * NaN would be NaN, in the products here and in their gradients.
-    seen = mask.any((0, 1))[None, :, None]
-    key, value = jnp.where(seen, key, 0.0), jnp.where(seen, value, 0.0)
-    query = jnp.where(mask.any((0, 2))[None, :, None], query, 0.0)
-    return _attend(query, key, value, mask)
-
-
-@jax.custom_vjp
-def _attend(query, key, value, mask):
-    return _forward(query, key, value, mask)[0]
+    heads, queries, keys = *query.shape[:2], key.shape[1]
+    if queries == 0 or keys == 0:
+        return jnp.zeros((heads, queries, value.shape[-1]), value.dtype)
+    mask = _per_head(mask)
+    if queries * keys <= BLOCK:
+        return _attend(query, key, value, mask)
+    # The last block is filled up with zero queries, whose results are cut off and whose gradients are zero.
+    rows = math.ceil(queries / math.ceil(queries * keys / BLOCK))
+    filled = jnp.pad(query, ((0, 0), (0, -queries % rows), (0, 0)))
+    if mask is not None and mask.shape[1] > 1:
+        mask = jnp.pad(mask, ((0, 0), (0, -queries % rows), (0, 0)))
+    out: Array = _attend_in_blocks(rows, filled, key, value, mask)
+    return out[:, :queries]
 
 
 def attention_probabilities(
     query: Float[Array, "h q d"], key: Float[Array, "h k d"], mask: Mask | None = None
 ) -> Float[Array, "h q k"]:
-    """Return the attention weights in float32; rows sum to 1, or to 0 where every key is masked."""
-    scale = 1.0 / math.sqrt(query.shape[-1])
-    logits = jnp.einsum("hqd,hkd->hqk", query, key, preferred_element_type=jnp.float32) * scale
-    # Without the barriers XLA fuses products and softmax on CPU and recomputes the exponentials.
-    logits = lax.optimization_barrier(logits)
-    if mask is None:
-        weights = jnp.exp(logits - logits.max(-1, keepdims=True))
-    else:
-        mask = mask if mask.ndim == 3 else mask[None]
-        top = jnp.where(mask, logits, -jnp.inf).max(-1, keepdims=True)
-        weights = jnp.where(mask, jnp.exp(logits - jnp.where(jnp.isfinite(top), top, 0.0)), 0.0)
+    """Return the attention weights; rows sum to 1, or to 0 where every key is masked.
+
+    In float32 also for bfloat16 inputs. For looking at; not to be differentiated where masked slots hold NaN.
+    """
+    if key.shape[1] == 0:
+        return jnp.zeros((*query.shape[:2], 0), _softmax_dtype(query))
+    logits = _logits(query, key, _per_head(mask))
+    return jnp.exp(logits - _log_total(logits))
+
+
+def _per_head(mask: Mask | None) -> Bool[Array, "#h #q #k"] | None:
+    return mask[None] if mask is not None and mask.ndim == 2 else mask
+
+
+def _softmax_dtype(x):
+    return x.dtype if x.dtype.itemsize > 2 else jnp.dtype(jnp.float32)
+
+
+def _logits(query, key, mask):
+    """Return query key^T / sqrt(d) in float32 or finer, -inf where masked."""
+    products = jnp.einsum("hqd,hkd->hqk", query, key, preferred_element_type=_softmax_dtype(query))
+    # Without the barrier XLA fuses product and softmax on CPU into loops that are several times slower.
+    logits = lax.optimization_barrier(products) / math.sqrt(query.shape[-1])
+    return logits if mask is None else jnp.where(mask, logits, -jnp.inf)
+
+
+def _finite_max(logits):
+    """Return the row maximum, finite also for a row without keys so that -inf minus it is -inf."""
+    return jnp.maximum(logits.max(-1, keepdims=True), jnp.finfo(logits.dtype).min)
+
+
+def _log_total(logits):
+    """Return log sum exp of each row; 0 for a row without keys, so that exp(logits - it) is 0 there."""
+    top = _finite_max(logits)
+    total = jnp.exp(logits - top).sum(-1, keepdims=True)
+    return jnp.where(total > 0, top + jnp.log(jnp.where(total > 0, total, 1.0)), 0.0)
+
+
+def _clear_keys(x, mask):
+    """Return x with 0 in the slots that no query sees: 0 * NaN would be NaN in the products."""
+    return x if mask is None else jnp.where(mask.any(-2)[..., None], x, 0)
+
+
+def _clear_queries(x, mask):
+    """Return x with 0 for the queries that see no key."""
+    return x if mask is None else jnp.where(mask.any(-1)[..., None], x, 0)
+
+
+@jax.custom_vjp
+def _attend(query, key, value, mask):
+    """Attend with all logits at once, keeping the weights for the gradient."""
+    return _attend_forward(query, key, value, mask)[0]
+
+
+def _attend_forward(query, key, value, mask):
+    # Masked keys need no clearing: their logits are replaced.
+    value = _clear_keys(value, mask)
+    logits = _logits(query, key, mask)
+    weights = jnp.exp(logits - _finite_max(logits))
     total = weights.sum(-1, keepdims=True)
-    return lax.optimization_barrier(weights / jnp.where(total > 0, total, 1.0))
+    # Dividing the result, not the weights, saves a pass over them.
+    inverse = (1.0 / jnp.where(total > 0, total, 1.0)).astype(value.dtype)
+    weights = weights.astype(value.dtype)
+    out = jnp.einsum("hqk,hke->hqe", weights, value) * inverse
+    return out, (query, key, value, mask, weights, inverse, out)
 
 
-def _forward(query, key, value, mask):
-    probabilities = attention_probabilities(query, key, mask).astype(value.dtype)
-    out = jnp.einsum("hqk,hke->hqe", probabilities, value)
-    return out, (query, key, value, probabilities)
+def _attend_backward(residuals, gradient):
+    query, key, value, mask, weights, inverse, out = residuals
+    query, key = _clear_queries(query, mask), _clear_keys(key, mask)
+    return *_gradients(query, key, value, weights, out, gradient * inverse), None
 
 
-def _backward(residuals, gradient):
-    query, key, value, probabilities = residuals
-    scale = 1.0 / math.sqrt(query.shape[-1])
-    to_value = jnp.einsum("hqk,hqe->hke", probabilities, gradient)
-    to_weight = jnp.einsum("hqe,hke->hqk", gradient, value)
-    # The gradient of softmax; masked entries have probability 0 and so get none.
-    to_logit = probabilities * (to_weight - (probabilities * to_weight).sum(-1, keepdims=True)) * scale
-    to_logit = lax.optimization_barrier(to_logit)
+_attend.defvjp(_attend_forward, _attend_backward)
+
+
+def _gradients(query, key, value, weights, out, gradient):
+    """Return the gradients of query, key and value.
+
+    Args:
+        query, key, value: with 0 in the slots that nobody sees.
+        weights: exp(logits) up to a factor per row.
+        out: the result of attention.
+        gradient: of the result, divided by the sum of the row's weights.
+    """
+    to_value = jnp.einsum("hqk,hqe->hke", weights, gradient)
+    dtype = _softmax_dtype(value)
+    to_weight = jnp.einsum("hqe,hke->hqk", gradient, value, preferred_element_type=dtype)
+    # Softmax: dz = p (dp - sum_k p dp), and sum_k p dp = out . d out.
+    along = (gradient.astype(dtype) * out.astype(dtype)).sum(-1, keepdims=True)
+    to_logit = weights.astype(dtype) * (lax.optimization_barrier(to_weight) - along) / math.sqrt(query.shape[-1])
+    to_logit = lax.optimization_barrier(to_logit.astype(query.dtype))
     to_query = jnp.einsum("hqk,hkd->hqd", to_logit, key)
     to_key = jnp.einsum("hqk,hqd->hkd", to_logit, query)
-    return to_query, to_key, to_value, None
+    return to_query, to_key, to_value
 
 
-_attend.defvjp(_forward, _backward)
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _attend_in_blocks(rows: int, query, key, value, mask) -> Array:
+    """Attend `rows` queries at a time, a divisor of their number, keeping one number per query for the gradient."""
+    return _in_blocks_forward(rows, query, key, value, mask)[0]
+
+
+def _in_blocks_forward(rows, query, key, value, mask):
+    value = _clear_keys(value, mask)
+
+    def block(inputs):
+        query, mask = inputs
+        logits = _logits(query, key, mask)
+        log_total = _log_total(logits)
+        return jnp.einsum("hqk,hke->hqe", jnp.exp(logits - log_total).astype(value.dtype), value), log_total
+
+    out, log_total = lax.map(block, (_split(query, rows), _split_mask(mask, query.shape[1], rows)))
+    return _join(out), (query, key, value, mask, out, log_total)
+
+
+def _in_blocks_backward(rows, residuals, gradient):
+    query, key, value, mask, out, log_total = residuals
+    query, key = _clear_queries(query, mask), _clear_keys(key, mask)
+
+    def block(sums, inputs):
+        query, mask, out, log_total, gradient = inputs
+        weights = jnp.exp(_logits(query, key, mask) - log_total)
+        weights = lax.optimization_barrier(weights.astype(value.dtype))
+        to_query, *to_others = _gradients(query, key, value, weights, out, gradient)
+        return jax.tree.map(jnp.add, sums, to_others), to_query
+
+    masks = _split_mask(mask, query.shape[1], rows)
+    inputs = (_split(query, rows), masks, out, log_total, _split(gradient, rows))
+    (to_key, to_value), to_query = lax.scan(block, [jnp.zeros_like(key), jnp.zeros_like(value)], inputs)
+    return _join(to_query), to_key, to_value, None
+
+
+_attend_in_blocks.defvjp(_in_blocks_forward, _in_blocks_backward)
+
+
+def _split(x: Float[Array, "h q d"], rows: int) -> Float[Array, "n h rows d"]:
+    return x.reshape(x.shape[0], -1, rows, x.shape[-1]).swapaxes(0, 1)
+
+
+def _join(x: Float[Array, "n h rows d"]) -> Float[Array, "h q d"]:
+    return x.swapaxes(0, 1).reshape(x.shape[1], -1, x.shape[-1])
+
+
+def _split_mask(mask, queries, rows):
+    """Split a mask along its queries; one that all queries share is repeated."""
+    if mask is None or mask.shape[1] == queries:
+        return None if mask is None else _split(mask, rows)
+    return jnp.broadcast_to(mask, (queries // rows, *mask.shape))
 
 
 class MultiHeadAttention(nn.Module):
@@ -102,17 +223,27 @@ class MultiHeadAttention(nn.Module):
         value: Float[Array, "k c"],
         mask: Mask | None = None,
     ) -> Float[Array, "q d"]:
-        """Return the attended values, without residual; 0 for a query that may see no key."""
+        """Return the attended values, without residual; 0 for a query that may see no key.
+
+        Stores the attention weights as the intermediate `probabilities` (heads, q, k) where a caller asks for it:
+        `module.apply(variables, ..., mutable="intermediates")`.
+        """
+        if self.dim % self.heads:
+            raise ValueError(f"dim {self.dim} does not split over {self.heads} heads")
+        if mask is not None:
+            pairs = mask.any(0) if mask.ndim == 3 else mask
+            seen, sees = pairs.any(0)[:, None], pairs.any(1)[:, None]
+            # Cleared here too, not only in `masked_attention`: the gradients of the projections would be 0 * NaN.
+            query, key, value = jnp.where(sees, query, 0), jnp.where(seen, key, 0), jnp.where(seen, value, 0)
         q, k, v = (
             nn.Dense(self.dim, name=name)(x).reshape(x.shape[0], self.heads, self.dim // self.heads).swapaxes(0, 1)
             for name, x in (("query", query), ("key", key), ("value", value))
         )
+        if self.is_mutable_collection("intermediates"):
+            self.sow("intermediates", "probabilities", attention_probabilities(q, k, mask))
         attended = masked_attention(q, k, v, mask).swapaxes(0, 1).reshape(query.shape[0], self.dim)
         out = nn.Dense(self.dim, name="output")(attended)
+        # The output's bias must not stand in for an attention over nothing.
         if key.shape[0] == 0:
             return jnp.zeros_like(out)
-        if mask is None:
-            return out
-        # The output's bias must not stand in for an attention over nothing.
-        sees = mask.any((0, 2)) if mask.ndim == 3 else mask.any(1)
-        return jnp.where(sees[:, None], out, 0.0)
+        return out if mask is None else jnp.where(sees, out, 0)

@@ -21,8 +21,8 @@ def pair_mask(valid_queries: Bool[Array, " q"], valid_keys: Bool[Array, " k"]) -
 class SpatialMask:
     """M_s of TF-Lane (Fig. 5): who sees whom among L lane queries and T traffic instances.
 
-    A quadrant is what one fusion module needs, broadcastable to its full size, so that quadrants nobody uses are never
-    built. Rows are queries.
+    A quadrant is what one fusion module needs, broadcastable to its full size: attention takes it as it is, and the
+    whole (L+T) x (L+T) matrix exists only where `dense` is called. Rows are queries.
 
     Attributes:
         lanes: L.
@@ -53,8 +53,13 @@ class SpatialMask:
 
     def dense(self) -> Bool[Array, "l+t l+t"]:
         """Return the whole matrix, lanes first."""
-        lanes, traffic = self.lanes, self.traffic_traffic.shape[0]
-        lane_lane = jnp.ones((lanes, lanes), bool) if self.lane_lane is None else self.lane_lane
-        top = jnp.concatenate([lane_lane, jnp.broadcast_to(self.lane_traffic, (lanes, traffic))], 1)
-        bottom = jnp.concatenate([jnp.broadcast_to(self.traffic_lane, (traffic, lanes)), self.traffic_traffic], 1)
-        return jnp.concatenate([top, bottom], 0)
+        lanes, traffic = self.lanes, self.lane_traffic.shape[1]
+        lane_lane = jnp.ones((1, 1), bool) if self.lane_lane is None else self.lane_lane
+
+        def full(quadrant, rows, columns):
+            return jnp.broadcast_to(quadrant, (rows, columns))
+
+        return jnp.block([
+            [full(lane_lane, lanes, lanes), full(self.lane_traffic, lanes, traffic)],
+            [full(self.traffic_lane, traffic, lanes), full(self.traffic_traffic, traffic, traffic)],
+        ])

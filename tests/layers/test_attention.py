@@ -1,0 +1,350 @@
+"""Masked attention against plain loops, finite differences, the libraries' and PyTorch's numbers."""
+
+import math
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tflane_jax.layers import attention
+from tflane_jax.layers.attention import MultiHeadAttention, attention_probabilities, masked_attention
+from tflane_jax.layers.masks import key_mask, pair_mask
+
+HEADS, D, E = 2, 4, 3
+
+
+@pytest.fixture(params=["whole", "in blocks"])
+def either_way(request, monkeypatch):
+    """Run a small problem whole, and cut into blocks of queries as large ones are."""
+    if request.param == "in blocks":
+        monkeypatch.setattr(attention, "BLOCK", 11)
+
+
+def arrays(seed, queries, keys, heads=HEADS):
+    """Return query, key, value and a gradient of the result."""
+    rng = np.random.default_rng(seed)
+    shapes = ((heads, queries, D), (heads, keys, D), (heads, keys, E), (heads, queries, E))
+    return tuple(jnp.asarray(rng.normal(size=shape).astype(np.float32)) for shape in shapes)
+
+
+def random_mask(seed, *shape):
+    return jnp.asarray(np.random.default_rng(seed).random(shape) < 0.5)
+
+
+def with_gradients(query, key, value, gradient, mask):
+    """Return the result and the gradients of query, key and value."""
+    return _with_gradients(query, key, value, gradient, mask, block=attention.BLOCK)
+
+
+@partial(jax.jit, static_argnames="block")
+def _with_gradients(query, key, value, gradient, mask, block):
+    assert block == attention.BLOCK
+    out, pull = jax.vjp(lambda q, k, v: masked_attention(q, k, v, mask), query, key, value)
+    return out, *pull(gradient)
+
+
+def loop_attention(query, key, value, mask):
+    """Attention written as loops over heads, queries and allowed keys, in float64."""
+    query, key, value = (np.asarray(x, np.float64) for x in (query, key, value))
+    heads, queries, keys = len(query), query.shape[1], key.shape[1]
+    allowed = np.ones((heads, queries, keys), bool) if mask is None else np.broadcast_to(mask, (heads, queries, keys))
+    out, weights = np.zeros((heads, queries, value.shape[-1])), np.zeros((heads, queries, keys))
+    for h in range(heads):
+        for i in range(queries):
+            seen = [j for j in range(keys) if allowed[h, i, j]]
+            exps = [math.exp(query[h, i] @ key[h, j] / math.sqrt(query.shape[-1])) for j in seen]
+            for j, e in zip(seen, exps, strict=True):
+                weights[h, i, j] = e / sum(exps)
+                out[h, i] += weights[h, i, j] * value[h, j]
+    return out, weights
+
+
+SIZES = [(8, 3), (1, 1), (1, 6), (6, 1), (0, 4), (4, 0)]
+MASKS = {
+    "none": lambda q, k: None,
+    "pairs": lambda q, k: random_mask(1, q, k),
+    "pairs per head": lambda q, k: random_mask(2, HEADS, q, k),
+    "keys": lambda q, k: random_mask(3, 1, k),
+    "keys per head": lambda q, k: random_mask(4, HEADS, 1, k),
+    "queries": lambda q, k: random_mask(5, q, 1),
+    "nothing": lambda q, k: jnp.zeros((1, 1), bool),
+}
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize(
+    ("queries", "keys", "kind"), [(5, 7, kind) for kind in MASKS] + [(*size, "pairs") for size in SIZES]
+)
+def test_matches_loops(queries, keys, kind):
+    query, key, value, _ = arrays(0, queries, keys)
+    mask = MASKS[kind](queries, keys)
+    out, weights = loop_attention(query, key, value, mask)
+    run = jax.jit(lambda q, k, v, m: (masked_attention(q, k, v, m), attention_probabilities(q, k, m)))
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        got, got_weights = run(query, key, value, mask)
+    np.testing.assert_allclose(got, out, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(got_weights, weights, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("kind", ["none", "pairs", "keys per head"])
+def test_gradients_match_finite_differences(kind):
+    with jax.enable_x64(True):
+        query, key, value, _ = (x.astype(jnp.float64) for x in arrays(1, 5, 7))
+        mask = MASKS[kind](5, 7)
+        attend = jax.jit(lambda q, k, v: masked_attention(q, k, v, mask))
+        check_grads(attend, (query, key, value), 1, ["rev"], 1e-6, 1e-6)
+
+
+@pytest.mark.usefixtures("either_way")
+def test_rows_with_keys_match_the_library():
+    query, key, value, gradient = arrays(2, 6, 5)
+    mask = random_mask(6, 6, 5).at[:, 0].set(True)
+
+    def library(q, k, v):
+        return jax.nn.dot_product_attention(*(x.swapaxes(0, 1) for x in (q, k, v)), mask=mask[None]).swapaxes(0, 1)
+
+    # The library wants as many channels in values as in keys.
+    value, gradient = (jnp.concatenate([x, x[..., :1]], -1) for x in (value, gradient))
+    out, pull = jax.jit(partial(jax.vjp, library))(query, key, value)
+    for got, want in zip(with_gradients(query, key, value, gradient, mask), (out, *pull(gradient)), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.usefixtures("either_way")
+def test_queries_without_keys_are_exactly_nothing():
+    query, key, value, gradient = arrays(3, 6, 5)
+    blind = np.array([1, 4])
+    mask = random_mask(7, 6, 5).at[:, 2].set(True).at[blind].set(False)
+    out, to_query, to_key, to_value = with_gradients(query, key, value, gradient, mask)
+    assert not np.any(out[:, blind])
+    assert not np.any(to_query[:, blind])
+    # They add nothing to the gradients of the others either.
+    others = np.setdiff1d(np.arange(6), blind)
+    rest = with_gradients(query[:, others], key, value, gradient[:, others], mask[others])
+    np.testing.assert_allclose(to_key, rest[2], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(to_value, rest[3], rtol=1e-5, atol=1e-6)
+
+    for leaf in with_gradients(query, key, value, gradient, jnp.zeros((6, 5), bool)):
+        assert not np.any(leaf)
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("garbage", [np.nan, np.inf, -1e30])
+@pytest.mark.parametrize("heads", ["shared", "per head"])
+def test_masked_slots_may_hold_anything(garbage, heads):
+    query, key, value, gradient = arrays(4, 6, 5)
+    valid_queries = np.array([[1, 1, 0, 1, 1, 0], [1, 0, 1, 1, 1, 1]], bool)
+    valid_keys = np.array([[1, 0, 1, 1, 0], [0, 1, 1, 1, 1]], bool)
+    if heads == "shared":
+        valid_queries[1], valid_keys[1] = valid_queries[0], valid_keys[0]
+    mask = jax.vmap(pair_mask)(jnp.asarray(valid_queries), jnp.asarray(valid_keys))
+    clean = with_gradients(query, key, value, gradient, mask)
+    query = jnp.where(valid_queries[..., None], query, garbage)
+    key, value = (jnp.where(valid_keys[..., None], x, garbage) for x in (key, value))
+    if heads == "shared":
+        mask = mask[0]
+    for got, want in zip(with_gradients(query, key, value, gradient, mask), clean, strict=True):
+        np.testing.assert_array_equal(got, want)
+        assert np.isfinite(got).all()
+
+
+@pytest.mark.usefixtures("either_way")
+def test_large_logits_do_not_overflow():
+    query, key, value, gradient = arrays(5, 6, 5)
+    for leaf in with_gradients(1e4 * query, 1e4 * key, value, gradient, random_mask(8, 6, 5)):
+        assert np.isfinite(leaf).all()
+
+
+@pytest.mark.usefixtures("either_way")
+def test_padding_changes_nothing():
+    """A padded and an unpadded twin agree."""
+    query, key, value, gradient = arrays(6, 6, 5)
+    short = with_gradients(query, key[:, :3], value[:, :3], gradient, None)
+    padded = with_gradients(query, key, value, gradient, key_mask(jnp.arange(5) < 3))
+    for got, want in zip(padded, short, strict=True):
+        np.testing.assert_allclose(got[:, : want.shape[1]], want, rtol=1e-5, atol=1e-6)
+        assert not np.any(got[:, want.shape[1] :])
+
+
+@pytest.mark.usefixtures("either_way")
+@pytest.mark.parametrize("depth", [1, 2])
+def test_vmap_is_a_loop_in_one_trace(depth):
+    """Over a batch, and over instances within it, as the temporal encoder runs."""
+    shape = (3, 2)[:depth]
+    count = math.prod(shape)
+    batch = [arrays(10 + i, 6, 5) for i in range(count)]
+    masks = [random_mask(20 + i, 6, 5) for i in range(count)]
+    stacked = [jnp.stack(x).reshape(*shape, *x[0].shape) for x in (*zip(*batch, strict=True), masks)]
+
+    traces = []
+
+    @jax.jit
+    def run(*stacked):
+        traces.append(stacked)
+        inner = with_gradients if depth == 1 else jax.vmap(with_gradients)
+        return jax.vmap(inner)(*stacked)
+
+    run(*stacked[:-1], ~stacked[-1])
+    one_by_one = [with_gradients(*example, mask) for example, mask in zip(batch, masks, strict=True)]
+    for got, want in zip(run(*stacked), zip(*one_by_one, strict=True), strict=True):
+        np.testing.assert_allclose(got.reshape(count, *got.shape[depth:]), np.stack(want), rtol=1e-5, atol=1e-6)
+    assert len(traces) == 1
+
+
+@pytest.mark.usefixtures("either_way")
+def test_bfloat16_stays_bfloat16_and_close():
+    exact = [x.astype(jnp.bfloat16).astype(jnp.float32) for x in arrays(7, 6, 5)]
+    mask = random_mask(9, 6, 5)
+    with jax.numpy_dtype_promotion("strict"):
+        coarse = with_gradients(*(x.astype(jnp.bfloat16) for x in exact), mask)
+    for got, want in zip(coarse, with_gradients(*exact, mask), strict=True):
+        assert got.dtype == jnp.bfloat16
+        np.testing.assert_allclose(got.astype(np.float32), want, rtol=0.0, atol=0.02 * (1.0 + np.abs(want).max()))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**16), size=st.sampled_from([(1, 1), (5, 6)]))
+def test_order_of_queries_and_keys_does_not_matter(seed, size):
+    queries, keys = size
+    rng = np.random.default_rng(seed)
+    query, key, value, _ = arrays(seed, queries, keys)
+    mask = random_mask(seed, queries, keys)
+    rows, columns = rng.permutation(queries), rng.permutation(keys)
+    run = jax.jit(masked_attention)
+    permuted = run(query[:, rows], key[:, columns], value[:, columns], mask[rows][:, columns])
+    np.testing.assert_allclose(permuted, run(query, key, value, mask)[:, rows], rtol=1e-5, atol=1e-6)
+
+
+@pytest.fixture
+def module():
+    """Return a module whose biases are not zero, its variables, and tokens of a query and a key side."""
+    rng = np.random.default_rng(0)
+    query, key = (jnp.asarray(rng.normal(size=(n, 8)).astype(np.float32)) for n in (6, 5))
+    module = MultiHeadAttention(8, 2)
+    params = jax.jit(module.init)(jax.random.key(0), query, key, key)
+    return module, jax.tree.map(lambda x: x + 0.1, params), query, key
+
+
+def test_module_over_nothing_is_zero(module):
+    module, params, query, key = module
+    assert not np.any(module.apply(params, query, key[:0], key[:0]))
+    assert not np.any(module.apply(params, query, key, key, jnp.zeros((6, 5), bool)))
+    assert module.apply(params, query[:0], key, key).shape == (0, 8)
+    mask = jnp.ones((2, 6, 5), bool).at[:, 3].set(False)
+    out = module.apply(params, query, key, key, mask)
+    assert not np.any(out[3])
+    np.testing.assert_allclose(out[0], module.apply(params, query, key, key)[0], rtol=1e-5, atol=1e-6)
+
+
+def test_module_ignores_masked_slots_in_parameter_gradients(module):
+    module, params, query, key = module
+    valid_query, valid_key = jnp.arange(6) != 2, jnp.arange(5) < 3
+    mask = pair_mask(valid_query, valid_key)
+
+    @jax.jit
+    def gradients(query, key):
+        return jax.grad(lambda p, q, k: (module.apply(p, q, k, k, mask) ** 2).sum(), (0, 1, 2))(params, query, key)
+
+    clean = gradients(query, key)
+    dirty = gradients(jnp.where(valid_query[:, None], query, jnp.nan), jnp.where(valid_key[:, None], key, jnp.nan))
+    chex.assert_trees_all_equal(dirty, clean)
+    chex.assert_tree_all_finite(clean)
+
+
+def test_module_shows_its_weights(module):
+    module, params, query, key = module
+    mask = random_mask(1, 6, 5)
+    out, state = module.apply(params, query, key, key, mask, mutable="intermediates")
+    (weights,) = state["intermediates"]["probabilities"]
+    assert weights.shape == (2, 6, 5)
+    np.testing.assert_allclose(weights.sum(-1), np.broadcast_to(mask.any(1), (2, 6)), atol=1e-6)
+    np.testing.assert_array_equal(out, module.apply(params, query, key, key, mask))
+
+
+def test_module_names_a_width_that_does_not_split():
+    x = jnp.zeros((2, 6))
+    with pytest.raises(ValueError, match="dim 6 does not split over 4 heads"):
+        MultiHeadAttention(6, 4).init(jax.random.key(0), x, x, x)
+
+
+def our_parameters(torch):
+    names = ("query", "key", "value")
+    parts = zip(names, jnp.split(torch["in_proj_weight"], 3), jnp.split(torch["in_proj_bias"], 3), strict=True)
+    params = {name: {"kernel": weight.T, "bias": bias} for name, weight, bias in parts}
+    return params | {"output": {"kernel": torch["out_proj.weight"].T, "bias": torch["out_proj.bias"]}}
+
+
+def torch_attention(torch, arrays, mask, heads):
+    """Run our module as torch does: sequence first, then batch."""
+    module = MultiHeadAttention(arrays["query"].shape[-1], heads)
+    variables = {"params": our_parameters(torch)}
+
+    def one(query, key, value, mask):
+        out, state = module.apply(variables, query, key, value, mask, mutable="intermediates")
+        return out, state["intermediates"]["probabilities"][0]
+
+    return jax.vmap(one, in_axes=(1, 1, 1, 0), out_axes=(1, 0))(arrays["query"], arrays["key"], arrays["value"], mask)
+
+
+def torch_biased_attention(torch, arrays, bias, heads):
+    """Run our function under an additive float mask (B, H, Q, K), which it takes as channels: q' = b, k' = 1."""
+    params = our_parameters(torch)
+    dim = arrays["query"].shape[-1] // heads
+    channels = dim + bias.shape[-1]
+
+    def project(name):
+        x = arrays[name] @ params[name]["kernel"] + params[name]["bias"][None, None]
+        return x.reshape(*x.shape[:2], heads, dim).transpose(1, 2, 0, 3)
+
+    query = jnp.concatenate([project("query") * math.sqrt(channels / dim), bias * math.sqrt(channels)], -1)
+    key = project("key")
+    key = jnp.concatenate([key, jnp.broadcast_to(jnp.eye(bias.shape[-1]), (*key.shape[:3], bias.shape[-1]))], -1)
+    out = jax.vmap(masked_attention)(query, key, project("value")).transpose(2, 0, 1, 3)
+    out = out.reshape(*out.shape[:2], -1) @ params["output"]["kernel"] + params["output"]["bias"][None, None]
+    return out, jax.vmap(attention_probabilities)(query, key)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("mha_*"), ids=case_id)
+def test_module_matches_torch(path):
+    case = load_module_case(path)
+    heads = case.meta["config"]["heads"]
+    blocked, padding = case.inputs.get("attn_mask"), case.inputs.get("key_padding_mask")
+    arrays = {name: case.inputs[name] for name in ("query", "key", "value")}
+    (queries, batch), keys = arrays["query"].shape[:2], arrays["key"].shape[0]
+    additive = blocked is not None and blocked.dtype != bool
+
+    def outputs(torch, arrays):
+        if additive:
+            out, weights = torch_biased_attention(torch, arrays, blocked.reshape(batch, heads, queries, keys), heads)
+        else:
+            mask = np.ones((batch, queries, keys), bool)
+            mask &= True if blocked is None else ~blocked
+            mask &= True if padding is None else ~padding[:, None]
+            out, weights = torch_attention(torch, arrays, jnp.asarray(mask), heads)
+        return {"output": out, "weights_per_head": weights, "weights_avg": weights.mean(1)}
+
+    outputs = jax.jit(outputs)
+    torch = {name: jnp.asarray(x) for name, x in case.params.items() if not name.startswith("enc.")}
+    actual = outputs(torch, arrays)
+    # A row without keys is NaN in torch and nothing here.
+    expected = {name: np.nan_to_num(case.outputs[name], nan=0.0) for name in actual}
+    assert_outputs_close(actual, expected)
+    for name in actual:
+        assert not np.any(np.asarray(actual[name])[np.isnan(case.outputs[name])])
+
+    if case.gradients:
+        def scalar(torch, arrays):
+            return sum((outputs(torch, arrays)[name] * weight).sum() for name, weight in case.weights.items())
+
+        by_param, by_input = jax.jit(jax.grad(scalar, argnums=(0, 1)))(torch, arrays)
+        gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
+        assert_gradients_close(gradients, case.gradients)

@@ -1,0 +1,60 @@
+"""Masks against the truth table of each pair, and the spatial mask against its definition entry by entry."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tflane_jax.layers.masks import SpatialMask, key_mask, pair_mask
+
+
+def random_bool(seed, *shape):
+    return jnp.asarray(np.random.default_rng(seed).random(shape) < 0.5)
+
+
+@pytest.mark.parametrize(("queries", "keys"), [(3, 4), (1, 1), (0, 2), (2, 0)])
+def test_pairs(queries, keys):
+    valid_queries, valid_keys = random_bool(0, queries), random_bool(1, keys)
+    by_key = np.broadcast_to(key_mask(valid_keys), (queries, keys))
+    by_pair = np.asarray(pair_mask(valid_queries, valid_keys))
+    assert by_pair.shape == (queries, keys)
+    for i in range(queries):
+        for j in range(keys):
+            assert by_key[i, j] == valid_keys[j]
+            assert by_pair[i, j] == (valid_queries[i] and valid_keys[j])
+
+
+@pytest.mark.parametrize(("lanes", "traffic"), [(4, 3), (1, 1), (0, 2), (3, 0)])
+@pytest.mark.parametrize("host", ["no mask", "own mask"])
+def test_spatial_mask_entry_by_entry(lanes, traffic, host):
+    """A lane sees what the host lets it see and valid instances; a valid instance sees all lanes and its like."""
+    valid = random_bool(2, traffic)
+    lane_mask = random_bool(3, lanes, lanes) if host == "own mask" else None
+    dense = np.asarray(SpatialMask.from_validity(lane_mask, valid, lanes).dense())
+    assert dense.shape == (lanes + traffic, lanes + traffic)
+    for i in range(lanes + traffic):
+        for j in range(lanes + traffic):
+            if i < lanes and j < lanes:
+                expected = lane_mask is None or lane_mask[i, j]
+            else:
+                expected = (i < lanes or valid[i - lanes]) and (j < lanes or valid[j - lanes])
+            assert dense[i, j] == expected, (i, j)
+
+
+def test_spatial_mask_goes_through_vmap_and_takes_quadrants_of_ones_own():
+    valid = random_bool(4, 5, 3)
+    batch = jax.vmap(lambda v: SpatialMask.from_validity(None, v, 2))(valid)
+    assert batch.lane_lane is None
+    dense = jax.vmap(SpatialMask.dense)(batch)
+    for i in range(5):
+        np.testing.assert_array_equal(dense[i], SpatialMask.from_validity(None, valid[i], 2).dense())
+
+    near = random_bool(5, 2, 3)
+    swapped = SpatialMask.from_validity(None, valid[0], 2).replace(lane_traffic=near)
+    np.testing.assert_array_equal(swapped.dense()[:2, 2:], near)
+
+
+def test_no_quadrant_that_nobody_uses_is_built():
+    """4,000 x 4,000 lanes without a mask of the host's own must not cost 16 MB."""
+    mask = SpatialMask.from_validity(None, random_bool(6, 30), 4000)
+    assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 2 * 30

@@ -17,7 +17,9 @@ def _total(cost, assignment):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("queries", "targets", "count"), [(5, 5, 5), (8, 3, 2), (3, 7, 7), (3, 7, 5), (1, 1, 1), (6, 4, 0)])
+@pytest.mark.parametrize(
+    ("queries", "targets", "count"), [(5, 5, 5), (8, 3, 2), (3, 7, 7), (3, 7, 5), (1, 1, 1), (6, 4, 0)]
+)
 def test_least_cost(backend, queries, targets, count):
     rng = np.random.default_rng([queries, targets, count])
     cost = rng.normal(size=(queries, targets)).astype(np.float32)

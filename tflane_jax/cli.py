@@ -47,6 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
     _evaluate(commands)
     _predict(commands)
     _data(commands)
+    _compare(commands)
     _demo(commands)
     _bench(commands)
     return parser
@@ -131,6 +132,17 @@ def _data(commands) -> None:
                      function="build", epilog=_OVERRIDES)  # fmt: skip
     build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
     build.set_defaults(takes_overrides=True)
+
+
+def _compare(commands) -> None:
+    parser = _command(commands, "compare", "train configurations with several seeds and test their differences",
+                      module="compare", function="run", epilog=_OVERRIDES)  # fmt: skip
+    parser.add_argument("configs", metavar="[NAME=]FILE[:ABLATION]", nargs="+",
+                        help="config files; the first one is what the others are compared with")  # fmt: skip
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, sharing the cores (default 1)")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/compare"), help="default runs/compare")
+    parser.set_defaults(takes_overrides=True)
 
 
 def _demo(commands) -> None:

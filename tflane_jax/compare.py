@@ -45,6 +45,11 @@ class Job:
     config: RunConfig
     folder: Path
 
+    @property
+    def log(self) -> Path:
+        """What a training in a process of its own prints."""
+        return self.folder.with_name(f"{self.folder.name}.log")
+
 
 def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, jobs: int = 1) -> Path:
     """Train what is not trained yet, evaluate on the test split, print and save tables and pictures.
@@ -112,7 +117,7 @@ def train_all(jobs: Sequence[Job], parallel: int) -> None:
             for slot in range(parallel):
                 if slot not in running and waiting:
                     job = waiting.pop(0)
-                    job.folder.mkdir(parents=True, exist_ok=True)
+                    job.log.parent.mkdir(parents=True, exist_ok=True)
                     process = context.Process(target=_worker, args=(job, cores[slot::parallel]), daemon=True)
                     process.start()
                     running[slot] = process, job
@@ -122,14 +127,14 @@ def train_all(jobs: Sequence[Job], parallel: int) -> None:
                 if process.exitcode is not None:
                     del running[slot]
                     if process.exitcode != 0:
-                        raise UserError(f"training {job.folder} failed: its messages are in {job.folder / 'log.txt'}")
+                        raise UserError(f"training {job.folder} failed: its messages are in {job.log}")
 
 
 def _worker(job: Job, cores: list[int]) -> None:
     """Train in a process of its own: on its own cores, with its messages in a file."""
     if cores:
         os.sched_setaffinity(0, cores)  # XLA sizes its thread pool by this
-    with (job.folder / "log.txt").open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+    with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
         configure_jax()
         try:
             result = train_run(job.config, job.folder, start=_start(job.folder), progress=False)

@@ -1,13 +1,26 @@
-"""TopoNet's lane branch on the built-in world: the vision-only baseline.
+"""TopoNet's lane branch on the built-in world, at a size for two cores: the vision-only baseline.
 
     tflane train --config configs/tf_lane/toponet.py
 
 Its numbers stand beside those of `toponet_tfm.py`, in README.md.
 """
 
-from tflane_jax.config import RunConfig
+from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
 
 
 def get_config() -> RunConfig:
-    """Return the baseline: all defaults."""
-    return RunConfig()
+    """Return the baseline.
+
+    A small model and few steps want a higher learning rate than TopoNet's, and more weight on the topology, whose loss
+    is a mean over all pairs of queries.
+    """
+    return RunConfig(
+        task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
+        data=WorldData(train=1000, val=25, test=150),
+        optim=OptimConfig(lr=1.5e-3, warmup_steps=200),
+        training=TrainingConfig(steps=2000, eval_every=1000, checkpoint_every=500),
+    )

@@ -13,7 +13,7 @@ from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.scene import Areas, Example, LaneGraph
 
 BASELINE = TopoNetConfig(
-    encoder=EvidenceEncoderConfig(dim=16, stem=8, dilations=(1,)),
+    encoder=EvidenceEncoderConfig(dim=16, dilations=(1,)),
     decoder=LaneDecoderConfig(dim=16, heads=2, layers=2, queries=6, points=11, hidden=16, relation=8),
 )
 WITH_TRAFFIC = dataclasses.replace(

@@ -15,30 +15,30 @@ class EvidenceEncoderConfig:
 
     Attributes:
         dim: channels of the BEV features.
-        stem: channels at half resolution.
-        dilations: one residual block at quarter resolution for each.
+        cell: raster cells a side that become one feature cell.
+        dilations: one residual block for each.
     """
 
-    dim: int = 64
-    stem: int = 32
+    dim: int = 32
+    cell: int = 4
     dilations: tuple[int, ...] = (1, 2, 4, 1)
 
 
 class EvidenceEncoder(nn.Module):
-    """Strided convolutions, then residual blocks of growing reach."""
+    """Raster cells folded into channels, then residual blocks of growing reach."""
 
     config: EvidenceEncoderConfig
 
     @nn.compact
-    def __call__(self, bev: UInt8[Array, "h w c"]) -> Float[Array, "h4 w4 d"]:
-        """Return features at a quarter of the raster's resolution."""
+    def __call__(self, bev: UInt8[Array, "h w c"]) -> Float[Array, "hf wf d"]:
+        """Return features, `cell` times coarser than the raster; raises ValueError where that does not divide it."""
+        (h, w, c), n = bev.shape, self.config.cell
+        if h % n or w % n:
+            raise ValueError(f"a raster of {h} x {w} cells does not fold into blocks of {n} x {n}")
         x = bev.astype(jnp.float32) / 255.0
-        # Two cells a side folded into channels: the first convolution then runs on a quarter of the cells.
-        h, w, c = x.shape
-        x = x.reshape(h // 2, 2, w // 2, 2, c).transpose(0, 2, 1, 3, 4).reshape(h // 2, w // 2, 4 * c)
-        x = nn.relu(_norm("stem_norm")(nn.Conv(self.config.stem, (3, 3), name="stem")(x)))
-        x = nn.Conv(self.config.dim, (3, 3), strides=(2, 2), name="reduce")(x)
-        x = nn.relu(_norm("reduce_norm")(x))
+        # Folding loses nothing and spares the convolutions at full resolution, which would cost most on a CPU.
+        x = x.reshape(h // n, n, w // n, n, c).transpose(0, 2, 1, 3, 4).reshape(h // n, w // n, n * n * c)
+        x = nn.relu(_norm("stem_norm")(nn.Conv(self.config.dim, (3, 3), name="stem")(x)))
         for i, dilation in enumerate(self.config.dilations):
             y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
             x = nn.relu(x + _norm(f"block_{i}_norm")(y))

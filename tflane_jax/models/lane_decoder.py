@@ -1,8 +1,9 @@
 """TopoNet's lane decoder: queries look at BEV features, refine centerlines and pass messages along predicted topology.
 
 Reference: specs/modules.md section 5. Two modes of refinement: "fixed" is TopoNet's own, where a query looks around one
-reference point that never moves; "iterative" moves all points of the lane from layer to layer and lets each attention
-head look around its own point of the lane (as LaneSegNet's heads-to-regions), which small models need to converge.
+reference point that never moves; "iterative" starts from learned anchor lanes, moves all points from layer to layer,
+and lets each attention head look around its own point of the lane (LaneSegNet's heads-to-regions), which small models
+need to converge.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+from scipy.stats import qmc
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
@@ -39,19 +41,21 @@ class LaneDecoderConfig:
         hidden: channels inside the feed-forward block.
         relation: channels of a side of the relationship head.
         edge_weight: share of neighbours in the scene graph.
+        bands: frequencies per coordinate that tell where a refined lane is.
         refine: see the file's docstring.
         range: the box that normalised coordinates span.
     """
 
     dim: int = 64
-    heads: int = 4
+    heads: int = 8
     layers: int = 3
-    queries: int = 60
+    queries: int = 48
     points: int = 11
     sampling_points: int = 4
     hidden: int = 128
-    relation: int = 32
+    relation: int = 16
     edge_weight: float = 0.6
+    bands: int = 6
     refine: Literal["fixed", "iterative"] = "iterative"
     range: PerceptionRange = BevGrid().range
 
@@ -63,13 +67,37 @@ class LaneQueries(nn.Module):
 
     @nn.compact
     def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
-        """Return content, position and initial reference points in [0, 1] (all points of a lane on one spot)."""
+        """Return content, position and initial reference points in [0, 1].
+
+        "fixed": all points of a lane on one spot that the position decides; "iterative": learned anchor lanes.
+        """
         config = self.config
         embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
         position, content = jnp.split(embedding, 2, -1)
+        if config.refine == "iterative":
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config))))
+            return content, position, nn.sigmoid(anchors)
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         shape = (config.queries, config.points, 3)
         return content, position, jnp.broadcast_to(spot[:, None], shape)
+
+
+def spread_lanes(config: LaneDecoderConfig, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:
+    """Return straight lanes spread evenly over the range, in [0, 1]: the anchors before training.
+
+    Middles and headings follow a Halton sequence: three lanes in five run along the ego's own axis, half of them
+    against it, and the others anywhere. `length` is in metres.
+    """
+    sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
+    middle = np.asarray(config.range.low(2)) + sample[:, :2] * np.asarray(config.range.size(2))
+    share = sample[:, 2] / 0.6
+    heading = np.where(share < 1.0, np.pi * (share < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
+    along = np.linspace(-length / 2, length / 2, config.points)
+    direction = np.stack([np.cos(heading), np.sin(heading)], -1)
+    lanes = np.zeros((config.queries, config.points, 3), np.float32)
+    lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
+    # Off the border, where the sigmoid that the points go through is flat.
+    return np.clip(config.range.normalise(lanes), 0.02, 0.98)
 
 
 class LaneDecoderLayer(nn.Module):

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tflane_jax.layers.graph import edge_probabilities
+from tflane_jax.layers.graph import Mlp, edge_probabilities
+from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
     LaneDecoderConfig,
@@ -91,10 +92,10 @@ class TopoNet(nn.Module):
         outputs = []
         for i in range(config.layers):
             where = position
-            if config.refine == "iterative" and i > 0:
-                where = position + nn.Dense(config.dim, name=f"lane_position_{i}")(
-                    reference.reshape(config.queries, -1)
-                )
+            if config.refine == "iterative":
+                # A query that moves says where it is.
+                along = sine_encoding(reference[..., :2], config.bands).reshape(config.queries, -1)
+                where = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
             queries = enhance(i, queries, where)
             look_at = attention_reference(reference, config)
             layer = LaneDecoderLayer(config, name=f"layer_{i}")

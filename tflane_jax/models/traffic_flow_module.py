@@ -101,7 +101,11 @@ class TemporalLayer(nn.Module):
     def __call__(self, x: Float[Array, "t n c"], frame_valid: Bool[Array, "t n"]) -> Float[Array, "t n c"]:
         """Return the frames after masked self-attention and a feed-forward block."""
         # One instance at a time; the mask is the temporal mask of Fig. 4.
-        attend = nn.vmap(MultiHeadAttention, variable_axes={"params": None}, split_rngs={"params": False})
+        attend = nn.vmap(
+            MultiHeadAttention,
+            variable_axes={"params": None, "intermediates": 0},
+            split_rngs={"params": False},
+        )
         y = nn.LayerNorm(name="attention_norm")(x)
         x = x + attend(self.width, self.heads, name="attention")(y, y, y, frame_valid[:, None, :])
         y = nn.LayerNorm(name="mlp_norm")(x)

@@ -106,7 +106,8 @@ def train_all(jobs: Sequence[Job], parallel: int) -> None:
     waiting = [job for job in jobs if _step(job.folder) < job.config.training.steps]
     if parallel == 1:
         for job in waiting:
-            train_run(job.config, job.folder, start=_start(job.folder))
+            if train_run(job.config, job.folder, start=_start(job.folder)).stopped_by is not None:
+                raise KeyboardInterrupt  # what is written goes on when the same command is given again
         return
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     context = multiprocessing.get_context("spawn")

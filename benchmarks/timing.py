@@ -1,0 +1,109 @@
+"""Timing that a busy machine cannot falsify: compiled programs in turn, compared round by round.
+
+Arrays are arguments, since XLA folds the constants of a closure into the program; compilation is timed apart; the
+programs of a comparison run one after the other in every round, and what is reported is the median over rounds of the
+ratio of two times of one round, so that a neighbour's load hits both.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from tflane_jax.training.provenance import provenance
+from tflane_jax.training.run_folder import write_json
+
+Program = Callable[[], Any]
+
+
+class Compiled(NamedTuple):
+    """A program ready to run on its arguments, and the seconds that its compilation took."""
+
+    program: Program
+    seconds: float
+
+
+def compile_jax(function: Callable[..., Any], *arguments: Any) -> Compiled:
+    """Compile `function` for `arguments`; the program runs it on them and waits for the result."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    return Compiled(lambda: jax.block_until_ready(compiled(*arguments)), time.perf_counter() - start)
+
+
+def interleave(programs: Mapping[str, Program], seconds: float, least_rounds: int = 3) -> dict[str, np.ndarray]:
+    """Run all programs once a round, in random order, until `seconds` are over; return seconds by round.
+
+    In a fixed or rotating order each program has the same neighbour before it, and pays for what that leaves running:
+    behind PyTorch, whose threads spin on for a while, the same program took 1.3 times as long.
+    A round repeats a fast program until it has taken about a millisecond, and counts the mean. The first run of each,
+    which touches fresh memory, is not counted.
+    """
+    repeats = {name: max(1, min(100, int(1e-3 / _seconds(program, 1)))) for name, program in programs.items()}
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    names, rng = list(programs), np.random.default_rng(0)
+    start, rounds = time.perf_counter(), 0
+    while rounds < least_rounds or time.perf_counter() - start < seconds:
+        for i in rng.permutation(len(names)):
+            times[names[i]].append(_seconds(programs[names[i]], repeats[names[i]]))
+        rounds += 1
+    return {name: np.array(values) for name, values in times.items()}
+
+
+def _seconds(program: Program, repeats: int) -> float:
+    start = time.perf_counter()
+    for _ in range(repeats):
+        program()
+    return (time.perf_counter() - start) / repeats
+
+
+def summarise(times: Mapping[str, np.ndarray], reference: str) -> dict[str, dict[str, float]]:
+    """Return for each program its median and least milliseconds and how many times as long as `reference` it takes."""
+    return {
+        name: {
+            "median_ms": float(np.median(values) * 1e3),
+            "least_ms": float(values.min() * 1e3),
+            "ratio": float(np.median(values / times[reference])),
+            "ratio_of_least": float(values.min() / times[reference].min()),
+            "rounds": len(values),
+        }
+        for name, values in times.items()
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Return provenance, processor and threads."""
+    return provenance() | {"processor": _processor(), "cores": os.cpu_count(), "load": list(os.getloadavg())}
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return an aligned table: the first column to the left, the others to the right."""
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+
+    def line(cells: Sequence[str]) -> str:
+        aligned = [cell.rjust(width) for cell, width in zip(cells, widths, strict=True)]
+        return f"| {' | '.join([cells[0].ljust(widths[0]), *aligned[1:]])} |"
+
+    rule = f"|{'|'.join('-' * (w + 2) if i == 0 else '-' * (w + 1) + ':' for i, w in enumerate(widths))}|"
+    return "\n".join([line(header), rule, *map(line, rows)])
+
+
+def save(out: Path, name: str, record: dict[str, Any], table: str) -> None:
+    """Write `name`.json and `name`.md into the folder `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / f"{name}.json", record)
+    (out / f"{name}.md").write_text(table + "\n", encoding="utf-8")

@@ -37,6 +37,7 @@ def shipped() -> dict[str, str]:
 @pytest.mark.parametrize(("name", "reference"), shipped().items())
 def test_shipped_configurations_have_not_changed_silently(name, reference, monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
+    monkeypatch.delenv("TFLANE_SHARED", raising=False)
     text = to_text(load_config(reference) if reference else RunConfig())
     golden = GOLDEN / f"{name}.txt"
     if not golden.exists() or golden.read_text(encoding="utf-8") != text:

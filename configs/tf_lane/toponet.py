@@ -22,5 +22,5 @@ def get_config() -> RunConfig:
         task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
         data=WorldData(train=1000, val=25, test=150),
         optim=OptimConfig(lr=1.5e-3, warmup_steps=200),
-        training=TrainingConfig(steps=2000, eval_every=1000, checkpoint_every=500),
+        training=TrainingConfig(steps=1000, eval_every=500, checkpoint_every=500),
     )

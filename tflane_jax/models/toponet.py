@@ -94,7 +94,8 @@ class TopoNet(nn.Module):
             where = position
             if config.refine == "iterative":
                 # A query that moves says where it is.
-                along = sine_encoding(reference[..., :2], config.bands).reshape(config.queries, -1)
+                along = jnp.concatenate([sine_encoding(reference[..., :2], config.bands), reference], -1)
+                along = along.reshape(config.queries, -1)
                 where = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
             queries = enhance(i, queries, where)
             look_at = attention_reference(reference, config)

@@ -81,8 +81,7 @@ class TemporalEncoder(nn.Module):
         width, (instances, frames) = self.config.width, tokens.frame_valid.shape
         where = tokens.position
         if self.config.position_encoding == "sine":
-            ground = sine_encoding(where[..., :2], self.config.bands)
-            where = jnp.concatenate([ground, where[..., 2:]], -1)
+            where = jnp.concatenate([sine_encoding(where[..., :2], self.config.bands), where], -1)
         moving = jnp.concatenate([where, tokens.heading], -1)
         x = nn.Dense(width, name="frame")(moving)
         category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)

@@ -1,0 +1,15 @@
+"""All benchmarks, one after the other: `python -m benchmarks --out DIR` (what `tflane bench` runs)."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from benchmarks import attention_masks, host
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and tables")
+options = parser.parse_args()
+for benchmark in (host, attention_masks):
+    print(f"\n== {benchmark.__name__}\n", flush=True)
+    benchmark.run(options.out)

@@ -1,10 +1,10 @@
 """A world-trained +TFM model, fine-tuned on one real Argoverse 2 log and evaluated on another.
 
-    tflane train --config configs/tf_lane/argoverse2.py --training.init-from runs/compare/tfm/seed_0 --out runs/finetuned
+    tflane train --config configs/tf_lane/argoverse2.py --training.init-from RUN --out runs/finetuned
     tflane eval runs/finetuned
 
-The two logs are those of $TFLANE_SHARED/data/argoverse2 (default ../shared). One log of 32 frames shows that the program
-runs on real data; it says nothing about accuracy. Numbers: docs/argoverse2.md.
+RUN is a run of `toponet_tfm.py`; the two logs are those of $TFLANE_SHARED/data/argoverse2 (default ../shared). One log of
+32 frames shows that the program runs on real data; it says little about accuracy. Numbers: docs/argoverse2.md.
 """
 
 import dataclasses

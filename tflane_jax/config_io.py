@@ -89,8 +89,10 @@ def _value(hint: Any, content: Any, path: str) -> Any:
         return content
     if hint is Path and isinstance(content, str):
         return Path(content)
-    if isinstance(hint, type) and issubclass(hint, enum.Enum) and content in hint.__members__:
-        return hint[content]
+    if isinstance(hint, type) and issubclass(hint, enum.Enum) and isinstance(content, str):
+        if content in hint.__members__:
+            return hint[content]
+        raise UserError(f"setting {path} cannot be {content!r:.80}")
     if hint is float and type(content) is int:
         return float(content)
     if isinstance(hint, type) and type(content) is hint:

@@ -3,8 +3,8 @@
     tflane train --config configs/tf_lane/argoverse2.py --training.init-from RUN --out runs/finetuned
     tflane eval runs/finetuned
 
-RUN is a run of `toponet_tfm.py`; the two logs are those of $TFLANE_SHARED/data/argoverse2 (default ../shared). One log of
-32 frames shows that the program runs on real data; it says little about accuracy. Numbers: docs/argoverse2.md.
+RUN is a run of `toponet_tfm.py`; the two logs are those of $TFLANE_SHARED/data/argoverse2 (default ../shared). One log
+of 32 frames shows that the program runs on real data; it says little about accuracy. Numbers: docs/argoverse2.md.
 """
 
 import dataclasses

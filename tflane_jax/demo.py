@@ -11,24 +11,26 @@ from pathlib import Path
 
 from tflane_jax.compare import compare
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
-STEPS = 900
+STEPS = 1400
 
 
 def configs() -> dict[str, RunConfig]:
     """Return the demo's two configurations: the baseline and the same with traffic flow."""
     baseline = RunConfig(
+        task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
         data=WorldData(train=400, val=10, test=50),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, ema_decay=0.99),
-        training=TrainingConfig(steps=STEPS, log_every=25, eval_every=STEPS // 2, checkpoint_every=300),
+        training=TrainingConfig(steps=STEPS, batch_size=4, log_every=25, eval_every=STEPS // 2, checkpoint_every=350),
         evaluation=EvaluationConfig(pictures=2),
     )
-    task = LaneGraphTask(model=replace(TopoNetConfig(), traffic_flow=TrafficFlowConfig()))
-    return {"baseline": baseline, "+TFM": replace(baseline, task=task)}
+    with_traffic = LaneGraphTask(replace(TopoNetConfig(), traffic_flow=TrafficFlowConfig()), baseline.task.losses)
+    return {"baseline": baseline, "+TFM": replace(baseline, task=with_traffic)}
 
 
 def main(out: Path) -> int:

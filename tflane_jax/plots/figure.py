@@ -6,6 +6,7 @@ matplotlib is imported when the first figure is made: it takes a second and is a
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,7 +38,16 @@ def new_figure(
         raise UserError(
             "pictures need matplotlib: install the extra with `pip install 'tflane_jax[plot]'`"
         ) from error
-    figure = Figure((columns * panel[0], rows * panel[1] + footer), layout="constrained")
+
+    class NotebookFigure(Figure):
+        """A figure that shows itself at the end of a notebook cell, as pyplot's do."""
+
+        def _repr_png_(self) -> bytes:
+            picture = io.BytesIO()
+            self.savefig(picture, dpi=90, format="png")
+            return picture.getvalue()
+
+    figure = NotebookFigure((columns * panel[0], rows * panel[1] + footer), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 

@@ -66,7 +66,7 @@ def fakes():
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
             patch.setattr(LaneGraphTask, function.__name__, function)
-        for module in ("runs", "commands.predict"):
+        for module in ("runs", "commands.predict", "compare"):
             patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
         yield
 
@@ -249,3 +249,27 @@ def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
     assert main(["train", "--config", f"{config}:baseline", "--out", str(folder)]) == 130
     said = capsys.readouterr().err
     assert f"stopped by SIGINT after step 2; go on with: tflane train --resume --out {folder}" in said
+
+
+def test_a_comparison_trains_tests_and_is_not_done_twice(config, tmp_path, capsys):
+    out = tmp_path / "comparison"
+    command = ["compare", f"baseline={config}:baseline", f"+TFM={config}", "--seeds", "0", "1", "--out", str(out)]
+    assert main(command) == 0
+    scores = json.loads((out / "scores.json").read_text())
+    assert list(scores) == ["baseline", "+TFM", "+TFM, no traffic flow at inference"]
+    assert {len(values) for values in scores.values()} == {2}
+    assert "+TFM" in (out / "table.md").read_text()
+    assert "of 2" in (out / "paired.md").read_text()
+    assert (out / "comparison.png").stat().st_size > 10_000
+    printed = capsys.readouterr().out
+    assert "OpenLane-V2 centerline v2.1" in printed
+
+    records = out / "tfm" / "seed_1" / "metrics.jsonl"
+    before = records.stat().st_mtime_ns
+    assert main(command) == 0
+    assert records.stat().st_mtime_ns == before
+
+
+def test_a_comparison_needs_different_names(config, tmp_path, capsys):
+    assert main(["compare", str(config), str(config), "--out", str(tmp_path / "c")]) == 2
+    assert "same name" in capsys.readouterr().err

@@ -1,7 +1,7 @@
 """`tflane demo`: the main job on the built-in world, small enough for two cores and ten minutes.
 
 The same host is trained twice, on BEV evidence alone and with traffic flow, and both are evaluated on scenes that
-neither has seen. One short run of each: the README has the longer comparison over several seeds.
+neither has seen. One short run of each says little: `tflane compare` trains several seeds and tests the difference.
 """
 
 from __future__ import annotations
@@ -37,5 +37,5 @@ def main(out: Path) -> int:
     """Run the demo into a folder; what is there already is not done again."""
     print("Two trainings on the built-in world: lanes from BEV evidence alone, then with traffic flow (TF-Lane).")
     compare(configs(), (0,), out)
-    print("\nOne short run of each says little: README.md has the comparison over five seeds.")
+    print("\nOne short run of each says little: `tflane compare` trains several seeds and tests the difference.")
     return 0

@@ -136,6 +136,7 @@ def test_no_bev_is_an_error(fitted):
         task.predict(params, make_example().replace(bev=None))
 
 
+@pytest.mark.slow
 def test_overfits_one_example():
     import optax
 

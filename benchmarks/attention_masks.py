@@ -147,7 +147,7 @@ def lanes_jointly(lanes: Tokens, traffic: Tokens, mask: Array) -> Tokens:
 def spatial_masks(inputs: Inputs) -> SpatialMask:
     """Return M_s of every example; the host has no mask of its own."""
     count = inputs.lanes.shape[1]
-    return jax.vmap(lambda valid: SpatialMask.from_validity(None, valid, count))(inputs.valid)
+    return jax.vmap(lambda valid: SpatialMask.from_validity(count, valid))(inputs.valid)
 
 
 def quadrants_of(mask: SpatialMask) -> dict[str, Array | None]:

@@ -21,6 +21,6 @@ def get_config() -> RunConfig:
     return RunConfig(
         task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
         data=WorldData(train=1000, val=25, test=150),
-        optim=OptimConfig(lr=1.5e-3, warmup_steps=200),
-        training=TrainingConfig(steps=1000, eval_every=500, checkpoint_every=500),
+        optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
+        training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),
     )

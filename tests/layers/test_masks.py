@@ -30,7 +30,7 @@ def test_spatial_mask_entry_by_entry(lanes, traffic, host):
     """A lane sees what the host lets it see and valid instances; a valid instance sees all lanes and its like."""
     valid = random_bool(2, traffic)
     lane_mask = random_bool(3, lanes, lanes) if host == "own mask" else None
-    dense = np.asarray(SpatialMask.from_validity(lane_mask, valid, lanes).dense())
+    dense = np.asarray(SpatialMask.from_validity(lanes, valid, lane_mask).dense())
     assert dense.shape == (lanes + traffic, lanes + traffic)
     for i in range(lanes + traffic):
         for j in range(lanes + traffic):
@@ -43,18 +43,18 @@ def test_spatial_mask_entry_by_entry(lanes, traffic, host):
 
 def test_spatial_mask_goes_through_vmap_and_takes_quadrants_of_ones_own():
     valid = random_bool(4, 5, 3)
-    batch = jax.vmap(lambda v: SpatialMask.from_validity(None, v, 2))(valid)
+    batch = jax.vmap(lambda v: SpatialMask.from_validity(2, v))(valid)
     assert batch.lane_lane is None
     dense = jax.vmap(SpatialMask.dense)(batch)
     for i in range(5):
-        np.testing.assert_array_equal(dense[i], SpatialMask.from_validity(None, valid[i], 2).dense())
+        np.testing.assert_array_equal(dense[i], SpatialMask.from_validity(2, valid[i]).dense())
 
     near = random_bool(5, 2, 3)
-    swapped = SpatialMask.from_validity(None, valid[0], 2).replace(lane_traffic=near)
+    swapped = SpatialMask.from_validity(2, valid[0]).replace(lane_traffic=near)
     np.testing.assert_array_equal(swapped.dense()[:2, 2:], near)
 
 
 def test_no_quadrant_that_nobody_uses_is_built():
     """4,000 x 4,000 lanes without a mask of the host's own must not cost 16 MB."""
-    mask = SpatialMask.from_validity(None, random_bool(6, 30), 4000)
+    mask = SpatialMask.from_validity(4000, random_bool(6, 30))
     assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 2 * 30

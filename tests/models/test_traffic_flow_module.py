@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from tests.priors.test_traffic_flow import make_flow
+from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
     LANE_FUSIONS,
     SpatialEncoder,
     TemporalEncoder,
     TrafficFlowModuleConfig,
-    spatial_mask,
 )
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, select_traffic_flow
 
@@ -42,7 +42,7 @@ def spatial(config, seed=0, valid=None, lane_mask=None):
     )
     valid = jnp.arange(5) < 3 if valid is None else valid
     module = SpatialEncoder(config, DIM)
-    arguments = (lanes, position, traffic, spatial_mask(LANES, valid, lane_mask))
+    arguments = (lanes, position, traffic, SpatialMask.from_validity(LANES, valid, lane_mask))
     return module, jax.jit(module.init)(jax.random.key(seed), *arguments), arguments
 
 

@@ -40,9 +40,9 @@ class SpatialMask:
 
     @classmethod
     def from_validity(
-        cls, lane_mask: Bool[Array, "l l"] | None, traffic_valid: Bool[Array, " t"], lanes: int
+        cls, lanes: int, traffic_valid: Bool[Array, " t"], lane_mask: Bool[Array, "l l"] | None = None
     ) -> SpatialMask:
-        """Return M_s from the host's L->L mask and the validity of instances (section 3.3)."""
+        """Return M_s from the validity of instances and the host's L->L mask, None for all lanes (section 3.3)."""
         return cls(
             lanes=lanes,
             lane_lane=lane_mask,

@@ -2,13 +2,12 @@
 
 Reference: specs/modules.md section 5. Two modes of refinement: "fixed" is TopoNet's own, where a query looks around one
 reference point that never moves; "iterative" starts from learned anchor lanes, moves all points from layer to layer,
-and lets each attention head look around its own point of the lane (LaneSegNet's heads-to-regions), which small models
-need to converge.
+and lets each attention head look around its own point of the lane (LaneSegNet's heads-to-regions), and refines each
+point by what is seen there, which small models need to converge.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +20,7 @@ from scipy.stats import qmc
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
-from tflane_jax.layers.deformable import DeformableAttention
+from tflane_jax.layers.deformable import DeformableAttention, sample_bilinear
 from tflane_jax.layers.graph import Mlp, RelationshipHead, SceneGraphFeedForward
 from tflane_jax.layers.positions import inverse_sigmoid
 from tflane_jax.scene import LanePrediction
@@ -110,9 +109,8 @@ class LaneDecoderLayer(nn.Module):
         self,
         queries: Float[Array, "q c"],
         position: Float[Array, "q c"],
-        reference: Float[Array, "q r 2"],
-        bev: Float[Array, "hw c"],
-        shapes: Sequence[tuple[int, int]],
+        reference: Float[Array, "q p 3"],
+        bev: Float[Array, "h w e"],
         adjacency: Float[Array, "q q"],
     ) -> Float[Array, "q c"]:
         """Return the queries after one layer; `adjacency` holds the previous layer's edge probabilities."""
@@ -120,12 +118,37 @@ class LaneDecoderLayer(nn.Module):
         where = queries + position
         attended = MultiHeadAttention(config.dim, config.heads, name="self_attention")(where, where, queries, None)
         queries = nn.LayerNorm(name="self_attention_norm")(queries + attended)
-        look = DeformableAttention(
-            config.dim, config.heads, config.sampling_points, len(shapes), name="bev_attention"
-        )
-        queries = nn.LayerNorm(name="bev_attention_norm")(queries + look(queries + position, bev, shapes, reference))
+        look = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
+        (h, w, e), around = bev.shape, attention_reference(reference, config)
+        seen = look(queries + position, bev.reshape(h * w, e), ((h, w),), around)
+        queries = nn.LayerNorm(name="bev_attention_norm")(queries + seen)
         graph = SceneGraphFeedForward(config.dim, config.hidden, config.edge_weight, name="scene_graph")
         return nn.LayerNorm(name="scene_graph_norm")(graph(queries, adjacency))
+
+
+class PointwiseRefinement(nn.Module):
+    """Moves each point of a lane by what is seen there, with one network for all points of all lanes.
+
+    The heads' own perceptron must learn for every point anew what a line beside it means; this one learns it once.
+    """
+
+    config: LaneDecoderConfig
+
+    @nn.compact
+    def __call__(
+        self, queries: Float[Array, "q c"], reference: Float[Array, "q p 3"], bev: Float[Array, "h w e"]
+    ) -> Float[Array, "q p 3"]:
+        """Return the change of the reference points, zero before training."""
+        config, (h, w, e) = self.config, bev.shape
+        here = sample_bilinear(bev.reshape(h * w, e), (h, w), reference[..., :2])
+        heading = directions(config.range.denormalise(reference)[..., :2])
+        x = nn.Dense(config.dim, name="here")(here)
+        x = x + nn.Dense(config.dim, use_bias=False, name="heading")(heading)
+        x = x + nn.Dense(config.dim, use_bias=False, name="lane")(queries)[:, None]
+        x = x + self.param("place", nn.initializers.normal(0.1), (1, config.points, config.dim))
+        x = nn.relu(nn.Dense(config.dim, name="hidden")(nn.relu(x)))
+        # 0.3: Adam's steps are of one size for all parameters, and a point moves by metres where a lane moves by tens.
+        return 0.3 * nn.Dense(3, kernel_init=nn.initializers.zeros, name="change")(x)
 
 
 class LaneHeads(nn.Module):
@@ -135,7 +158,7 @@ class LaneHeads(nn.Module):
 
     @nn.compact
     def __call__(
-        self, queries: Float[Array, "q c"], reference: Float[Array, "q p 3"]
+        self, queries: Float[Array, "q c"], reference: Float[Array, "q p 3"], bev: Float[Array, "h w e"]
     ) -> tuple[LanePrediction, Float[Array, "q p 3"]]:
         """Return the prediction in metres and the same points in [0, 1]."""
         config = self.config
@@ -144,10 +167,33 @@ class LaneHeads(nn.Module):
             x = nn.relu(nn.LayerNorm(name=f"class_norm_{i}")(nn.Dense(config.dim, name=f"class_{i}")(x)))
         # Bias -log 99: every query starts as one percent likely (focal loss prior).
         logits = nn.Dense(1, bias_init=nn.initializers.constant(-np.log(99.0)), name="class_out")(x)
-        moved = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries)
-        unit = nn.sigmoid(moved.reshape(reference.shape) + inverse_sigmoid(reference))
+        # The change of the reference, in logits of [0, 1].
+        change = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries).reshape(reference.shape)
+        if config.refine == "iterative":
+            change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
+            change = change + PointwiseRefinement(config, name="pointwise")(queries, reference, bev)
+        unit = nn.sigmoid(change + inverse_sigmoid(reference))
         successor = RelationshipHead(config.relation, name="successor")(queries, queries)
         return LanePrediction(config.range.denormalise(unit), logits, successor), unit
+
+
+def smooth_basis(points: int) -> Float[np.ndarray, "p k"]:
+    """Return cosines along a lane as columns, the k-th scaled by 1 / k^2: the shapes that a lane is moved by.
+
+    The columns span everything that free points do, but an equal change of all coefficients bends a lane instead of
+    making it zigzag: the first moves it, the second turns and stretches it, the third bends it.
+    """
+    along = np.linspace(0.0, np.pi, points)
+    order = np.arange(points)
+    return (np.cos(along[:, None] * order) / np.maximum(order, 1) ** 2).astype(np.float32)
+
+
+def directions(points: Float[Array, "*b p 2"]) -> Float[Array, "*b p 2"]:
+    """Return the unit direction of travel at each point of a polyline, by central differences; 0 where it stands."""
+    before = jnp.concatenate([points[..., :1, :], points[..., :-1, :]], -2)
+    after = jnp.concatenate([points[..., 1:, :], points[..., -1:, :]], -2)
+    step = after - before
+    return step / jnp.sqrt((step**2).sum(-1, keepdims=True) + 1e-6)
 
 
 def attention_reference(

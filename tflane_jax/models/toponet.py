@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.graph import Mlp, edge_probabilities
+from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
@@ -23,14 +24,12 @@ from tflane_jax.models.lane_decoder import (
     LaneDecoderLayer,
     LaneHeads,
     LaneQueries,
-    attention_reference,
     next_reference,
 )
 from tflane_jax.models.traffic_flow_module import (
     SpatialEncoder,
     TemporalEncoder,
     TrafficFlowModuleConfig,
-    spatial_mask,
 )
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
 from tflane_jax.scene import Example, LanePrediction, TrafficFlow
@@ -82,10 +81,7 @@ class TopoNet(nn.Module):
         config = self.config.decoder
         if example.bev is None:
             raise ValueError("this model reads BEV evidence, and the example has none (bev is None)")
-        features = EvidenceEncoder(self.config.encoder, name="encoder")(example.bev)
-        shapes = ((features.shape[0], features.shape[1]),)
-        bev = features.reshape(-1, features.shape[-1])
-
+        bev = EvidenceEncoder(self.config.encoder, name="encoder")(example.bev)
         queries, position, reference = LaneQueries(config, name="queries")()
         enhance = self._traffic_flow(example)
         adjacency = jnp.zeros((config.queries, config.queries))
@@ -98,10 +94,8 @@ class TopoNet(nn.Module):
                 along = along.reshape(config.queries, -1)
                 where = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
             queries = enhance(i, queries, where)
-            look_at = attention_reference(reference, config)
-            layer = LaneDecoderLayer(config, name=f"layer_{i}")
-            queries = layer(queries, where, look_at, bev, shapes, adjacency)
-            prediction, unit = LaneHeads(config, name=f"heads_{i}")(queries, reference)
+            queries = LaneDecoderLayer(config, name=f"layer_{i}")(queries, where, reference, bev, adjacency)
+            prediction, unit = LaneHeads(config, name=f"heads_{i}")(queries, reference, bev)
             reference = next_reference(reference, unit, config)
             adjacency = edge_probabilities(prediction.successor_logits)
             outputs.append(prediction)
@@ -114,7 +108,7 @@ class TopoNet(nn.Module):
             return lambda layer, queries, position: queries
         tokens = traffic_flow_tokens(example, traffic.prior)
         features = TemporalEncoder(traffic.module, dim, name="temporal_encoder")(tokens)
-        mask = spatial_mask(self.config.decoder.queries, tokens.valid)
+        mask = SpatialMask.from_validity(self.config.decoder.queries, tokens.valid)
 
         def enhance(
             layer: int, queries: Float[Array, "q c"], position: Float[Array, "q c"]

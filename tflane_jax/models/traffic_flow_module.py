@@ -68,22 +68,30 @@ class TemporalEncoder(nn.Module):
     @nn.compact
     def __call__(self, tokens: TrafficFlowTokens) -> Float[Array, "t d"]:
         """Return TF_Feat; what stands at invalid instances is finite and meaningless."""
-        x = self._embed(tokens)
+        where = self._where(tokens)
+        x = self._embed(tokens, where)
         for i in range(self.config.depth):
             x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, tokens.frame_valid)
         x = nn.LayerNorm(name="norm")(x)
         weight = tokens.frame_valid.astype(x.dtype)
         mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
-        return Mlp((self.dim, self.dim), name="token")(mean)
+        # A mean blurs where a moving instance was; its first and its last valid frame say it.
+        first = tokens.frame_valid.argmax(-1)
+        last = weight.shape[1] - 1 - tokens.frame_valid[:, ::-1].argmax(-1)
+        ends = [jnp.take_along_axis(where, i[:, None, None], 1)[:, 0] for i in (first, last)]
+        return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, *ends], -1))
 
-    def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
-        """Encode position, heading, size, category and age of every frame."""
-        width, (instances, frames) = self.config.width, tokens.frame_valid.shape
+    def _where(self, tokens: TrafficFlowTokens) -> Float[Array, "t n e"]:
+        """Encode position and heading of every frame."""
         where = tokens.position
         if self.config.position_encoding == "sine":
             where = jnp.concatenate([sine_encoding(where[..., :2], self.config.bands), where], -1)
-        moving = jnp.concatenate([where, tokens.heading], -1)
-        x = nn.Dense(width, name="frame")(moving)
+        return jnp.concatenate([where, tokens.heading], -1)
+
+    def _embed(self, tokens: TrafficFlowTokens, where: Float[Array, "t n e"]) -> Float[Array, "t n c"]:
+        """Add size, category and age of every frame."""
+        width, (instances, frames) = self.config.width, tokens.frame_valid.shape
+        x = nn.Dense(width, name="frame")(where)
         category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
         size = nn.Dense(width, use_bias=False, name="size")(tokens.size)
         age = self.param("age", nn.initializers.normal(0.02), (frames, width))
@@ -162,10 +170,3 @@ class SpatialEncoder(nn.Module):
         transformed = fused + Mlp((2 * self.dim, self.dim), name="transform")(fused)
         transformed = nn.LayerNorm(name="transform_norm")(transformed)
         return transformed + lanes if self.config.query_type == "point" else transformed
-
-
-def spatial_mask(
-    lanes: int, traffic_valid: Bool[Array, " t"], lane_mask: Bool[Array, "l l"] | None = None
-) -> SpatialMask:
-    """Return M_s: the host's own L->L mask (None: all lanes see all), the rest from instance validity."""
-    return SpatialMask.from_validity(lane_mask, traffic_valid, lanes)

@@ -6,7 +6,7 @@ spatial mask M_s (Fig. 5, Eq. (2) and (3)). Neither knows anything of the host d
 
 Where the paper is silent, and what stands here: each fusion module is multi-head attention with a residual and a
 LayerNorm; the transformation T of Eq. (3) is a residual two-layer perceptron with a LayerNorm; an instance's token is
-the mean of its valid frames after self-attention.
+made from the mean of its valid frames after self-attention and from where its first and its last valid frame are.
 """
 
 from __future__ import annotations

@@ -1,0 +1,62 @@
+"""The parts of the lane decoder that have a geometry of their own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.models.cases import BASELINE
+from tflane_jax.models.lane_decoder import PointwiseRefinement, directions, smooth_basis, spread_lanes
+
+
+@pytest.mark.parametrize("points", [2, 3, 11, 20])
+def test_basis_reaches_every_polyline(points):
+    basis = smooth_basis(points)
+    anything = np.random.default_rng(0).normal(size=(points, 3))
+    np.testing.assert_allclose(basis @ np.linalg.solve(basis, anything), anything, atol=1e-3)
+
+
+def test_basis_bends_rather_than_zigzags():
+    basis = smooth_basis(11)
+    np.testing.assert_array_equal(basis[:, 0], 1.0)
+    bend = np.abs(np.diff(basis, 2, axis=0)).max(0)
+    assert (bend[2:] < 0.45).all()  # the alternating column alone, unscaled, would bend by 4
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 1000), st.floats(-3, 3), st.floats(-50, 50))
+def test_directions_turn_with_the_line(seed, angle, shift):
+    line = np.cumsum(np.random.default_rng(seed).uniform(0.2, 1.0, (7, 2)), 0).astype(np.float32)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], np.float32)
+    moved, before = (jax.jit(directions)(x) for x in (line @ turn.T + np.float32(shift), line))
+    np.testing.assert_allclose(moved, np.asarray(before) @ turn.T, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=-1), 1.0, atol=1e-3)
+
+
+def test_direction_of_a_point_is_zero_with_a_finite_gradient():
+    still = jnp.zeros((3, 2))
+    np.testing.assert_array_equal(directions(still), 0.0)
+    assert np.isfinite(jax.grad(lambda line: directions(line).sum())(still)).all()
+
+
+def test_pointwise_refinement_starts_at_zero_and_looks_only_where_the_point_is():
+    config = BASELINE.decoder
+    rng = np.random.default_rng(0)
+    queries = jnp.asarray(rng.normal(size=(config.queries, config.dim)), jnp.float32)
+    reference = jnp.asarray(spread_lanes(config))
+    bev = jnp.asarray(rng.normal(size=(6, 10, 5)), jnp.float32)
+    module = PointwiseRefinement(config)
+    params = jax.jit(module.init)(jax.random.key(0), queries, reference, bev)
+    apply = jax.jit(module.apply)
+    np.testing.assert_array_equal(apply(params, queries, reference, bev), 0.0)
+
+    params["params"]["change"]["kernel"] += 1.0
+    # Cells far from every point of the first lane may hold anything.
+    column, row = np.meshgrid((np.arange(10) + 0.5) / 10, (np.arange(6) + 0.5) / 6)
+    away = np.abs(np.stack([column, row], -1)[:, :, None] - np.asarray(reference)[0, :, :2]) > [0.11, 0.17]
+    other = jnp.where(away.any(-1).all(-1)[..., None], 7.0, bev)
+    before, after = (np.asarray(apply(params, queries, reference, b)) for b in (bev, other))
+    np.testing.assert_array_equal(before[0], after[0])
+    assert not np.allclose(before, after)

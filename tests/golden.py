@@ -91,6 +91,11 @@ def load_module_case(path: Path) -> ModuleCase:
     return ModuleCase(meta, *groups.values())
 
 
+def named_gradients(by_param: Arrays, by_input: Arrays) -> Arrays:
+    """Return gradients under the names of `ModuleCase.gradients`."""
+    return {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
+
+
 def assert_outputs_close(actual: Arrays, expected: Arrays, tolerance: float = 2e-5) -> None:
     """Compare every expected output by name: |a - b| <= tolerance (1 + |b|), the rule of the specification."""
     for name, value in expected.items():

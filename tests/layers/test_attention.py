@@ -12,7 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
 from tflane_jax.layers import attention
 from tflane_jax.layers.attention import MultiHeadAttention, attention_probabilities, masked_attention
 from tflane_jax.layers.masks import key_mask, pair_mask
@@ -346,5 +353,4 @@ def test_module_matches_torch(path):
             return sum((outputs(torch, arrays)[name] * weight).sum() for name, weight in case.weights.items())
 
         by_param, by_input = jax.jit(jax.grad(scalar, argnums=(0, 1)))(torch, arrays)
-        gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
-        assert_gradients_close(gradients, case.gradients)
+        assert_gradients_close(named_gradients(by_param, by_input), case.gradients)

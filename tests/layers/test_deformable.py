@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
 from tflane_jax.layers.deformable import (
     DeformableAttention,
     compass_offsets,
@@ -58,8 +65,7 @@ def test_decoder_attention_matches_the_reference(path):
     step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
     (_, out), (by_param, by_input) = step(case.params, case.inputs)
     assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
-    gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
-    assert_gradients_close(gradients, case.gradients)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
 
 
 def loop_sample(grid, x, y):

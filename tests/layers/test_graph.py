@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
 from tflane_jax.layers.graph import (
     LaneGraphConvolution,
     Mlp,
@@ -30,8 +37,7 @@ def test_graph_convolution_matches_the_reference(path):
     step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
     (_, out), (by_param, by_input) = step(case.params, case.inputs)
     assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
-    gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
-    assert_gradients_close(gradients, case.gradients)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
 
 
 def relationship_params(torch_params):
@@ -72,8 +78,7 @@ def test_relationship_head_matches_the_reference(path):
     features = {name: case.inputs[name] for name in ("o1_feats", "o2_feats")}
     assert_outputs_close(jax.jit(outputs)(case.params, features), without_scalar(case.outputs))
     by_param, by_input = jax.jit(jax.grad(scalar, argnums=(0, 1)))(case.params, features)
-    gradients = {f"p/{k}": v for k, v in by_param.items()} | {f"in/{k}": v for k, v in by_input.items()}
-    assert_gradients_close(gradients, case.gradients)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
 
 
 def without_scalar(outputs):

@@ -75,7 +75,7 @@ def test_matches_plain_loops(counts):
     prediction, lanes = make_case(1, counts)
     total, report = jitted_loss(prediction, lanes, CONFIG)
     assert float(total) == pytest.approx(loop_loss(prediction, lanes), rel=1e-5)
-    assert float(report["matched"]) == pytest.approx(np.mean(counts))
+    assert float(report["matching/lanes"]) == pytest.approx(np.mean(counts))
 
 
 def test_padding_changes_nothing():

@@ -62,7 +62,7 @@ def lane_graph_loss(
 
     Returns:
         The sum over layers of all weighted terms, and the terms of the last layer under `class`, `points`, `successor`
-        beside `matched`, the mean number of matched lanes.
+        beside `matching/lanes`, the mean number of matched lanes.
     """
     # Padding may hold anything; from here on it holds zeros, so that 0 * padding is 0.
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
@@ -80,7 +80,7 @@ def lane_graph_loss(
     }
     total = jnp.stack(list(terms.values())).sum()
     report = {name: value[-1] for name, value in terms.items()}
-    report["matched"] = assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()
+    report["matching/lanes"] = assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()
     return total, report
 
 

@@ -22,7 +22,8 @@ UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 def make_update_step(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
     """Return the jitted update (state, batch) -> (state, metrics); the state that goes in is consumed.
 
-    Metrics: `loss`, the task's terms as `loss/<term>`, `grad_norm` before clipping, `learning_rate`, and `finite`.
+    Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group of its own, "matching/lanes",
+    stays), `grad_norm` before clipping, `learning_rate`, and `finite`.
     Where the loss or a gradient is not finite, `finite` is False and the state comes out unchanged.
     A second trace (a batch of another shape) raises AssertionError.
     """
@@ -91,7 +92,7 @@ def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
             opt_state=opt_state,
             key=state.key,
         )
-        metrics = {f"loss/{name}": value for name, value in terms.items()} | {
+        metrics = {name if "/" in name else f"loss/{name}": value for name, value in terms.items()} | {
             "loss": loss,
             "grad_norm": grad_norm,
             "learning_rate": schedule(state.step),

@@ -25,7 +25,7 @@ def configs() -> dict[str, RunConfig]:
     baseline = RunConfig(
         task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
         data=WorldData(train=400, val=10, test=50),
-        optim=OptimConfig(lr=1e-3, warmup_steps=100, ema_decay=0.99),
+        optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0, ema_decay=0.99),
         training=TrainingConfig(steps=STEPS, batch_size=4, log_every=25, eval_every=STEPS // 2, checkpoint_every=350),
         evaluation=EvaluationConfig(pictures=2),
     )

@@ -18,6 +18,12 @@ from tflane_jax.errors import UserError
 _OVERRIDES = """Any setting of the configuration can be changed by its dotted name, say --optim.lr 1e-3.
 `tflane train --config FILE --help` lists them all with their values."""
 
+_FILES = """Protocols and their files:
+  openlane-v2.1-centerline, openlane-v1.0-centerline
+      PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
+      dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
+      of about four: say which one you report. v2.1 is also that of devkit v1.1."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
@@ -48,6 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
     _predict(commands)
     _data(commands)
     _compare(commands)
+    _score(commands)
     _demo(commands)
     _bench(commands)
     return parser
@@ -143,6 +150,19 @@ def _compare(commands) -> None:
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, sharing the cores (default 1)")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/compare"), help="default runs/compare")
     parser.set_defaults(takes_overrides=True)
+
+
+def _score(commands) -> None:
+    parser = _command(commands, "score", "score a file of predictions, of any framework, by an official protocol",
+                      module="score", function="run", epilog=_FILES)  # fmt: skip
+    parser.add_argument("protocol", metavar="PROTOCOL", help="see below")
+    parser.add_argument("predictions", metavar="PREDICTIONS", type=Path, help="file of predictions")
+    parser.add_argument("truth", metavar="GROUND_TRUTH", type=Path, help="file or folder of annotations")
+    parser.add_argument("--by", choices=("scene",), help="report parts as well")
+    parser.add_argument("--bootstrap", type=int, metavar="N", default=0,
+                        help="95 percent intervals from N draws of whole scenes (some 200 are enough)")  # fmt: skip
+    parser.add_argument("--out", metavar="STEM", type=Path, default=Path("score"),
+                        help="write STEM.md and STEM.json (default score)")  # fmt: skip
 
 
 def _demo(commands) -> None:

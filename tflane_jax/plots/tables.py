@@ -39,16 +39,17 @@ def format_table(
 
 
 def save_table(
-    stem: Path, rows: Sequence[Row], meta: Mapping[str, Any], *, title: str = "", digits: int = 3
-) -> tuple[Path, Path]:
+    stem: Path, rows: Sequence[Row], meta: Mapping[str, Any], *,
+    columns: Sequence[str] | None = None, title: str = "", digits: int = 3,
+) -> tuple[Path, Path]:  # fmt: skip
     """Write `<stem>.md` and `<stem>.json` ({"meta": ..., "rows": [...]}), each all or nothing, and return
-    both.
+    both. `columns` are those of the Markdown table; the JSON file has them all.
 
     NaN and infinity become null in the JSON file, where they are not allowed.
     """
     stem = Path(stem)
     text = json.dumps({"meta": _plain(meta), "rows": _plain(rows)}, indent=1, allow_nan=False)
-    table = format_table(rows, title=title, digits=digits)
+    table = format_table(rows, columns, title=title, digits=digits)
     return _write(stem.with_name(stem.name + ".md"), table), _write(stem.with_name(stem.name + ".json"), text)
 
 

@@ -1,0 +1,184 @@
+"""`tflane score` on OpenLane-V2's own files: official numbers, and what it says of damaged files."""
+
+import dataclasses
+import json
+import os
+import re
+
+import numpy as np
+import pytest
+
+from tests.metrics.cases import hand_frame
+from tests.metrics.fixtures import expected_cases, load_frames
+from tests.scoring.files import FRAMES, centerline_annotation, write_collection, write_submission
+from tflane_jax.cli import main
+
+PROTOCOL = "openlane-v2.1-centerline"
+DETECTIONS, TRUTH = hand_frame()
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Return a submission and annotations of three frames in two scenes, and where to write."""
+    write_submission(tmp_path / "submission.pkl", dict.fromkeys(FRAMES, DETECTIONS))
+    write_collection(tmp_path / "annotations.pkl", dict.fromkeys(FRAMES, TRUTH))
+    return tmp_path
+
+
+def run(folder, *more, protocol=PROTOCOL, truth="annotations.pkl"):
+    code = main(
+        ["score", protocol, str(folder / "submission.pkl"), str(folder / truth), "--out", str(folder / "out"), *more]
+    )
+    return code, json.loads((folder / "out.json").read_text()) if code == 0 else None
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("protocol", ["v2.1", "v1.0"])
+def test_files_give_the_official_numbers(tmp_path, protocol):
+    cases = expected_cases()
+    if not cases:
+        pytest.skip("golden/metrics/openlanev2_centerline is absent")
+    name = max(cases, key=lambda case: cases[case]["n_frames"])
+    frames = {("val", f"1000{i % 3}", str(i)): frame for i, frame in enumerate(load_frames(name))}
+    write_submission(tmp_path / "submission.pkl", {key: frame[0] for key, frame in frames.items()})
+    write_collection(tmp_path / "annotations.pkl", {key: frame[1] for key, frame in frames.items()})
+    code, written = run(tmp_path, protocol=f"openlane-{protocol}-centerline")
+    assert code == 0
+    official = cases[name][protocol.replace(".", "_")]
+    for number in ("DET_l", "DET_t", "TOP_ll", "TOP_lt", "OLS"):
+        assert written["rows"][0][number] == pytest.approx(official[number], abs=1e-6), number
+
+
+def test_a_folder_of_annotations_gives_the_same(files):
+    for split, segment, timestamp in FRAMES:
+        info = files / "data" / split / segment / "info"
+        info.mkdir(parents=True, exist_ok=True)
+        (info / f"{timestamp}.json").write_text(json.dumps({"annotation": centerline_annotation(TRUTH)}))
+        (info / f"{timestamp}-ls.json").write_text("the other task's file")
+    assert run(files)[1]["rows"] == run(files, truth="data")[1]["rows"]
+    # A split's own folder will do.
+    assert run(files)[1]["rows"] == run(files, truth="data/val")[1]["rows"]
+
+
+def test_dense_annotations_are_thinned(files):
+    # A straight line of 201 points; every 20th is what the detections were measured against.
+    dense = dataclasses.replace(TRUTH, points=[np.linspace(line[0], line[-1], 201) for line in TRUTH.points])
+    before = run(files)[1]["rows"]
+    write_collection(files / "annotations.pkl", dict.fromkeys(FRAMES, dense))
+    assert run(files)[1]["rows"] == before
+
+
+def test_the_table_names_protocol_and_scenes(files, capsys):
+    code, written = run(files, "--by", "scene", "--bootstrap", "20")
+    said = capsys.readouterr().out
+    assert code == 0
+    assert "OpenLane-V2 centerline v2.1" in said
+    assert [row["part"] for row in written["rows"]] == ["all", "low, 2.5 %", "high, 97.5 %", "val/10000", "val/10001"]
+    whole, low, high = written["rows"][:3]
+    # Every frame is the same, and so is every draw.
+    assert low["DET_l"] == pytest.approx(whole["DET_l"])
+    assert high["DET_l"] == pytest.approx(whole["DET_l"])
+    assert (files / "out.md").read_text() in said
+
+
+def test_intervals_hold_what_varies_between_scenes(files):
+    nothing = dataclasses.replace(DETECTIONS, points=[p + 30.0 for p in DETECTIONS.points])
+    write_submission(files / "submission.pkl", dict.fromkeys(FRAMES[:2], DETECTIONS) | {FRAMES[2]: nothing})
+    whole, low, high = run(files, "--bootstrap", "50")[1]["rows"]
+    assert low["DET_l"] == 0.0 < whole["DET_l"] < high["DET_l"]
+
+
+def first(results, field):
+    return results[FRAMES[1]]["predictions"][field]
+
+
+def drop(results):
+    del results[FRAMES[1]]
+
+
+def rename(results):
+    results["val", "99", "7"] = results.pop(FRAMES[0])
+
+
+def bad_key(results):
+    results["100"] = results.pop(FRAMES[0])
+
+
+DAMAGE = {
+    "missing frame": (drop, r"1 of 3 frames are missing from the predictions: val/10000/150 \(predict every frame"),
+    "extra frame": (rename, r"missing .*: val/10000/100 .*; 1 of 3 frames are predicted, but not .*: val/99/7"),
+    "key": (bad_key, r"'100' is no frame, expected \(split, segment, timestamp\)"),
+    "field": (lambda r: r[FRAMES[1]]["predictions"].pop("topology_lclc"), "frame val/10000/150 lacks .*topology_lclc"),
+    "no list": (lambda r: r[FRAMES[1]]["predictions"].update(lane_centerline=3),
+                "frame val/10000/150: lane_centerline is of type int, expected a list"),
+    "points": (lambda r: first(r, "lane_centerline")[2].update(points=np.zeros((11, 2))),
+               r"frame val/10000/150: lane_centerline\[2\].points has shape \(11, 2\), expected \(any, 3\)"),
+    "empty line": (lambda r: first(r, "lane_centerline")[2].update(points=[]), r"lane_centerline\[2\].points is empty"),
+    "NaN": (lambda r: first(r, "lane_centerline")[1]["points"].__setitem__((3, 0), np.nan),
+            r"frame val/10000/150: lane_centerline\[1\].points holds nan at \[3, 0\]"),
+    "words": (lambda r: first(r, "lane_centerline")[1].update(points="a line"),
+              r"frame val/10000/150: lane_centerline\[1\].points is of type str"),
+    "confidence": (lambda r: first(r, "lane_centerline")[3].update(confidence=1.5),
+                   r"frame val/10000/150: lane_centerline: confidence: number 3 is 1.5, expected 0 to 1"),
+    "topology": (lambda r: r[FRAMES[1]]["predictions"].update(topology_lclc=np.zeros((4, 3))),
+                 r"frame val/10000/150: topology_lclc has shape \(4, 3\), expected \(4, 4\)"),
+    "attribute": (lambda r: first(r, "traffic_element")[0].update(attribute=13),
+                  r"frame val/10000/150: traffic_element\[0\].attribute is 13, expected .* from 0 to 12"),
+    "box": (lambda r: first(r, "traffic_element")[0].update(points=np.zeros(4)),
+            r"traffic_element\[0\].points has shape \(4,\), expected \(2, 2\)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_submission_is_named_to_the_frame(files, capsys, damage):
+    change, message = DAMAGE[damage]
+    write_submission(files / "submission.pkl", dict.fromkeys(FRAMES, DETECTIONS), change)
+    code, _ = run(files)
+    said = capsys.readouterr()
+    assert code == 2
+    assert re.search(message, said.err), said.err
+    assert not (files / "out.json").exists()
+
+
+def test_a_pickle_that_runs_things_is_refused(files, capsys):
+    class Evil:
+        def __reduce__(self):
+            return os.system, ("true",)
+
+    write_submission(files / "submission.pkl", {}, lambda results: results.update(bad=Evil()))
+    assert run(files)[0] == 2
+    assert "is refused" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["openlane-v3", "a.pkl", "b.pkl"], "no protocol 'openlane-v3', only openlane-v2.1-centerline"),
+        ([PROTOCOL, "a.pkl", "b.pkl"], "cannot read a.pkl"),
+        ([PROTOCOL, "a.txt", "b.pkl"], "a.txt: expected a .json or .pkl file"),
+        ([PROTOCOL, "a.pkl", "b.pkl", "--bootstrap", "-1"], "--bootstrap -1"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message, capsys):
+    assert main(["score", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_one_scene_has_no_interval(files, capsys):
+    write_submission(files / "submission.pkl", {FRAMES[0]: DETECTIONS})
+    write_collection(files / "annotations.pkl", {FRAMES[0]: TRUTH})
+    assert run(files, "--bootstrap", "5")[0] == 2
+    assert "there is only one" in capsys.readouterr().err
+
+
+def test_no_frames_is_an_error(files, capsys):
+    write_submission(files / "submission.pkl", {})
+    write_collection(files / "annotations.pkl", {})
+    assert run(files)[0] == 2
+    assert "no frames" in capsys.readouterr().err
+
+
+def test_an_empty_folder_is_named(files, capsys):
+    (files / "empty").mkdir()
+    assert run(files, truth="empty")[0] == 2
+    assert "holds no annotations" in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""Scores of prediction files, whatever framework wrote them: `tflane score`."""

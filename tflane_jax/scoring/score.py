@@ -1,0 +1,128 @@
+"""Score predictions against ground truth by a protocol: whole, by scene, with confidence intervals.
+
+Frames are kept by scene, so that scenes can be reported alone and drawn again for the bootstrap: frames of one drive
+look alike, and intervals over frames would be far too narrow.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.errors import UserError
+
+
+class Accumulator(Protocol):
+    """What every metric of `tflane_jax.metrics` is."""
+
+    @property
+    def protocol(self) -> str:
+        """Name and version."""
+        ...
+
+    def update(self, detections: Any, truth: Any) -> None:
+        """Add a frame."""
+        ...
+
+    def merge(self, other: Self) -> Self:
+        """Return an accumulator of the frames of both."""
+        ...
+
+    def compute(self) -> dict[str, float]:
+        """Return the numbers."""
+        ...
+
+
+@dataclass(frozen=True)
+class Scored:
+    """The accumulators of a scored file, one for each scene, in order of their names."""
+
+    scenes: Mapping[str, Accumulator]
+
+    @property
+    def protocol(self) -> str:
+        """Name and version, to stand above every table."""
+        return next(iter(self.scenes.values())).protocol
+
+    def total(self) -> dict[str, float]:
+        """Return the numbers over all frames."""
+        return _merged(list(self.scenes.values())).compute()
+
+    def by_scene(self) -> dict[str, dict[str, float]]:
+        """Return the numbers of each scene."""
+        return {name: metrics.compute() for name, metrics in self.scenes.items()}
+
+    def intervals(
+        self, samples: int, *, level: float = 0.95, seed: int = 0, progress: bool = True
+    ) -> dict[str, tuple[float, float]]:
+        """Return percentile bootstrap intervals of the numbers: scenes are drawn with replacement, `samples` times.
+
+        Raises UserError where there are fewer than two scenes, of which nothing can be drawn.
+        """
+        scenes = list(self.scenes.values())
+        if len(scenes) < 2:
+            raise UserError("a bootstrap draws whole scenes, and there is only one: no interval can be given")
+        rng = np.random.default_rng(seed)
+        drawn: dict[str, list[float]] = {}
+        for _ in tqdm(range(samples), desc="bootstrap", unit="sample", disable=not progress):
+            chosen = [scenes[i] for i in rng.integers(0, len(scenes), len(scenes))]
+            for name, value in _merged(chosen).compute().items():
+                drawn.setdefault(name, []).append(value)
+        tails = (1 - level) / 2, (1 + level) / 2
+        return {name: tuple(np.quantile(values, tails).tolist()) for name, values in drawn.items()}
+
+
+def score(
+    predictions: Mapping[Hashable, Any],
+    truth: Mapping[Hashable, Any],
+    make: Callable[[], Accumulator],
+    scene_of: Callable[[Any], str],
+    *,
+    progress: bool = True,
+) -> Scored:
+    """Score frame by frame.
+
+    Args:
+        predictions, truth: by frame; both must have the same frames.
+        make: returns a fresh accumulator.
+        scene_of: from a frame to the name of its scene.
+        progress: show a bar with rate and time left.
+
+    Raises:
+        UserError: frames that only one side has (named), no frames, or an array that does not fit (its frame named).
+    """
+    _check_frames(predictions, truth)
+    scenes: dict[str, Accumulator] = {}
+    for key in tqdm(sorted(truth, key=str), desc="score", unit="frame", disable=not progress):
+        try:
+            scenes.setdefault(scene_of(key), make()).update(predictions[key], truth[key])
+        except UserError as error:
+            raise UserError(f"frame {key}: {error}") from None
+    return Scored(dict(sorted(scenes.items())))
+
+
+def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, Any]) -> None:
+    if not truth:
+        raise UserError("the ground truth has no frames")
+    problems = []
+    for what, remedy, lost in (
+        ("missing from the predictions", "predict every frame; a frame without lanes is an empty list",
+         truth.keys() - predictions.keys()),
+        ("predicted, but not in the ground truth", "score against the split that was predicted",
+         predictions.keys() - truth.keys()),
+    ):  # fmt: skip
+        if lost:
+            shown = ", ".join(sorted(map(str, lost))[:3])
+            more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+            problems.append(f"{len(lost)} of {len(truth)} frames are {what}: {shown}{more} ({remedy})")
+    if problems:
+        raise UserError("; ".join(problems))
+
+
+def _merged(accumulators: list[Accumulator]) -> Accumulator:
+    return functools.reduce(lambda a, b: a.merge(b), accumulators)

@@ -11,7 +11,7 @@ import io
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -78,9 +78,9 @@ def _scalar(dtype: np.dtype, data: bytes = b"") -> Any:
     return np.frombuffer(data, dtype, 1)[0]
 
 
-def _from_buffer(buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: str) -> np.ndarray:
+def _from_buffer(buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
     """Return an array that protocol 5 keeps inside the file."""
-    return np.frombuffer(buffer, dtype).reshape(shape, order=order)  # pyright: ignore[reportArgumentType]
+    return np.frombuffer(buffer, dtype).reshape(shape, order=order)
 
 
 _NUMPY: dict[str, dict[str, Any]] = {

@@ -29,7 +29,7 @@ def run(folder, *more, protocol=PROTOCOL, truth="annotations.pkl"):
     code = main(
         ["score", protocol, str(folder / "submission.pkl"), str(folder / truth), "--out", str(folder / "out"), *more]
     )
-    return code, json.loads((folder / "out.json").read_text()) if code == 0 else None
+    return code, json.loads((folder / "out.json").read_text()) if code == 0 else {}
 
 
 @pytest.mark.golden

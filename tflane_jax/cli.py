@@ -135,6 +135,12 @@ def _data(commands) -> None:
                       help="picture (default samples.png)")  # fmt: skip
     check = _command(inner, "check", "say what a folder of Argoverse 2 logs lacks", module="data", function="check")
     check.add_argument("root", metavar="PATH", help="a log or a folder of logs")
+    overlap = _command(inner, "overlap", "say whether two splits show the same places", module="data",
+                       function="overlap_of_splits")  # fmt: skip
+    overlap.add_argument("train", metavar="TRAIN", type=Path,
+                         help="folder of Argoverse 2 logs, or of OpenLane-V2 segments")  # fmt: skip
+    overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same of the other split")
+    overlap.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
     build = _command(inner, "build", "make the built-in world's examples ahead of training", module="data",
                      function="build", epilog=_OVERRIDES)  # fmt: skip
     build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")

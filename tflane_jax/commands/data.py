@@ -1,4 +1,4 @@
-"""`tflane data show`, `data check` and `data build`."""
+"""`tflane data show`, `data check`, `data overlap` and `data build`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 from tflane_jax.commands.sources import chosen_source, source_name
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.datasets.argoverse2 import check_log, find_logs, load_log
+from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
-from tflane_jax.plots import dataset_summary, format_table, show_dataset
+from tflane_jax.plots import dataset_summary, format_table, save_table, show_dataset
 from tflane_jax.runs import open_dataset, spread
 from tflane_jax.scene import stack_examples
 
@@ -44,6 +45,26 @@ def check(options: argparse.Namespace) -> int:
         print(f"{folder}: ok, {len(log.keyframes)} key frames, {log.tracks.frames} annotated frames, "
               f"{len(log.tracks.uuid)} road users, {len(log.map.segments)} lane segments")  # fmt: skip
     return 2 if lacking else 0
+
+
+def overlap_of_splits(options: argparse.Namespace) -> int:
+    """Print how much of a validation split lies near training frames."""
+    train, validation = read_drives(options.train), read_drives(options.validation)
+    found = overlap(train, validation)
+    title = (
+        f"share of {sum(map(len, found.distances))} validation frames ({len(validation)} drives) with a training frame "
+        f"({len(train)} drives) nearby"
+    )
+    print(format_table(found.rows(), title=title))
+    if found.worst():
+        print("\n" + format_table(found.worst(), title="validation drives that overlap most"))
+    if any(drive.area == "unknown" for drive in (*train, *validation)):
+        print("\nThese files do not name the city: places of different cities may coincide by chance.")
+    if options.out is not None:
+        sides = {"train": str(options.train), "validation": str(options.validation)}
+        meta = {**sides, "worst": found.worst(len(validation))}
+        print("\nwritten to", *save_table(options.out, found.rows(), meta, title=title))
+    return 0
 
 
 def build(options: argparse.Namespace, overrides: Sequence[str]) -> int:

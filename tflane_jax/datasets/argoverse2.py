@@ -90,7 +90,7 @@ def load_log(
         UserError: a file is missing or unreadable, lacks a column, or holds no frame.
     """
     folder = Path(folder)
-    pose_times, poses = _read_poses(folder)
+    pose_times, poses = read_poses(folder)
     boxes = read_table(folder / ANNOTATIONS, _BOX_COLUMNS)
     times = np.unique(boxes["timestamp_ns"])
     if len(times) == 0:
@@ -138,7 +138,7 @@ def read_table(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
     return {c: table[c].to_numpy() for c in columns}
 
 
-def _read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4)."""
     table = read_table(folder / POSES, _POSE_COLUMNS)
     order = np.argsort(table["timestamp_ns"], kind="stable")

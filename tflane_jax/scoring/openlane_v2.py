@@ -16,9 +16,9 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.fields import items, load_file, load_json, member, numbers, scores, whole_number
 from tflane_jax.metrics.centerline_matching import ATTRIBUTES
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
-from tflane_jax.scoring.fields import items, load_file, load_json, member, numbers, scores, whole_number
 
 # Annotated centerlines have 201 points; the published numbers are measured on every 20th.
 _DENSE, _STRIDE = 201, 20

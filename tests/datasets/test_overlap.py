@@ -1,0 +1,106 @@
+"""The split checker: near is near within one city only, and files of both kinds are read."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.shared import shared_root
+from tflane_jax.cli import main
+from tflane_jax.datasets.overlap import Drive, overlap, read_drives
+from tflane_jax.errors import UserError
+
+
+def drive(name, *positions, area="PIT"):
+    return Drive(name, area, np.array(positions, float).reshape(-1, 2))
+
+
+def test_distances_are_those_on_paper():
+    train = [drive("a", (0, 0), (10, 0)), drive("b", (100, 0))]
+    found = overlap(train, [drive("x", (13, 4), (40, 0)), drive("y", (100, 12))])
+    np.testing.assert_allclose(found.distances[0], [5, 30])
+    np.testing.assert_allclose(found.distances[1], [12])
+    assert found.nearest == ("a", "b")
+    assert found.rows() == [
+        {"within m": 5.0, "frames": pytest.approx(1 / 3), "drives": 0.5},
+        {"within m": 10.0, "frames": pytest.approx(1 / 3), "drives": 0.5},
+        {"within m": 20.0, "frames": pytest.approx(2 / 3), "drives": 1.0},
+        {"within m": 50.0, "frames": 1.0, "drives": 1.0},
+    ]
+    assert [row["drive"] for row in found.worst()] == ["y", "x"]
+
+
+def test_cities_are_never_compared():
+    found = overlap([drive("a", (0, 0))], [drive("x", (0, 0), area="MIA")])
+    assert found.nearest == ("-",)
+    assert np.isinf(found.distances[0]).all()
+    assert found.rows()[-1]["frames"] == 0.0
+    assert found.worst() == []
+
+
+@settings(deadline=None, max_examples=25, derandomize=True)
+@given(st.integers(0, 10**6), st.integers(1, 30), st.integers(1, 30))
+def test_distances_equal_a_plain_loop(seed, n, m):
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(-50, 50, (n, 2)), rng.uniform(-50, 50, (m, 2))
+    found = overlap([Drive("a", "PIT", a)], [Drive("b", "PIT", b)])
+    np.testing.assert_allclose(found.distances[0], np.linalg.norm(a[None] - b[:, None], axis=-1).min(1), atol=1e-9)
+
+
+@pytest.mark.parametrize("empty", ["training", "validation"])
+def test_no_frames_is_an_error(empty):
+    sides = {"training": [drive("a", (0, 0))], "validation": [drive("x", (0, 0))]} | {empty: [drive("e")]}
+    with pytest.raises(UserError, match=f"the {empty} split has no frames"):
+        overlap(sides["training"], sides["validation"])
+
+
+def write_segment(root, segment, *translations):
+    (root / segment / "info").mkdir(parents=True)
+    for i, translation in enumerate(translations):
+        text = json.dumps({"pose": {"translation": translation}})
+        (root / segment / "info" / f"{i}.json").write_text(text)
+        (root / segment / "info" / f"{i}-ls.json").write_text("not read")
+
+
+def test_openlane_folders_on_the_command_line(tmp_path, capsys):
+    write_segment(tmp_path / "train", "00001", [0, 0, 1], [10, 0, 1])
+    write_segment(tmp_path / "val", "10001", [10, 3, 5])
+    out = tmp_path / "overlap"
+    assert main(["data", "overlap", str(tmp_path / "train"), str(tmp_path / "val"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "do not name the city" in said
+    written = json.loads(out.with_suffix(".json").read_text())
+    assert written["rows"][0] == {"within m": 5.0, "frames": 1.0, "drives": 1.0}
+    assert written["meta"]["worst"][0]["nearest"] == "00001"
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [({}, "lacks the entry 'pose'"), ({"pose": {"translation": [0, 1]}}, "expected \\(3,\\)"),
+     ({"pose": {"translation": [0, float("nan"), 1]}}, "must be finite")],
+)  # fmt: skip
+def test_damaged_frames_are_named(tmp_path, pose, message):
+    (tmp_path / "s" / "info").mkdir(parents=True)
+    (tmp_path / "s" / "info" / "7.json").write_text(json.dumps(pose))
+    with pytest.raises(UserError, match=rf"7\.json.*{message}"):
+        read_drives(tmp_path)
+
+
+def test_a_folder_without_drives_is_named(tmp_path, capsys):
+    assert main(["data", "overlap", str(tmp_path), str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_real_logs():
+    logs = shared_root() / "data" / "argoverse2" / "sensor" / "val"
+    if not logs.is_dir():
+        pytest.skip("real logs are absent")
+    drives = read_drives(logs)
+    assert [d.area for d in drives] == ["PIT", "PIT"]
+    # Ego paths of 74.9 m and 40.4 m (specs/data_formats.md section 1.2).
+    lengths = [np.linalg.norm(np.diff(d.positions, axis=0), axis=-1).sum() for d in drives]
+    np.testing.assert_allclose(lengths, [74.9, 40.4], atol=0.3)
+    assert overlap(drives, drives).rows()[0] == {"within m": 5.0, "frames": 1.0, "drives": 1.0}
+    assert overlap(drives[:1], drives[1:]).rows()[-1]["frames"] == 0.0

@@ -1,0 +1,124 @@
+"""Do two splits show the same places? Training and validation drives that pass the same spot leak the map.
+
+The official splits of nuScenes and OpenLane-V2 do: a model that has learnt the map of a place by heart scores there
+without seeing anything. This compares ego positions and says how much of a validation split lies near training frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+from tflane_jax.datasets.argoverse2 import find_logs, read_poses
+from tflane_jax.errors import UserError
+from tflane_jax.fields import load_json, member, numbers
+
+RADII = (5.0, 10.0, 20.0, 50.0)
+_POSE_INTERVAL = 0.1  # seconds between the poses of a log that are looked at; the files have 170 a second
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Where one recording went.
+
+    Attributes:
+        name: of the recording.
+        area: whose coordinates the positions are in, a city; positions of different areas are never compared.
+        positions: (F, 2) metres.
+    """
+
+    name: str
+    area: str
+    positions: Float[np.ndarray, "f 2"]
+
+
+def read_drives(root: Path) -> list[Drive]:
+    """Return the drives of a folder of Argoverse 2 logs, or of OpenLane-V2 (`<segment>/info/<timestamp>.json`).
+
+    OpenLane-V2's files do not name the city: their drives all get the area "unknown".
+
+    Raises:
+        UserError: neither is there, or a file cannot be read.
+    """
+    root = Path(root)
+    files = sorted(p for p in root.glob("**/info/*.json") if not p.stem.endswith("-ls"))
+    if files:
+        drives: dict[Path, list[np.ndarray]] = {}
+        for file in files:
+            pose = member(load_json(file), "pose", str(file))
+            where = numbers(member(pose, "translation", f"{file}: pose"), (3,), f"{file}: pose.translation")
+            drives.setdefault(file.parent.parent, []).append(where[:2])
+        return [Drive(folder.name, "unknown", np.stack(where)) for folder, where in drives.items()]
+    return [_log_drive(folder) for folder in find_logs(root)]
+
+
+def _log_drive(folder: Path) -> Drive:
+    times, poses = read_poses(folder)
+    _, kept = np.unique(times // int(_POSE_INTERVAL * 1e9), return_index=True)
+    maps = sorted((folder / "map").glob("log_map_archive_*____*_city_*.json"))
+    if not maps:
+        raise UserError(f"{folder / 'map'} has no log_map_archive_*.json, whose name tells the city")
+    return Drive(folder.name, maps[0].stem.split("____")[1].split("_")[0], poses[kept, :2, 3])
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How near validation comes to training.
+
+    Attributes:
+        names: (V,) validation drives.
+        distances: of each, (F,) from every frame to the nearest training frame of the same area, metres; inf where
+            there is none.
+        nearest: (V,) the training drive that comes nearest, "-" where there is none.
+    """
+
+    names: tuple[str, ...]
+    distances: tuple[Float[np.ndarray, " f"], ...]
+    nearest: tuple[str, ...]
+
+    def rows(self) -> list[dict[str, float]]:
+        """Return, for each of `RADII`, the share of validation frames and of drives with a training frame so near."""
+        frames = np.concatenate(self.distances)
+        closest = np.array([d.min() for d in self.distances])
+        return [
+            {"within m": r, "frames": float((frames <= r).mean()), "drives": float((closest <= r).mean())}
+            for r in RADII
+        ]
+
+    def worst(self, count: int = 10) -> list[dict[str, float | str]]:
+        """Return the validation drives that overlap most at 20 m: share of their frames, least distance, with whom."""
+        rows: list[dict[str, float | str]] = [
+            {"drive": name, "frames within 20 m": float((d <= 20.0).mean()), "least m": float(d.min()), "nearest": who}
+            for name, d, who in zip(self.names, self.distances, self.nearest, strict=True)
+            if np.isfinite(d.min())
+        ]
+        return sorted(rows, key=lambda row: (-float(row["frames within 20 m"]), float(row["least m"])))[:count]
+
+
+def overlap(train: Sequence[Drive], validation: Sequence[Drive]) -> Overlap:
+    """Compare positions within each area; raises UserError where one side has no drive."""
+    for what, drives in (("training", train), ("validation", validation)):
+        if not sum(len(drive.positions) for drive in drives):
+            raise UserError(f"the {what} split has no frames")
+    trees = {}
+    for area in {drive.area for drive in train}:
+        drives = [drive for drive in train if drive.area == area]
+        owner = np.repeat(np.arange(len(drives)), [len(drive.positions) for drive in drives])
+        trees[area] = KDTree(np.concatenate([drive.positions for drive in drives])), owner, drives
+    distances, nearest = [], []
+    drives_with_frames = [drive for drive in validation if len(drive.positions)]
+    for drive in drives_with_frames:
+        if drive.area not in trees:
+            distances.append(np.full(len(drive.positions), np.inf))
+            nearest.append("-")
+            continue
+        tree, owner, drives = trees[drive.area]
+        distance, index = tree.query(drive.positions)
+        distances.append(distance)
+        nearest.append(drives[owner[index[distance.argmin()]]].name)
+    return Overlap(tuple(drive.name for drive in drives_with_frames), tuple(distances), tuple(nearest))

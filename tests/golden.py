@@ -19,6 +19,7 @@ from tests.shared import shared_root
 CLAIMS = {
     "metrics/openlanev2_centerline": "tests/metrics/test_openlane_v2.py",
     "metrics/resample": "tests/geometry/test_polylines.py",
+    "metrics/tusimple": "tests/metrics/test_tusimple.py",
     "modules/custom_msda_decoder*": "tests/layers/test_deformable.py",
     "modules/mha_*": "tests/layers/test_attention.py",
     "modules/mmdet_losses*": "tests/losses/test_costs.py",

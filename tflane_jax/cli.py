@@ -22,7 +22,10 @@ _FILES = """Protocols and their files:
   openlane-v2.1-centerline, openlane-v1.0-centerline
       PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
       dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
-      of about four: say which one you report. v2.1 is also that of devkit v1.1."""
+      of about four: say which one you report. v2.1 is also that of devkit v1.1.
+  tusimple, tusimple-lstr
+      Both files hold one JSON record a line: raw_file, lanes (x at every row, negative where there is none), h_samples
+      (the truth) or run_time in ms (predictions). tusimple-lstr allows 20 s an image instead of 200 ms, like LSTR."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

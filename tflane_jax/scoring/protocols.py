@@ -10,7 +10,8 @@ from typing import Any
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
-from tflane_jax.scoring import openlane_v2
+from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
+from tflane_jax.scoring import openlane_v2, tusimple
 from tflane_jax.scoring.score import Accumulator
 
 
@@ -41,6 +42,17 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
     )
     for version in ("v2.1", "v1.0")
+}
+
+PROTOCOLS |= {
+    name: ScoringProtocol(
+        read_predictions=tusimple.read_predictions,
+        read_truth=tusimple.read_truth,
+        scene_of=lambda image: image.rpartition("/")[0],
+        metrics=partial(TuSimpleMetrics, limit),
+        columns=("Accuracy", "FP", "FN"),
+    )
+    for name, limit in (("tusimple", OFFICIAL_TIME_LIMIT), ("tusimple-lstr", LSTR_TIME_LIMIT))
 }
 
 

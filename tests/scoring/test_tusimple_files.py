@@ -1,0 +1,97 @@
+"""`tflane score tusimple` on label files: official numbers, and what it says of damaged files."""
+
+import json
+import re
+
+import pytest
+
+from tests.metrics.test_tusimple import golden
+from tests.shared import shared_root
+from tflane_jax.cli import main
+
+ROWS = [240, 250, 260, 270]
+TRUTH = [
+    {"raw_file": f"clips/0313/{i}/20.jpg", "h_samples": ROWS, "lanes": [[100, 110, 120, 130], [-2, 300, 310, 320]]}
+    for i in range(3)
+]
+GUESS = [{"raw_file": record["raw_file"], "lanes": record["lanes"][:1], "run_time": 10} for record in TRUTH]
+
+
+def write(path, records):
+    path.write_text("\n".join(json.dumps(record) for record in records) + "\n")
+
+
+def run(folder, guess, truth=TRUTH, protocol="tusimple"):
+    write(folder / "pred.json", guess)
+    write(folder / "label.json", truth)
+    out = folder / "out"
+    code = main(["score", protocol, str(folder / "pred.json"), str(folder / "label.json"), "--out", str(out)])
+    return code, json.loads(out.with_suffix(".json").read_text())["rows"][0] if code == 0 else {}
+
+
+def test_by_hand(tmp_path):
+    # One of two lanes found in each image; nothing invented.
+    code, row = run(tmp_path, GUESS)
+    assert code == 0
+    assert (row["frames"], row["Accuracy"], row["FP"], row["FN"]) == (3, 0.5, 0.0, 0.5)
+
+
+def test_the_time_limit_is_the_protocols(tmp_path):
+    slow = [GUESS[0] | {"run_time": 300}, *GUESS[1:]]
+    assert run(tmp_path, slow)[1]["Accuracy"] == pytest.approx(1 / 3)
+    assert run(tmp_path, slow, protocol="tusimple-lstr")[1]["Accuracy"] == 0.5
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("name", golden())
+def test_files_give_the_official_numbers(tmp_path, name):
+    case = golden()[name]
+    code, row = run(tmp_path, case["pred"], case["gt"])
+    assert code == 0
+    for number in ("Accuracy", "FP", "FN"):
+        assert row[number] == pytest.approx(case["expected"][number], abs=1e-9)
+
+
+def test_real_labels_against_themselves(tmp_path):
+    path = shared_root() / "data" / "tusimple" / "LaneDetection" / "label_data_0313.json"
+    if not path.exists():
+        pytest.skip("real TuSimple labels are absent")
+    labels = [json.loads(line) for line in path.read_text().splitlines()]
+    code, row = run(tmp_path, [record | {"run_time": 1} for record in labels], labels)
+    assert code == 0
+    assert (row["frames"], row["FP"], row["FN"]) == (len(labels), 0.0, 0.0)
+
+
+def change(record, **fields):
+    return [GUESS[0], {k: v for k, v in (record | fields).items() if v is not ...}, GUESS[2]]
+
+
+DAMAGE = {
+    "missing": (GUESS[:2], r"1 of 3 frames are missing from the predictions: clips/0313/2/20.jpg"),
+    "extra": ([*GUESS, GUESS[0] | {"raw_file": "x.jpg"}], r"1 of 3 frames are predicted, but not .*: x.jpg"),
+    "twice": ([*GUESS, GUESS[1]], r"line 4: clips/0313/1/20.jpg is there twice, first in line 2"),
+    "no lanes": (change(GUESS[1], lanes=...), r"line 2 \(clips/0313/1/20.jpg\) lacks the entry 'lanes'"),
+    "ragged": (change(GUESS[1], lanes=[[1, 2, 3, 4], [1, 2]]), r"line 2 .*: lanes is of type list, expected numbers"),
+    "rows": (change(GUESS[1], lanes=[[1, 2, 3]]),
+             r"frame clips/0313/1/20.jpg: detections: lanes have shape \(1, 3\), expected \(lanes, 4\)"),
+    "NaN": (change(GUESS[1], lanes=[[1, 2, float("nan"), 4]]), r"line 2 \(.*\): lanes holds nan at \[0, 2\]"),
+    "time": (change(GUESS[1], run_time="fast"), r"line 2 \(.*\): run_time is of type str"),
+    "no name": (change(GUESS[1], raw_file=...), r"line 2 lacks the entry 'raw_file'"),
+    "a list": ([GUESS[0], [1], GUESS[2]], r"line 2 is of type list, expected a mapping"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_predictions_are_named_to_the_line(tmp_path, capsys, damage):
+    guess, message = DAMAGE[damage]
+    assert run(tmp_path, guess)[0] == 2
+    said = capsys.readouterr().err
+    assert re.search(message, said), said
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_a_broken_line_is_named(tmp_path, capsys):
+    write(tmp_path / "label.json", TRUTH)
+    (tmp_path / "pred.json").write_text(json.dumps(GUESS[0]) + "\n{'raw_file': 1}\n")
+    assert main(["score", "tusimple", str(tmp_path / "pred.json"), str(tmp_path / "label.json")]) == 2
+    assert re.search(r"pred.json, line 2 is no JSON record", capsys.readouterr().err)

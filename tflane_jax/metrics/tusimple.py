@@ -1,0 +1,130 @@
+"""TuSimple lane metrics: accuracy, false positives and false negatives (shared specs/metrics.md section 5).
+
+The official rules have corners that surprise: rows without a point on either side count as hits, a prediction may serve
+several lanes (so that false positives can be negative), one lane of more than four may be missed for nothing, and with
+six or more lanes the accuracy can exceed 1. All of them are kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.errors import UserError
+
+PIXEL_THRESHOLD = 20.0  # across the lane
+MATCHED = 0.85  # least share of rows
+OFFICIAL_TIME_LIMIT, LSTR_TIME_LIMIT = 200.0, 20_000.0  # milliseconds
+_ABSENT = -100.0
+_LANES = 4  # the benchmark is about the ego lane's and its neighbours' lines
+
+
+@dataclass(frozen=True)
+class RowLanes:
+    """Lanes of one image, as x at fixed rows.
+
+    Attributes:
+        x: (L, H) pixels; negative where a lane has no point in a row.
+        rows: (H,) the image rows, pixels (`h_samples`); None for predictions, which use those of the truth.
+        run_time: milliseconds that a prediction took.
+    """
+
+    x: Float[np.ndarray, "l h"]
+    rows: Float[np.ndarray, " h"] | None = None
+    run_time: float = 0.0
+
+
+class TuSimpleMetrics:
+    """Accumulator of the TuSimple metrics over images; it keeps three sums.
+
+    Args:
+        time_limit: milliseconds; an image that took longer counts as missed. 200 officially, 20,000 in LSTR's copy.
+    """
+
+    def __init__(self, time_limit: float = OFFICIAL_TIME_LIMIT) -> None:
+        self.time_limit = time_limit
+        self._frames = 0
+        self._sums = np.zeros(3)
+
+    @property
+    def protocol(self) -> str:
+        """Name and version, to stand above every table of these numbers."""
+        return f"TuSimple, {self.time_limit:g} ms an image"
+
+    def update(self, detections: RowLanes, truth: RowLanes) -> None:
+        """Add one image; raise UserError for arrays that do not fit together."""
+        self._sums += score_image(detections, truth, self.time_limit)
+        self._frames += 1
+
+    def merge(self, other: Self) -> Self:
+        """Return an accumulator of the images of both (neither changes)."""
+        if self.time_limit != other.time_limit:
+            raise UserError(f"cannot merge {self.protocol} with {other.protocol}: use one time limit")
+        merged = type(self)(self.time_limit)
+        merged._frames = self._frames + other._frames
+        merged._sums = self._sums + other._sums
+        return merged
+
+    def compute(self) -> dict[str, float]:
+        """Return `frames`, and the means over images of `Accuracy`, `FP` and `FN` (0 without images)."""
+        accuracy, positives, negatives = (self._sums / max(self._frames, 1)).tolist()
+        return {"frames": self._frames, "Accuracy": accuracy, "FP": positives, "FN": negatives}
+
+
+def score_image(
+    detections: RowLanes, truth: RowLanes, time_limit: float = OFFICIAL_TIME_LIMIT
+) -> tuple[float, float, float]:
+    """Return accuracy, share of false positives and share of missed lanes of one image."""
+    if truth.rows is None:
+        raise UserError("truth: the rows (h_samples) of the lanes are missing")
+    rows = np.asarray(truth.rows, np.float64)
+    true, found = _checked(truth.x, len(rows), "truth"), _checked(detections.x, len(rows), "detections")
+    g, p = len(true), len(found)
+    if detections.run_time > time_limit or p > g + 2:
+        return 0.0, 0.0, 1.0
+    best = line_accuracy(true, found, pixel_thresholds(true, rows)).max(1, initial=0.0)
+    matched = int((best >= MATCHED).sum())
+    missed = g - matched
+    total = best.sum()
+    if g > _LANES:
+        missed -= missed > 0
+        total -= best.min()
+    counted = max(min(g, _LANES), 1)
+    return float(total / counted), (p - matched) / p if p else 0.0, missed / counted
+
+
+def pixel_thresholds(true: Float[np.ndarray, "g h"], rows: Float[np.ndarray, " h"]) -> Float[np.ndarray, " g"]:
+    """Return how far a point may lie from each lane along its row, so that it is 20 pixels across the lane.
+
+    The slope is that of the least-squares line through the lane's points; a lane of one point counts as upright.
+    """
+    valid = true >= 0
+    count = np.maximum(valid.sum(-1, keepdims=True), 1)
+    y = np.where(valid, rows - (valid * rows).sum(-1, keepdims=True) / count, 0.0)
+    x = np.where(valid, true, 0.0)
+    spread = (y * y).sum(-1)
+    slope = (y * x).sum(-1) / np.where(spread > 0, spread, 1.0)
+    return PIXEL_THRESHOLD * np.sqrt(1.0 + np.where(spread > 0, slope, 0.0) ** 2)
+
+
+def line_accuracy(
+    true: Float[np.ndarray, "g h"], found: Float[np.ndarray, "p h"], thresholds: Float[np.ndarray, " g"]
+) -> Float[np.ndarray, "g p"]:
+    """Return the share of rows in which a prediction is nearer than the threshold; rows absent in both are hits."""
+    true, found = (np.where(x < 0, _ABSENT, x) for x in (true, found))
+    near = np.abs(true[:, None] - found[None]) < thresholds[:, None, None]
+    return near.mean(-1) if near.shape[-1] else np.zeros(near.shape[:2])
+
+
+def _checked(x: Float[np.ndarray, "l h"], rows: int, what: str) -> Float[np.ndarray, "l h"]:
+    x = np.asarray(x, np.float64)
+    if x.size == 0:
+        return np.zeros((0 if x.ndim < 2 else len(x), rows)) if rows or x.ndim < 2 else x
+    if x.ndim != 2 or x.shape[1] != rows:
+        raise UserError(f"{what}: lanes have shape {x.shape}, expected (lanes, {rows}), one x for each row")
+    if not np.isfinite(x).all():
+        raise UserError(f"{what}: lane {int((~np.isfinite(x).all(1)).argmax())} has a number that is not finite")
+    return x

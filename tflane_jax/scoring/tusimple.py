@@ -1,0 +1,57 @@
+"""TuSimple's label and prediction files: one JSON record a line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.errors import UserError
+from tflane_jax.fields import items, member, numbers
+from tflane_jax.metrics.tusimple import RowLanes
+
+
+def read_predictions(path: Path) -> dict[str, RowLanes]:
+    """Return the predicted lanes by `raw_file`; raises UserError that names file, line and field."""
+    return {name: _lanes(record, where, timed=True) for name, record, where in _records(path)}
+
+
+def read_truth(path: Path) -> dict[str, RowLanes]:
+    """Return the labelled lanes by `raw_file`; raises UserError that names file, line and field."""
+    return {name: _lanes(record, where, timed=False) for name, record, where in _records(path)}
+
+
+def _records(path: Path) -> list[tuple[str, Any, str]]:
+    """Return image, record and place of every line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no file of JSON lines: it is not text") from None
+    records, first = [], {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        where = f"{path}, line {number}"
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError as error:
+            raise UserError(f"{where} is no JSON record: {error.msg} at character {error.pos}") from None
+        name = member(record, "raw_file", where)
+        if not isinstance(name, str):
+            raise UserError(f"{where}: raw_file is of type {type(name).__name__}, expected a path")
+        if name in first:
+            raise UserError(f"{where}: {name} is there twice, first in line {first[name]}")
+        first[name] = number
+        records.append((name, record, f"{where} ({name})"))
+    return records
+
+
+def _lanes(record: Any, where: str, *, timed: bool) -> RowLanes:
+    lanes = items(record, "lanes", where)
+    if timed:
+        time = float(numbers(member(record, "run_time", where), (), f"{where}: run_time"))
+        return RowLanes(numbers(lanes, (None, None), f"{where}: lanes"), run_time=time)
+    rows = numbers(items(record, "h_samples", where), (None,), f"{where}: h_samples")
+    return RowLanes(numbers(lanes, (None, len(rows)), f"{where}: lanes"), rows)

@@ -18,6 +18,7 @@ from tests.shared import shared_root
 # Glob under golden/ (a folder of metrics, or the name of a module case) -> the test file that checks it.
 CLAIMS = {
     "metrics/openlanev2_centerline": "tests/metrics/test_openlane_v2.py",
+    "metrics/openlanev2_lanesegment": "tests/metrics/test_lane_segment.py",
     "metrics/resample": "tests/geometry/test_polylines.py",
     "metrics/tusimple": "tests/metrics/test_tusimple.py",
     "modules/custom_msda_decoder*": "tests/layers/test_deformable.py",

@@ -1,63 +1,113 @@
-"""Reading golden/metrics/openlanev2_centerline: schema in shared specs/metrics.md section 7."""
+"""Reading golden/metrics/openlanev2_centerline and _lanesegment: schema in shared specs/metrics.md section 7."""
 
 from __future__ import annotations
 
 import functools
 import json
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 
 from tests.shared import shared_root
 from tflane_jax.metrics import ElementDetections, ElementTruth, LaneDetections, LaneTruth
+from tflane_jax.metrics.lane_segment import AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
 
-FOLDER = "golden/metrics/openlanev2_centerline"
+Task = Literal["centerline", "lanesegment"]
+Arrays = dict[str, np.ndarray]
+
+
+def folder(task: Task):
+    """Return where the cases of a task are."""
+    return shared_root() / "golden" / "metrics" / f"openlanev2_{task}"
 
 
 @functools.cache
-def expected_cases() -> dict[str, dict[str, Any]]:
+def expected_cases(task: Task = "centerline") -> dict[str, dict[str, Any]]:
     """Return what the official evaluator gave, by name of the case; empty where the folder is absent."""
-    path = shared_root() / FOLDER / "expected.json"
+    path = folder(task) / "expected.json"
     return json.loads(path.read_text())["cases"] if path.exists() else {}
 
 
-def load_frames(name: str) -> list[tuple[LaneDetections, LaneTruth, dict[str, np.ndarray]]]:
-    """Return detections, truth and the official intermediate results of each frame of a case."""
-    with np.load(shared_root() / FOLDER / "inputs.npz", allow_pickle=False) as file:
-        a = {key.split("/", 1)[1]: file[key] for key in file.files if key.split("/", 1)[0] == name}
-    frames = range(expected_cases()[name]["n_frames"])
+def load_frames(name: str) -> list[tuple[LaneDetections, LaneTruth, Arrays]]:
+    """Return detections, truth and the official intermediate results of each frame of a centerline case."""
+    case = _Case("centerline", name)
+    return list(zip(*case.lanes(), case.official(), strict=True))
 
-    def rows(field: str, owner: str) -> list[np.ndarray]:
-        return [a[field][a[f"{owner}_frame"] == f] for f in frames]
 
-    def lines(side: str) -> list[list[np.ndarray]]:
-        counts = a[f"{side}_center_npts"]
-        every = np.split(a[f"{side}_center_pts"], np.cumsum(counts)[:-1]) if len(counts) else []
-        return [[every[i] for i in np.flatnonzero(a[f"{side}_lane_frame"] == f)] for f in frames]
+def load_segments(name: str) -> list[tuple[SegmentDetections, SegmentTruth, Arrays]]:
+    """Return the same of a lane-segment case."""
+    case = _Case("lanesegment", name)
+    detections, truths = case.lanes()
+    sides = {(who, which): case.lines(f"{who}_{which}", f"{who}_lane")
+             for who in ("gt", "pd") for which in ("left", "right")}  # fmt: skip
+    areas = {who: case.lines(f"{who}_area", f"{who}_area") for who in ("gt", "pd")}
+    categories = {who: case.rows(f"{who}_area_cat", f"{who}_area") for who in ("gt", "pd")}
+    scores = case.rows("pd_area_conf", "pd_area")
+    return [
+        (
+            SegmentDetections(detection, sides["pd", "left"][f], sides["pd", "right"][f],
+                              AreaDetections(areas["pd"][f], categories["pd"][f], scores[f])),
+            SegmentTruth(truth, sides["gt", "left"][f], sides["gt", "right"][f],
+                         AreaTruth(areas["gt"][f], categories["gt"][f])),
+            official,
+        )
+        for f, (detection, truth, official) in enumerate(zip(detections, truths, case.official(), strict=True))
+    ]  # fmt: skip
 
-    def matrices(field: str, heights: list[int], widths: list[int]) -> list[np.ndarray]:
-        sizes = np.multiply(heights, widths)
-        pieces = np.split(a[field], np.cumsum(sizes)[:-1])
+
+class _Case:
+    """The arrays of one case, split by frame."""
+
+    def __init__(self, task: Task, name: str) -> None:
+        with np.load(folder(task) / "inputs.npz", allow_pickle=False) as file:
+            self.arrays = {key.split("/", 1)[1]: file[key] for key in file.files if key.split("/", 1)[0] == name}
+        self.frames = range(expected_cases(task)[name]["n_frames"])
+
+    def rows(self, field: str, owner: str) -> list[np.ndarray]:
+        return [self.arrays[field][self.arrays[f"{owner}_frame"] == f] for f in self.frames]
+
+    def lines(self, field: str, owner: str) -> list[list[np.ndarray]]:
+        counts = self.arrays[f"{field}_npts"]
+        every = np.split(self.arrays[f"{field}_pts"], np.cumsum(counts)[:-1]) if len(counts) else []
+        frame = self.arrays[f"{owner}_frame"]
+        return [[every[i] for i in np.flatnonzero(frame == f)] for f in self.frames]
+
+    def matrices(self, field: str, heights: Sequence[int], widths: Sequence[int]) -> list[np.ndarray]:
+        pieces = np.split(self.arrays[field], np.cumsum(np.multiply(heights, widths))[:-1])
         return [piece.reshape(h, w) for piece, h, w in zip(pieces, heights, widths, strict=True)]
 
-    lanes = {side: lines(side) for side in ("gt", "pd")}
-    boxes = {side: rows(f"{side}_te_box", f"{side}_te") for side in ("gt", "pd")}
-    attributes = {side: rows(f"{side}_te_attr", f"{side}_te") for side in ("gt", "pd")}
-    n = {side: [len(x) for x in lanes[side]] for side in lanes}
-    t = {side: [len(x) for x in boxes[side]] for side in boxes}
-    ll = {side: matrices(f"{side}_ll", n[side], n[side]) for side in lanes}
-    lt = {side: matrices(f"{side}_lt", n[side], t[side]) for side in lanes}
-    scores, element_scores = rows("pd_lane_conf", "pd_lane"), rows("pd_te_conf", "pd_te")
-    official = {key: rows(key, "pd_lane") for key in a if key.startswith("out_lane_match")}
-    official["out_lane_dist"] = matrices("out_lane_dist", n["gt"], n["pd"])
+    def count(self, owner: str) -> list[int]:
+        frame = self.arrays[f"{owner}_frame"]
+        return [int((frame == f).sum()) for f in self.frames]
 
-    def frame(f: int) -> tuple[LaneDetections, LaneTruth, dict[str, np.ndarray]]:
-        detected = ElementDetections(boxes["pd"][f], attributes["pd"][f], element_scores[f], lt["pd"][f])
-        true = ElementTruth(boxes["gt"][f], attributes["gt"][f], lt["gt"][f].astype(bool))
-        return (
-            LaneDetections(lanes["pd"][f], scores[f], ll["pd"][f], detected),
-            LaneTruth(lanes["gt"][f], ll["gt"][f].astype(bool), elements=true),
-            {key: values[f] for key, values in official.items()},
-        )
+    def lanes(self) -> tuple[list[LaneDetections], list[LaneTruth]]:
+        """Return centerlines, topology and traffic elements of every frame."""
+        n, t = ({who: self.count(f"{who}_{what}") for who in ("gt", "pd")} for what in ("lane", "te"))
+        points = {who: self.lines(f"{who}_center", f"{who}_lane") for who in n}
+        ll = {who: self.matrices(f"{who}_ll", n[who], n[who]) for who in n}
+        lt = {who: self.matrices(f"{who}_lt", n[who], t[who]) for who in n}
+        boxes = {who: self.rows(f"{who}_te_box", f"{who}_te") for who in n}
+        attributes = {who: self.rows(f"{who}_te_attr", f"{who}_te") for who in n}
+        scores, element_scores = self.rows("pd_lane_conf", "pd_lane"), self.rows("pd_te_conf", "pd_te")
+        detections = [
+            LaneDetections(
+                points["pd"][f], scores[f], ll["pd"][f],
+                ElementDetections(boxes["pd"][f], attributes["pd"][f], element_scores[f], lt["pd"][f]),
+            )
+            for f in self.frames
+        ]  # fmt: skip
+        truths = [
+            LaneTruth(
+                points["gt"][f], ll["gt"][f].astype(bool),
+                elements=ElementTruth(boxes["gt"][f], attributes["gt"][f], lt["gt"][f].astype(bool)),
+            )
+            for f in self.frames
+        ]  # fmt: skip
+        return detections, truths
 
-    return [frame(f) for f in frames]
+    def official(self) -> list[Arrays]:
+        """Return the official matches and distances of every frame."""
+        matches = {key: self.rows(key, "pd_lane") for key in self.arrays if key.startswith("out_lane_match")}
+        matches["out_lane_dist"] = self.matrices("out_lane_dist", self.count("gt_lane"), self.count("pd_lane"))
+        return [{key: values[f] for key, values in matches.items()} for f in self.frames]

@@ -28,18 +28,22 @@ ELEMENT_THRESHOLD = 0.75  # IoU distance
 ATTRIBUTES = 13
 
 
+def relaxation(truth: Float[np.ndarray, "g n 3"]) -> Float[np.ndarray, " g"]:
+    """Return the factor on distances to each true lane, max(0.5, 1 - 0.005 r), r the range of its nearest vertex."""
+    return np.maximum(0.5, 1.0 - 0.005 * np.linalg.norm(truth, axis=-1).min(-1))
+
+
 def nearest_lanes(
     truth: Float[np.ndarray, "g n 3"], detected: Float[np.ndarray, "p m 3"]
 ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """Return for each detection the relaxed Frechet distance to its nearest lane (metres), and which lane that is.
 
-    The distance is multiplied by max(0.5, 1 - 0.005 r), r the range of the lane's nearest vertex, so far lanes are
-    easier. Exact without measuring every pair: the distance of the end points bounds a pair from below. Without lanes
-    the distances are inf.
+    The distance is multiplied by `relaxation`, so far lanes are easier. Exact without measuring every pair: the
+    distance of the end points bounds a pair from below. Without lanes the distances are inf.
     """
     if len(truth) == 0 or len(detected) == 0:
         return np.full(len(detected), np.inf), np.zeros(len(detected), np.int64)
-    relax = np.maximum(0.5, 1.0 - 0.005 * np.linalg.norm(truth, axis=-1).min(-1))[:, None]
+    relax = relaxation(truth)[:, None]
     ends_truth, ends_detected = truth[:, None, [0, -1]], detected[None, :, [0, -1]]
     bound = relax * vertex_distance(ends_truth, ends_detected).max(-1)
 
@@ -125,14 +129,24 @@ class MatchedElements:
 def match_frame(detections: LaneDetections, truth: LaneTruth, version: Version = "v2.1") -> MatchedFrame:
     """Match one frame by the rules of the given version; raise UserError for arrays that do not fit together."""
     true_points, points = checked_lines(truth.points, "truth"), checked_lines(detections.points, "detections")
-    g, p = len(true_points), len(points)
+    return match_lanes(detections, truth, *nearest_lanes(true_points, points), version)
+
+
+def match_lanes(
+    detections: LaneDetections,
+    truth: LaneTruth,
+    distance: Float[np.ndarray, " p"],
+    nearest: Int[np.ndarray, " p"],
+    version: Version = "v2.1",
+) -> MatchedFrame:
+    """Match one frame whose detections are at `distance` from their `nearest` lanes; see `match_frame`."""
+    g, p = len(truth.points), len(detections.points)
     edges, confidence = np.asarray(truth.successor, bool), np.asarray(detections.successor)
     scores = np.asarray(detections.scores)
     check_shape(edges, (g, g), "truth: successor")
     check_shape(scores, (p,), "detections: scores")
     check_shape(confidence, (p, p), "detections: successor")
 
-    distance, nearest = nearest_lanes(true_points, points)
     taken = np.stack([greedy_match(distance, nearest, scores, threshold) for threshold in LANE_THRESHOLDS])
     levels = np.stack([matchings(scores, row, version) for row in taken])
     rows = np.concatenate(levels)

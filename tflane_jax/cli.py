@@ -23,6 +23,9 @@ _FILES = """Protocols and their files:
       PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
       dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
       of about four: say which one you report. v2.1 is also that of devkit v1.1.
+  openlane-v2.1-lane-segment, lanesegnet
+      The same files of the lane-segment task (TIMESTAMP-ls.json). The first gives the devkit's OLUS, the second the
+      mAP of the LaneSegNet and TF-Lane papers.
   tusimple, tusimple-lstr
       Both files hold one JSON record a line: raw_file, lanes (x at every row, negative where there is none), h_samples
       (the truth) or run_time in ms (predictions). tusimple-lstr allows 20 s an image instead of 200 ms, like LSTR."""

@@ -1,27 +1,53 @@
-"""Files of the OpenLane-V2 centerline task: official submissions and annotations.
+"""Files of OpenLane-V2, both tasks: official submissions and annotations.
 
-Submission (a pickle): {"results": {(split, segment, timestamp): {"predictions": {"lane_centerline", "traffic_element",
-"topology_lclc", "topology_lcte"}}}}. Annotations: the devkit's collected pickle {(split, segment, timestamp):
-{"annotation": {...}}}, or the dataset's folder with `<split>/<segment>/info/<timestamp>.json`. Source: shared
+Submission (a pickle): {"results": {(split, segment, timestamp): {"predictions": {...}}}}. Annotations: the devkit's
+collected pickle {(split, segment, timestamp): {"annotation": {...}}}, or the dataset's folder with
+`<split>/<segment>/info/<timestamp>.json`, `<timestamp>-ls.json` for lane segments. Source: shared
 specs/data_formats.md section 2.2, specs/metrics.md section 6.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
 from tflane_jax.fields import items, load_file, load_json, member, numbers, scores, whole_number
+from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.centerline_matching import ATTRIBUTES
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
+from tflane_jax.metrics.lane_segment import (
+    CROSSING,
+    AreaDetections,
+    AreaTruth,
+    Flavour,
+    SegmentDetections,
+    SegmentTruth,
+)
 
 # Annotated centerlines have 201 points; the published numbers are measured on every 20th.
 _DENSE, _STRIDE = 201, 20
+# Lines of segments and areas are measured on so many points, equally spaced.
+_LINE_POINTS, _AREA_POINTS = 10, 20
+
+
+class _Names(NamedTuple):
+    """What a task calls its fields; `suffix` ends the names of its annotation files."""
+
+    lanes: str
+    line: str
+    lane_lane: str
+    lane_element: str
+    suffix: str
+
+
+_CENTERLINE = _Names("lane_centerline", "points", "topology_lclc", "topology_lcte", "")
+_SEGMENT = _Names("lane_segment", "centerline", "topology_lsls", "topology_lste", "-ls")
 
 
 class FrameKey(NamedTuple):
@@ -41,85 +67,163 @@ class FrameKey(NamedTuple):
 
 
 def read_predictions(path: Path) -> dict[FrameKey, LaneDetections]:
-    """Return the detections of a submission; raises UserError that names file, frame and field."""
-    results = member(load_file(path), "results", str(path))
-    if not isinstance(results, Mapping):
-        raise UserError(f"{path}: results is of type {type(results).__name__}, expected a mapping from frames")
-    frames = {}
-    for identifier, record in results.items():
-        key = _key(identifier, path)
-        frames[key] = _detections(member(record, "predictions", f"{path}, frame {key}"), f"{path}, frame {key}")
-    return frames
+    """Return the detections of a centerline submission; raises UserError that names file, frame and field."""
+    return _submission(path, lambda record, where: _detections(record, where, _CENTERLINE))
 
 
 def read_truth(path: Path, *, progress: bool = True) -> dict[FrameKey, LaneTruth]:
-    """Return the annotations of a collected file or of a folder; raises UserError that names file, frame and field."""
-    if path.is_dir():
-        files = sorted(p for p in path.resolve().glob("**/info/*.json") if not p.stem.endswith("-ls"))
-        if not files:
-            raise UserError(f"{path} holds no annotations: expected <split>/<segment>/info/<timestamp>.json in it")
-        frames = {}
-        for file in tqdm(files, desc=f"read {path.name}", unit="frame", disable=not progress):
-            segment = file.parent.parent
-            key = FrameKey(segment.parent.name, segment.name, file.stem)
-            frames[key] = _truth(member(load_json(file), "annotation", str(file)), str(file))
-        return frames
-    collected = load_file(path)
-    if not isinstance(collected, Mapping):
-        raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames to annotations")
+    """Return centerline annotations, a collected file's or a folder's; raises UserError as `read_predictions`."""
+    return _annotations(path, _CENTERLINE, lambda record, where: _truth(record, where, _CENTERLINE), progress)
+
+
+def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
+    """Return the detections of a lane-segment submission; raises UserError that names file, frame and field."""
+    return _submission(path, _segment_detections)
+
+
+def read_segment_truth(
+    path: Path, flavour: Flavour = "OpenLane-V2", *, progress: bool = True
+) -> dict[FrameKey, SegmentTruth]:
+    """Return lane-segment annotations, a collected file's or a folder's; raises UserError as `read_predictions`.
+
+    Lines get 10 points and areas 20, unless they have as many already. In the flavour "LaneSegNet" a crossing of five
+    corners becomes its two long sides, 10 points each, as LaneSegNet measures it.
+    """
+    return _annotations(path, _SEGMENT, lambda record, where: _segment_truth(record, where, flavour), progress)
+
+
+T = TypeVar("T")
+_Parse = Callable[[Any, str], T]
+
+
+def _submission(path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
+    results = member(load_file(path), "results", str(path))
+    if not isinstance(results, Mapping):
+        raise UserError(f"{path}: results is of type {type(results).__name__}, expected a mapping from frames")
+    return _by_frame(results, "predictions", path, parse)
+
+
+def _annotations(path: Path, names: _Names, parse: _Parse[T], progress: bool) -> dict[FrameKey, T]:
+    if not path.is_dir():
+        collected = load_file(path)
+        if not isinstance(collected, Mapping):
+            raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames")
+        return _by_frame(collected, "annotation", path, parse)
+    stems = {file: file.stem.removesuffix("-ls") for file in sorted(path.resolve().glob("**/info/*.json"))}
+    files = {file: stem for file, stem in stems.items() if file.stem == stem + names.suffix}
+    if not files:
+        raise UserError(
+            f"{path} holds no annotations: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it"
+        )
     frames = {}
-    for identifier, record in collected.items():
-        key = _key(identifier, path)
-        frames[key] = _truth(member(record, "annotation", f"{path}, frame {key}"), f"{path}, frame {key}")
+    for file, stem in tqdm(files.items(), desc=f"read {path.name}", unit="frame", disable=not progress):
+        segment = file.parent.parent
+        record = member(load_json(file), "annotation", str(file))
+        frames[FrameKey(segment.parent.name, segment.name, stem)] = parse(record, str(file))
     return frames
 
 
-def _key(identifier: Any, path: Path) -> FrameKey:
-    if not isinstance(identifier, tuple) or len(identifier) != 3:
-        raise UserError(f"{path}: {identifier!r:.80} is no frame, expected (split, segment, timestamp)")
-    return FrameKey(*map(str, identifier))
+def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
+    frames = {}
+    for identifier, record in records.items():
+        if not isinstance(identifier, tuple) or len(identifier) != 3:
+            raise UserError(f"{path}: {identifier!r:.80} is no frame, expected (split, segment, timestamp)")
+        key = FrameKey(*map(str, identifier))
+        where = f"{path}, frame {key}"
+        frames[key] = parse(member(record, field, where), where)
+    return frames
 
 
-def _truth(record: Any, where: str) -> LaneTruth:
-    lanes, elements = items(record, "lane_centerline", where), items(record, "traffic_element", where)
-    g, t = len(lanes), len(elements)
-    points = [_line(lane, f"{where}: lane_centerline[{i}]") for i, lane in enumerate(lanes)]
+def _truth(record: Any, where: str, names: _Names) -> LaneTruth:
+    points = _lines(record, names.lanes, names.line, where)
+    lanes, elements = len(points), items(record, "traffic_element", where)
     boxes, attributes = _elements(elements, where)
     return LaneTruth(
         points=[line[::_STRIDE] if len(line) == _DENSE else line for line in points],
-        successor=numbers(member(record, "topology_lclc", where), (g, g), f"{where}: topology_lclc") > 0.5,
+        successor=_matrix(record, names.lane_lane, (lanes, lanes), where) > 0.5,
         elements=ElementTruth(
-            boxes, attributes, numbers(member(record, "topology_lcte", where), (g, t), f"{where}: topology_lcte") > 0.5
+            boxes, attributes, _matrix(record, names.lane_element, (lanes, len(elements)), where) > 0.5
         ),
     )
 
 
-def _detections(record: Any, where: str) -> LaneDetections:
-    lanes, elements = items(record, "lane_centerline", where), items(record, "traffic_element", where)
-    p, u = len(lanes), len(elements)
+def _detections(record: Any, where: str, names: _Names) -> LaneDetections:
+    points = _lines(record, names.lanes, names.line, where)
+    lanes, elements = len(points), items(record, "traffic_element", where)
     boxes, attributes = _elements(elements, where)
     return LaneDetections(
-        points=[_line(lane, f"{where}: lane_centerline[{i}]") for i, lane in enumerate(lanes)],
-        scores=_confidences(lanes, f"{where}: lane_centerline"),
-        successor=numbers(member(record, "topology_lclc", where), (p, p), f"{where}: topology_lclc"),
+        points=points,
+        scores=_confidences(record, names.lanes, where),
+        successor=_matrix(record, names.lane_lane, (lanes, lanes), where),
         elements=ElementDetections(
             boxes,
             attributes,
-            _confidences(elements, f"{where}: traffic_element"),
-            numbers(member(record, "topology_lcte", where), (p, u), f"{where}: topology_lcte"),
+            _confidences(record, "traffic_element", where),
+            _matrix(record, names.lane_element, (lanes, len(elements)), where),
         ),
     )
 
 
-def _line(lane: Any, where: str) -> np.ndarray:
-    points = numbers(member(lane, "points", where), (None, 3), f"{where}.points")
-    if len(points) == 0:
-        raise UserError(f"{where}.points is empty: a line has at least one point")
-    return points
+def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
+    lanes = _truth(record, where, _SEGMENT)
+    points, categories = _areas(record, where)
+    if flavour == "LaneSegNet":
+        points = [_long_sides(line) if c == CROSSING and len(line) == 5 else line
+                  for line, c in zip(points, categories, strict=True)]  # fmt: skip
+    center, left, right = (
+        [_with_points(line, _LINE_POINTS) for line in lines]
+        for lines in (lanes.points, *(_lines(record, _SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))
+    )
+    areas = AreaTruth([_with_points(line, _AREA_POINTS) for line in points], categories)
+    return SegmentTruth(replace(lanes, points=center), left, right, areas)
 
 
-def _confidences(things: Any, where: str) -> np.ndarray:
-    return scores([member(x, "confidence", f"{where}[{i}]") for i, x in enumerate(things)], f"{where}: confidence")
+def _segment_detections(record: Any, where: str) -> SegmentDetections:
+    left, right = (_lines(record, _SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES)
+    areas = AreaDetections(*_areas(record, where), _confidences(record, "area", where))
+    return SegmentDetections(_detections(record, where, _SEGMENT), left, right, areas)
+
+
+_SIDES = ("left", "right")
+
+
+def _with_points(line: np.ndarray, count: int) -> np.ndarray:
+    return line if len(line) == count else resample(line, count)
+
+
+def _long_sides(corners: np.ndarray) -> np.ndarray:
+    """Return a crossing as LaneSegNet measures it: corners 0 to 1, then corners 2 to 3."""
+    return np.concatenate([resample(corners[:2], _AREA_POINTS // 2), resample(corners[2:4], _AREA_POINTS // 2)])
+
+
+def _areas(record: Any, where: str) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return lines and categories of crossings and boundaries."""
+    categories = [
+        whole_number(member(area, "category", f"{where}: area[{i}]"), 1, 2, f"{where}: area[{i}].category")
+        for i, area in enumerate(items(record, "area", where))
+    ]
+    return _lines(record, "area", "points", where), np.array(categories, np.int64)
+
+
+def _lines(record: Any, things: str, field: str, where: str) -> list[np.ndarray]:
+    lines = []
+    for i, thing in enumerate(items(record, things, where)):
+        at = f"{where}: {things}[{i}]"
+        points = numbers(member(thing, field, at), (None, 3), f"{at}.{field}")
+        if len(points) == 0:
+            raise UserError(f"{at}.{field} is empty: a line has at least one point")
+        lines.append(points)
+    return lines
+
+
+def _matrix(record: Any, field: str, shape: tuple[int, int], where: str) -> np.ndarray:
+    return numbers(member(record, field, where), shape, f"{where}: {field}")
+
+
+def _confidences(record: Any, things: str, where: str) -> np.ndarray:
+    at = f"{where}: {things}"
+    values = [member(thing, "confidence", f"{at}[{i}]") for i, thing in enumerate(items(record, things, where))]
+    return scores(values, f"{at}: confidence")
 
 
 def _elements(elements: Any, where: str) -> tuple[np.ndarray, np.ndarray]:

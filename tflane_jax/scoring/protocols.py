@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
+from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
 from tflane_jax.scoring import openlane_v2, tusimple
 from tflane_jax.scoring.score import Accumulator
@@ -33,26 +35,43 @@ class ScoringProtocol:
     columns: tuple[str, ...]
 
 
-PROTOCOLS: dict[str, ScoringProtocol] = {
-    f"openlane-{version}-centerline": ScoringProtocol(
+def _centerline(version: Version) -> ScoringProtocol:
+    return ScoringProtocol(
         read_predictions=openlane_v2.read_predictions,
         read_truth=openlane_v2.read_truth,
         scene_of=lambda key: key.scene,
         metrics=partial(CenterlineMetrics, version),
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
     )
-    for version in ("v2.1", "v1.0")
-}
 
-PROTOCOLS |= {
-    name: ScoringProtocol(
+
+def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol:
+    return ScoringProtocol(
+        read_predictions=openlane_v2.read_segment_predictions,
+        read_truth=partial(openlane_v2.read_segment_truth, flavour=flavour),
+        scene_of=lambda key: key.scene,
+        metrics=partial(LaneSegmentMetrics, flavour),
+        columns=columns,
+    )
+
+
+def _tusimple(time_limit: float) -> ScoringProtocol:
+    return ScoringProtocol(
         read_predictions=tusimple.read_predictions,
         read_truth=tusimple.read_truth,
         scene_of=lambda image: image.rpartition("/")[0],
-        metrics=partial(TuSimpleMetrics, limit),
+        metrics=partial(TuSimpleMetrics, time_limit),
         columns=("Accuracy", "FP", "FN"),
     )
-    for name, limit in (("tusimple", OFFICIAL_TIME_LIMIT), ("tusimple-lstr", LSTR_TIME_LIMIT))
+
+
+PROTOCOLS: dict[str, ScoringProtocol] = {
+    "openlane-v2.1-centerline": _centerline("v2.1"),
+    "openlane-v1.0-centerline": _centerline("v1.0"),
+    "openlane-v2.1-lane-segment": _lane_segment("OpenLane-V2", ("OLUS", "DET_l", "DET_a", "DET_t", "TOP_ll", "TOP_lt")),
+    "lanesegnet": _lane_segment("LaneSegNet", ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "AP_boundary")),
+    "tusimple": _tusimple(OFFICIAL_TIME_LIMIT),
+    "tusimple-lstr": _tusimple(LSTR_TIME_LIMIT),
 }
 
 

@@ -1,0 +1,101 @@
+"""`tflane score` on OpenLane-V2's lane-segment files, in both flavours."""
+
+import json
+import pickle
+import re
+
+import numpy as np
+import pytest
+
+from tests.metrics.fixtures import expected_cases, load_segments
+from tests.scoring.files import centerline_annotation, centerline_prediction
+from tflane_jax.cli import main
+
+NAMES = {"lane_centerline": "lane_segment", "topology_lclc": "topology_lsls", "topology_lcte": "topology_lste"}
+
+
+def as_segments(record, left, right, areas):
+    """Turn a centerline record into one of lane segments."""
+    record = {NAMES.get(name, name): value for name, value in record.items()}
+    for lane, l_line, r_line in zip(record["lane_segment"], left, right, strict=True):
+        lane |= {"centerline": lane.pop("points"), "left_laneline": l_line, "right_laneline": r_line}
+    scores = getattr(areas, "scores", np.zeros(len(areas.points)))
+    record["area"] = [
+        {"category": int(category), "points": points, "confidence": float(score)}
+        for category, points, score in zip(areas.categories, areas.points, scores, strict=True)
+    ]
+    return record
+
+
+def write(folder, frames, change=lambda results: None):
+    results = {
+        key: {"predictions": as_segments(centerline_prediction(d.lanes), d.left, d.right, d.areas)}
+        for key, (d, _) in frames.items()
+    }
+    change(results)
+    truth = {
+        key: {"annotation": as_segments(centerline_annotation(t.lanes), t.left, t.right, t.areas)}
+        for key, (_, t) in frames.items()
+    }
+    (folder / "submission.pkl").write_bytes(pickle.dumps({"results": results}))
+    (folder / "annotations.pkl").write_bytes(pickle.dumps(truth))
+
+
+def run(folder, protocol):
+    out = folder / "out"
+    code = main(["score", protocol, str(folder / "submission.pkl"), str(folder / "annotations.pkl"),
+                 "--out", str(out)])  # fmt: skip
+    return code, json.loads(out.with_suffix(".json").read_text())["rows"][0] if code == 0 else {}
+
+
+@pytest.fixture
+def golden_frames():
+    if not expected_cases("lanesegment"):
+        pytest.skip("golden/metrics/openlanev2_lanesegment is absent")
+    return {("val", "10000", str(i)): frame[:2] for i, frame in enumerate(load_segments("rand_mid"))}
+
+
+@pytest.mark.golden
+def test_files_give_the_official_numbers(tmp_path, golden_frames):
+    write(tmp_path, golden_frames)
+    expected = expected_cases("lanesegment")["rand_mid"]
+    for protocol, official in (("openlane-v2.1-lane-segment", "olus"), ("lanesegnet", "lanesegnet")):
+        code, row = run(tmp_path, protocol)
+        assert code == 0
+        numbers = {name: value for name, value in expected[official].items() if isinstance(value, float)}
+        assert len(numbers) >= 4
+        for name, value in numbers.items():
+            assert row[name] == pytest.approx(value, abs=1e-6), name
+
+
+@pytest.mark.golden
+def test_a_lost_side_line_is_named(tmp_path, golden_frames, capsys):
+    def change(results):
+        del results["val", "10000", "2"]["predictions"]["lane_segment"][3]["right_laneline"]
+
+    write(tmp_path, golden_frames, change)
+    assert run(tmp_path, "lanesegnet")[0] == 2
+    assert re.search(r"frame val/10000/2: lane_segment\[3\] lacks the entry 'right_laneline'", capsys.readouterr().err)
+
+
+def segment_record(crossing, score=None):
+    line, side = np.linspace((0, 0, 0), (9, 0, 0), 10), np.array([0, 2, 0])
+    lane = {"centerline": line, "left_laneline": line + side, "right_laneline": line - side}
+    area = {"category": 1, "points": crossing}
+    if score is not None:
+        lane["confidence"] = area["confidence"] = score
+    empty = {"traffic_element": [], "topology_lsls": [[0]], "topology_lste": np.zeros((1, 0))}
+    return {"lane_segment": [lane], "area": [area], **empty}
+
+
+def test_laneseg_net_measures_the_long_sides_of_a_crossing(tmp_path):
+    corners = np.array([[0, 0, 0], [0, 9, 0], [8, 9, 0], [8, 0, 0], [0, 0, 0]], float)
+    sides = np.concatenate([np.linspace(corners[0], corners[1], 10), np.linspace(corners[2], corners[3], 10)])
+    key = ("val", "1", "1")
+    (tmp_path / "annotations.pkl").write_bytes(pickle.dumps({key: {"annotation": segment_record(corners)}}))
+    results = {key: {"predictions": segment_record(sides, 0.9)}}
+    (tmp_path / "submission.pkl").write_bytes(pickle.dumps({"results": results}))
+    own, devkit = run(tmp_path, "lanesegnet")[1], run(tmp_path, "openlane-v2.1-lane-segment")[1]
+    assert own["crossing@0.5"] == 1.0
+    # The devkit spreads 20 points around the whole outline instead, also along its short sides.
+    assert devkit["crossing@0.5"] == 0.0

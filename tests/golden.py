@@ -17,6 +17,7 @@ from tests.shared import shared_root
 
 # Glob under golden/ (a folder of metrics, or the name of a module case) -> the test file that checks it.
 CLAIMS = {
+    "metrics/maptr": "tests/metrics/test_vector_map.py",
     "metrics/openlanev2_centerline": "tests/metrics/test_openlane_v2.py",
     "metrics/openlanev2_lanesegment": "tests/metrics/test_lane_segment.py",
     "metrics/resample": "tests/geometry/test_polylines.py",

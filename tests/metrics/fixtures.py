@@ -1,4 +1,4 @@
-"""Reading golden/metrics/openlanev2_centerline and _lanesegment: schema in shared specs/metrics.md section 7."""
+"""Reading the golden cases of OpenLane-V2 (both tasks) and MapTR: schema in shared specs/metrics.md section 7."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ import numpy as np
 from tests.shared import shared_root
 from tflane_jax.metrics import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.lane_segment import AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
+from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
 
-Task = Literal["centerline", "lanesegment"]
+Task = Literal["centerline", "lanesegment", "maptr"]
 Arrays = dict[str, np.ndarray]
 
 
 def folder(task: Task):
     """Return where the cases of a task are."""
-    return shared_root() / "golden" / "metrics" / f"openlanev2_{task}"
+    return shared_root() / "golden" / "metrics" / ("maptr" if task == "maptr" else f"openlanev2_{task}")
 
 
 @functools.cache
@@ -54,6 +55,26 @@ def load_segments(name: str) -> list[tuple[SegmentDetections, SegmentTruth, Arra
         )
         for f, (detection, truth, official) in enumerate(zip(detections, truths, case.official(), strict=True))
     ]  # fmt: skip
+
+
+def load_maps(name: str) -> list[tuple[MapDetections, MapTruth, list[Arrays]]]:
+    """Return the same of a MapTR case; the official results by class: `score` (P, G) and `hits` (3, P)."""
+    case = _Case("maptr", name)
+    lines = {who: case.lines(who, who) for who in ("gt", "pd")}
+    classes = {who: case.rows(f"{who}_cls", who) for who in ("gt", "pd")}
+    confidence = case.rows("pd_conf", "pd")
+    heights, widths = case.arrays["out_score_shape"].T.tolist()
+    scores = case.matrices("out_score", heights, widths)
+    hits = np.split(case.arrays["out_tp"].T.astype(bool), np.cumsum(heights)[:-1], 1)
+    official = [{"score": score, "hits": hit} for score, hit in zip(scores, hits, strict=True)]  # class-major
+    return [
+        (
+            MapDetections(lines["pd"][f], classes["pd"][f], confidence[f]),
+            MapTruth(lines["gt"][f], classes["gt"][f]),
+            [official[c * len(case.frames) + f] for c in range(len(CLASSES))],
+        )
+        for f in case.frames
+    ]
 
 
 class _Case:

@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.metrics.matching import average_precision_11, descending, greedy_match, vertex_average_precision
+from tflane_jax.metrics.matching import (
+    average_precision_11,
+    average_precision_area,
+    descending,
+    greedy_match,
+    vertex_average_precision,
+)
 from tflane_jax.metrics.topology import confidence_levels
 
 QUICK = settings(max_examples=40, deadline=None, derandomize=True)
@@ -25,11 +31,12 @@ def test_greedy_match_equals_the_loop(seed, count):
     rng = np.random.default_rng(seed)
     # Few levels, so that scores tie and distances lie on the threshold.
     args = rng.integers(0, 4, count) / 2.0, rng.integers(0, 5, count), rng.integers(0, 4, count) / 4.0, 1.0
-    np.testing.assert_array_equal(greedy_match(*args), match_by_loop(*args))
+    distance, nearest, scores, threshold = args
+    np.testing.assert_array_equal(greedy_match(distance < threshold, nearest, scores), match_by_loop(*args))
 
 
-def test_no_second_choice_and_strict_threshold():
-    taken = greedy_match(np.array([0.1, 0.2, 1.0]), np.array([0, 0, 1]), np.array([0.5, 0.9, 0.7]), 1.0)
+def test_no_second_choice():
+    taken = greedy_match(np.array([0.1, 0.2, 1.0]) < 1.0, np.array([0, 0, 1]), np.array([0.5, 0.9, 0.7]))
     np.testing.assert_array_equal(taken, [-1, 0, -1])
 
 
@@ -62,6 +69,16 @@ def test_average_precision_without_truth_or_predictions():
     assert average_precision_11(none, none.astype(bool), 0) == 1.0
     assert average_precision_11(one, one < 0, 0) == 0.0
     assert average_precision_11(none, none.astype(bool), 3) == 0.0
+
+
+def test_area_under_the_curve():
+    # Precisions 1, 1/2, 2/3 at the ranks; from each rank on the best is 1, 2/3, 2/3; true positives at ranks 1 and 3.
+    hits, scores = np.array([True, False, True]), np.array([0.9, 0.8, 0.7])
+    assert average_precision_area(scores, hits, 3) == pytest.approx((1 + 2 / 3) / 3)
+    assert average_precision_area(scores[::-1], hits, 2) == pytest.approx((1 + 2 / 3) / 2)
+    assert average_precision_area(scores[:0], hits[:0], 3) == 0.0
+    assert average_precision_area(scores[:0], hits[:0], 0) == 0.0
+    assert average_precision_area(scores, hits & False, 0) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -8,15 +8,34 @@ from tflane_jax.metrics.frames import (
     detections_from_prediction,
     truth_from_example,
 )
+from tflane_jax.metrics.lane_segment import (
+    AreaDetections,
+    AreaTruth,
+    LaneSegmentMetrics,
+    SegmentDetections,
+    SegmentTruth,
+)
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
+from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.metrics.vector_map import MapDetections, MapTruth, VectorMapMetrics
 
 __all__ = [
+    "AreaDetections",
+    "AreaTruth",
     "CenterlineMetrics",
     "ElementDetections",
     "ElementTruth",
     "GroupedCenterlineMetrics",
     "LaneDetections",
+    "LaneSegmentMetrics",
     "LaneTruth",
+    "MapDetections",
+    "MapTruth",
+    "RowLanes",
+    "SegmentDetections",
+    "SegmentTruth",
+    "TuSimpleMetrics",
+    "VectorMapMetrics",
     "detections_from_prediction",
     "truth_from_example",
 ]

@@ -20,7 +20,7 @@ from tflane_jax.metrics.frames import (
     check_shape,
     checked_lines,
 )
-from tflane_jax.metrics.matching import greedy_match
+from tflane_jax.metrics.matching import greedy_match, nearest_truth
 from tflane_jax.metrics.topology import FILL, Version, matchings, topology_precision
 
 LANE_THRESHOLDS = (1.0, 2.0, 3.0)  # metres, discrete Frechet
@@ -42,7 +42,7 @@ def nearest_lanes(
     distance of the end points bounds a pair from below. Without lanes the distances are inf.
     """
     if len(truth) == 0 or len(detected) == 0:
-        return np.full(len(detected), np.inf), np.zeros(len(detected), np.int64)
+        return nearest_truth(np.zeros((len(truth), len(detected))))
     relax = relaxation(truth)[:, None]
     ends_truth, ends_detected = truth[:, None, [0, -1]], detected[None, :, [0, -1]]
     bound = relax * vertex_distance(ends_truth, ends_detected).max(-1)
@@ -147,7 +147,7 @@ def match_lanes(
     check_shape(scores, (p,), "detections: scores")
     check_shape(confidence, (p, p), "detections: successor")
 
-    taken = np.stack([greedy_match(distance, nearest, scores, threshold) for threshold in LANE_THRESHOLDS])
+    taken = np.stack([greedy_match(distance < threshold, nearest, scores) for threshold in LANE_THRESHOLDS])
     levels = np.stack([matchings(scores, row, version) for row in taken])
     rows = np.concatenate(levels)
     topology = topology_precision(edges, confidence, rows, rows, FILL[version])
@@ -179,8 +179,10 @@ def _match_elements(
     distance = iou_distance(truth.boxes, detections.boxes)
     inside = np.where(true_attributes[:, None] == attributes, distance, np.inf)
     # The score of detection looks inside an attribute, the score of topology does not.
-    hits = greedy_match(*_nearest(inside), scores, ELEMENT_THRESHOLD) >= 0
-    taken = greedy_match(*_nearest(distance), scores, ELEMENT_THRESHOLD)
+    within, taken = (
+        greedy_match(least < ELEMENT_THRESHOLD, nearest, scores)
+        for least, nearest in (nearest_truth(inside), nearest_truth(distance))
+    )
 
     thresholds, levels = lane_levels.shape[:2]
     columns = np.tile(matchings(scores, taken, version), (thresholds, 1))
@@ -189,17 +191,11 @@ def _match_elements(
     return MatchedElements(
         scores=scores,
         attributes=attributes,
-        hits=hits,
+        hits=within >= 0,
         truths=np.bincount(true_attributes, minlength=ATTRIBUTES),
         topology=topology.sum(-1).reshape(thresholds, levels).mean(1) * bool(vertices),
         vertices=vertices,
     )
-
-
-def _nearest(distance: Float[np.ndarray, "t u"]) -> tuple[Float[np.ndarray, " u"], Int[np.ndarray, " u"]]:
-    if len(distance) == 0:
-        return np.full(distance.shape[1], np.inf), np.zeros(distance.shape[1], np.int64)
-    return distance.min(0), distance.argmin(0)
 
 
 def _checked_attributes(attributes: Int[np.ndarray, " n"], count: int, what: str) -> Int[np.ndarray, " n"]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.metrics.frames import Lines, checked_lines
+
 # Rounding of bound and distance, far below any difference that could matter.
 _SLACK = 1e-9
 _PIECES = 10
@@ -32,6 +34,11 @@ class PaddedLines:
     points: Float[np.ndarray, "l n d"]
     counts: Int[np.ndarray, " l"]
 
+    @classmethod
+    def of(cls, lines: Lines, what: str, dims: int = 3) -> PaddedLines:
+        """Return the given lines; raise UserError, which names them by `what`, for those that cannot be measured."""
+        return cls(checked_lines(lines, what, dims), np.array([len(line) for line in lines], int))
+
     def __len__(self) -> int:
         return len(self.points)
 
@@ -44,28 +51,55 @@ class PaddedLines:
         closed = (self.points[:, 0] == self.points[:, -1]).all(-1) & (self.counts > 1)
         return PaddedLines(self.points, self.counts - closed)
 
+    def resampled(self, count: int) -> PaddedLines:
+        """Return `count` points on each line, equally spaced in ground-plane arc length, both ends included.
+
+        As `geometry.polylines.resample` does, and unlike `resample_lines` to the last bit: rounding does not depend on
+        the other lines, so that twins remain equally near.
+        """
+        if len(self) == 0:
+            return PaddedLines(np.zeros((0, count, self.points.shape[-1])), self.counts)
+        step = np.diff(self.points[..., :2], axis=1)
+        along = np.cumsum(np.hypot(step[..., 0], step[..., 1]), axis=1)
+        along = np.concatenate([np.zeros((len(along), 1)), along], 1)
+        distance = along[:, -1:] * np.linspace(0.0, 1.0, count)
+        # The last segment that starts at or before the distance, never one of length zero.
+        final = np.maximum((along < along[:, -1:]).sum(1) - 1, 0)
+        start = np.minimum((along[:, None] <= distance[..., None]).sum(-1) - 1, final[:, None])
+        line = np.arange(len(along))[:, None]
+        stop = np.minimum(start + 1, along.shape[1] - 1)
+        length = along[line, stop] - along[line, start]
+        weight = ((distance - along[line, start]) / np.where(length > 0.0, length, 1.0))[..., None]
+        a, b = self.points[line, start], self.points[line, stop]
+        return PaddedLines(np.where(weight == 1.0, b, a + weight * (b - a)), np.full(len(self), count))
+
     def counted(self) -> Bool[np.ndarray, "l n"]:
         """Return which vertices count."""
         return np.arange(self.points.shape[1]) < self.counts[:, None]
 
 
 def near_pairs(
-    a: PaddedLines, b: PaddedLines, within: float, among: Bool[np.ndarray, "a b"] | None = None
+    a: PaddedLines,
+    b: PaddedLines,
+    within: float | Float[np.ndarray, " a"],
+    among: Bool[np.ndarray, "a b"] | None = None,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Return all pairs (lines of a, lines of b) whose Chamfer distance can be at most `within` metres, and few others.
 
     Args:
+        within: one for all, or one for each line of a.
         among: leave out the pairs that are false here.
     """
+    within = np.broadcast_to(np.asarray(within) + _SLACK, len(a))
     boxes_a, boxes_b = _piece_boxes(a), _piece_boxes(b)
     # The box of the whole line first, it costs next to nothing.
     gap = _box_gap(boxes_a.whole[:, None], boxes_b.whole[None])
-    possible = gap <= within + _SLACK
+    possible = gap <= within[:, None]
     i, j = np.nonzero(possible if among is None else possible & among)
     gap = _box_gap(boxes_a.pieces[i][:, :, None], boxes_b.pieces[j][:, None])
     forth = (boxes_a.weights[i] * gap.min(2)).sum(-1)
     back = (boxes_b.weights[j] * gap.min(1)).sum(-1)
-    keep = 0.5 * (forth + back) <= within + _SLACK
+    keep = 0.5 * (forth + back) <= within[i]
     return i[keep], j[keep]
 
 
@@ -114,20 +148,18 @@ def _piece_boxes(lines: PaddedLines) -> _Boxes:
 
 def _box_gap(a: Float[np.ndarray, "*b 2 d"], b: Float[np.ndarray, "*b 2 d"]) -> Float[np.ndarray, "*b"]:
     """Return the least distance between points of two boxes."""
-    total = None
-    for axis in range(a.shape[-1]):
-        gap = np.maximum(a[..., 0, axis] - b[..., 1, axis], b[..., 0, axis] - a[..., 1, axis])
-        squared = np.maximum(gap, 0.0) ** 2
-        total = squared if total is None else total + squared
-    return np.sqrt(total)
+    gaps = np.maximum(a[..., 0, :] - b[..., 1, :], b[..., 0, :] - a[..., 1, :])
+    return np.sqrt((np.maximum(gaps, 0.0) ** 2).sum(-1))
 
 
 def _squared(a: Float[np.ndarray, "k n d"], b: Float[np.ndarray, "k m d"]) -> Float[np.ndarray, "k n m"]:
-    total = None
-    for axis in range(a.shape[-1]):
+    # In place and coordinate by coordinate: the passes over memory are what this costs.
+    total = a[:, :, None, 0] - b[:, None, :, 0]
+    total *= total
+    for axis in range(1, a.shape[-1]):
         step = a[:, :, None, axis] - b[:, None, :, axis]
         step *= step
-        total = step if total is None else np.add(total, step, out=total)
+        total += step
     return total
 
 

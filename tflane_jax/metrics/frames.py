@@ -17,7 +17,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry.distances import pad_lines
 from tflane_jax.scene import LaneGraph, LanePrediction, TrafficElements
 
-Lines = Sequence[Float[np.ndarray, "_ 3"]] | Float[np.ndarray, "l n 3"]
+Lines = Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"]
 
 
 @dataclass(frozen=True)
@@ -116,14 +116,15 @@ def detections_from_prediction(prediction: LanePrediction) -> LaneDetections:
     )
 
 
-def checked_lines(lines: Lines, what: str) -> Float[np.ndarray, "l n 3"]:
+def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "l n d"]:
     """Return the polylines of one frame as one array (`pad_lines`); raise UserError for what cannot be measured."""
     try:
-        points = pad_lines(lines)
+        points = pad_lines(lines, dims)
     except ValueError as error:
         raise UserError(f"{what}: {error}") from None
-    if points.ndim != 3 or points.shape[-1] != 3:
-        raise UserError(f"{what}: points have shape {points.shape}, expected lines of 3-D points (lines, points, 3)")
+    if points.ndim != 3 or points.shape[-1] != dims:
+        expected = f"expected lines of {dims}-D points (lines, points, {dims})"
+        raise UserError(f"{what}: points have shape {points.shape}, {expected}")
     finite = np.isfinite(points).all((1, 2))
     if not finite.all():
         raise UserError(f"{what}: line {int(finite.argmin())} has a coordinate that is not finite")

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry.distances import chamfer, discrete_frechet
+from tflane_jax.geometry.distances import discrete_frechet
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, match_lanes, relaxation
-from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape, checked_lines
-from tflane_jax.metrics.matching import average_precision_11, greedy_match
+from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape
+from tflane_jax.metrics.matching import average_precision_11, greedy_match, nearest_truth, pooled
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 
 Flavour = Literal["OpenLane-V2", "LaneSegNet"]
@@ -146,8 +147,7 @@ class _AreaPrecision:
 
     def __init__(self) -> None:
         self.truths = 0
-        self.scores: list[np.ndarray] = []
-        self.hits: list[np.ndarray] = []  # (thresholds, detections) each
+        self.detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, hits (thresholds, detections)
 
     def update(self, detections: AreaDetections, truth: AreaTruth, category: int) -> None:
         true = _of_category(truth.points, truth.categories, category, "truth")
@@ -156,24 +156,20 @@ class _AreaPrecision:
         check_shape(scores, (len(detections.points),), "detections: area scores")
         scores = scores[np.asarray(detections.categories) == category]
         distance = _area_distance(true, found)
-        if len(true):
-            least, nearest = distance.min(0), distance.argmin(0)
-        else:
-            least, nearest = np.full(len(found), np.inf), np.zeros(len(found), np.int64)
+        least, nearest = nearest_truth(distance)
         self.truths += len(true)
-        self.scores.append(scores)
-        self.hits.append(np.stack([greedy_match(least, nearest, scores, t) >= 0 for t in AREA_THRESHOLDS]))
+        hits = np.stack([greedy_match(least < t, nearest, scores) >= 0 for t in AREA_THRESHOLDS])
+        self.detections.append((scores, hits))
 
     def __add__(self, other: _AreaPrecision) -> _AreaPrecision:
         total = _AreaPrecision()
         total.truths = self.truths + other.truths
-        total.scores, total.hits = self.scores + other.scores, self.hits + other.hits
+        total.detections = self.detections + other.detections
         return total
 
     def compute(self) -> list[float]:
         """Return the average precision at each threshold."""
-        scores = np.concatenate([np.zeros(0), *self.scores])
-        hits = np.concatenate([np.zeros((len(AREA_THRESHOLDS), 0), bool), *self.hits], 1)
+        scores, hits = pooled(self.detections, (len(AREA_THRESHOLDS), 0))
         return [average_precision_11(scores, row, self.truths) for row in hits]
 
 
@@ -189,62 +185,26 @@ def nearest_segments(
         truth: G centerlines, left lines, right lines.
         detected: P of each.
     """
-    true, found = ([_Padded.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
+    true, found = ([PaddedLines.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
                    for side, three in (("truth", truth), ("detections", detected)))  # fmt: skip
     for side, three in (("truth", true), ("detections", found)):
-        if len({len(lines.points) for lines in three}) > 1:
-            raise UserError(f"{side}: {', '.join(f'{len(x.points)} {n}' for x, n in zip(three, _NAMES, strict=True))}"
+        if len({len(lines) for lines in three}) > 1:
+            raise UserError(f"{side}: {', '.join(f'{len(x)} {n}' for x, n in zip(three, _NAMES, strict=True))}"
                             ", expected as many of each")  # fmt: skip
-    g, p = len(true[0].points), len(found[0].points)
-    if g == 0 or p == 0:
-        return np.full(p, np.inf), np.zeros(p, np.int64)
     relax = relaxation(true[0].points)
-    # No vertex of one line is nearer to the other line than their boxes are to each other.
-    lane, detection = np.nonzero(relax[:, None] * _box_gap(true[0].points, found[0].points) < LANE_THRESHOLDS[-1])
-    near = relax[lane] * _pair_chamfer(true[0], found[0], lane, detection) < LANE_THRESHOLDS[-1]
+    true = [lines.open_ends() for lines in true]
+    lane, detection = near_pairs(true[0], found[0], LANE_THRESHOLDS[-1] / relax)
+    near = relax[lane] * pair_chamfer(true[0], found[0], lane, detection) < LANE_THRESHOLDS[-1]
     lane, detection = lane[near], detection[near]
     total = discrete_frechet(true[0].points[lane], found[0].points[detection])
     for i in (1, 2):
-        total = total + _pair_chamfer(true[i], found[i], lane, detection)
-    distance = np.full((g, p), _MASKED)
+        total = total + pair_chamfer(true[i], found[i], lane, detection)
+    distance = np.full((len(true[0]), len(found[0])), _MASKED)
     distance[lane, detection] = relax[lane] * 0.5 * total
-    return distance.min(0), distance.argmin(0)
+    return nearest_truth(distance)
 
 
 _NAMES = ("centerlines", "left lines", "right lines")
-
-
-@dataclass(frozen=True)
-class _Padded:
-    """Lines of a frame as one array; `valid` leaves out padding."""
-
-    points: Float[np.ndarray, "l n 3"]
-    valid: Bool[np.ndarray, "l n"]
-
-    @classmethod
-    def of(cls, lines: Lines, what: str) -> _Padded:
-        points = checked_lines(lines, what)
-        counts = np.array([len(line) for line in lines], int)
-        return cls(points, np.arange(points.shape[1]) < counts[:, None])
-
-    def opened(self) -> Bool[np.ndarray, "l n"]:
-        """Return `valid` without the last vertex of closed lines, which counts only once."""
-        last = self.valid.sum(-1) - 1
-        closed = (self.points[:, 0] == self.points[np.arange(len(last)), last]).all(-1)
-        return self.valid & ~(closed[:, None] & (np.arange(self.valid.shape[1]) == last[:, None]))
-
-
-def _pair_chamfer(
-    true: _Padded, found: _Padded, i: Int[np.ndarray, " k"], j: Int[np.ndarray, " k"]
-) -> Float[np.ndarray, " k"]:
-    """Return the Chamfer distance of K pairs; only true lines are opened."""
-    return chamfer(true.points[i], found.points[j], true.opened()[i], found.valid[j])
-
-
-def _box_gap(a: Float[np.ndarray, "g n 3"], b: Float[np.ndarray, "p m 3"]) -> Float[np.ndarray, "g p"]:
-    """Return the distance between the axis-aligned boxes of all pairs of lines."""
-    low = np.maximum(a.min(1)[:, None] - b.max(1)[None], b.min(1)[None] - a.max(1)[:, None])
-    return np.sqrt((np.maximum(low, 0.0) ** 2).sum(-1))
 
 
 def _of_category(
@@ -263,7 +223,7 @@ def _area_distance(
     """Return the Chamfer distance of all pairs of areas that may match; others are at 1024."""
     distance = np.full((len(true), len(found)), _MASKED)
     if distance.size:
-        a, b = _Padded.of(true, "truth: areas"), _Padded.of(found, "detections: areas")
-        i, j = np.nonzero(_box_gap(a.points, b.points) < AREA_THRESHOLDS[-1])
-        distance[i, j] = _pair_chamfer(a, b, i, j)
+        a, b = PaddedLines.of(true, "truth: areas").open_ends(), PaddedLines.of(found, "detections: areas")
+        i, j = near_pairs(a, b, AREA_THRESHOLDS[-1])
+        distance[i, j] = pair_chamfer(a, b, i, j)
     return distance

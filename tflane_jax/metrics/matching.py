@@ -1,4 +1,4 @@
-"""Greedy nearest matching and the average precisions of OpenLane-V2 (shared specs/metrics.md section 1).
+"""Greedy nearest matching and the official average precisions (shared specs/metrics.md sections 1 and 4).
 
 Everywhere "in descending confidence" is a stable order: of equal confidences the earlier element goes first. The
 official program sorts unstably, so its value is undefined where confidences tie; ours is one of the possible ones.
@@ -15,23 +15,37 @@ def descending(values: Float[np.ndarray, "*b n"]) -> Int[np.ndarray, "*b n"]:
     return np.argsort(-values, axis=-1, kind="stable")
 
 
+def nearest_truth(distance: Float[np.ndarray, "g p"]) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Return for each prediction the distance to its nearest truth, the first of several, and which one that is.
+
+    Without truth the distances are inf.
+    """
+    if len(distance) == 0:
+        return np.full(distance.shape[1], np.inf), np.zeros(distance.shape[1], np.int64)
+    return distance.min(0), distance.argmin(0)
+
+
 def greedy_match(
-    distance: Float[np.ndarray, " p"],
-    nearest: Int[np.ndarray, " p"],
-    scores: Float[np.ndarray, " p"],
-    threshold: float,
+    near: Bool[np.ndarray, " p"], nearest: Int[np.ndarray, " p"], scores: Float[np.ndarray, " p"]
 ) -> Int[np.ndarray, " p"]:
     """Return for each prediction the truth that it takes, -1 for a false positive.
 
-    Every prediction looks only at its nearest truth, decided before matching (`nearest`, at `distance`). In descending
-    confidence it takes that truth if it is nearer than `threshold` (strictly) and free; there is no second choice.
+    Every prediction looks only at its nearest truth, decided before matching (`nearest`). In descending confidence it
+    takes that truth if it is `near` enough and free; there is no second choice.
     """
     order = descending(scores)
-    near = order[distance[order] < threshold]
-    _, first = np.unique(nearest[near], return_index=True)
+    order = order[near[order]]
+    _, first = np.unique(nearest[order], return_index=True)
     taken = np.full(len(nearest), -1)
-    taken[near[first]] = nearest[near[first]]
+    taken[order[first]] = nearest[order[first]]
     return taken
+
+
+def pooled(detections: list[tuple[np.ndarray, ...]], *empty: tuple[int, ...]) -> list[np.ndarray]:
+    """Concatenate scores and the other fields over frames; `empty` are the shapes of the others without frames."""
+    if not detections:
+        return [np.zeros(shape) for shape in ((0,), *empty)]
+    return [np.concatenate(field, -1) for field in zip(*detections, strict=True)]
 
 
 def average_precision_11(scores: Float[np.ndarray, " p"], hits: Bool[np.ndarray, " p"], truths: int) -> float:
@@ -48,6 +62,19 @@ def average_precision_11(scores: Float[np.ndarray, " p"], hits: Bool[np.ndarray,
     # Recall >= k/10 as 10 found >= k truths in integers: 0.7 and 0.9 have no exact float, and official values depend
     # on the test being exact.
     return float(best_from[np.searchsorted(10 * found, np.arange(11) * truths)].mean())
+
+
+def average_precision_area(scores: Float[np.ndarray, " p"], hits: Bool[np.ndarray, " p"], truths: int) -> float:
+    """Return the area under the precision-recall curve, precision taken as the best at that recall or above.
+
+    Without ground truth or without predictions it is 0. Arguments as in `average_precision_11`.
+    """
+    if truths == 0 or len(scores) == 0:
+        return 0.0
+    hits = hits[descending(scores)]
+    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
+    best_from = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(best_from[hits].sum() / truths)
 
 
 def vertex_average_precision(

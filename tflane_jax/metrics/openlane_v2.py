@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import ATTRIBUTES, LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
-from tflane_jax.metrics.matching import average_precision_11
+from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.topology import Version
 
 Group = Literal["all", "occluded", "clear"]
@@ -86,7 +86,7 @@ class CenterlineMetrics:
           `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is.
         """
         result: dict[str, float] = {"frames": self._frames, "lanes": self._lanes}
-        scores, hits = _pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
+        scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
         precisions = [average_precision_11(scores, row, self._lanes) for row in hits]
         result["DET_l"] = float(np.mean(precisions))
         result |= {f"DET_l@{t}": value for t, value in zip(LANE_THRESHOLDS, precisions, strict=True)}
@@ -97,7 +97,7 @@ class CenterlineMetrics:
             missing = self._frames - self._frames_with_elements
             raise UserError(f"traffic elements are missing in {missing} of {self._frames} frames: give all or none")
 
-        scores, hits, attributes = _pooled(self._element_detections, (0,), (0,))
+        scores, hits, attributes = pooled(self._element_detections, (0,), (0,))
         precisions = [
             average_precision_11(scores[attributes == i], hits[attributes == i], int(count))
             for i, count in enumerate(self._true_elements)
@@ -178,10 +178,3 @@ class GroupedCenterlineMetrics:
             raise UserError(f"truth: visibility has shape {visibility.shape}, expected {(lanes,)}")
         occluded = visibility < self.occluded_below
         return occluded if group == "occluded" else ~occluded
-
-
-def _pooled(detections: list[tuple[np.ndarray, ...]], *empty: tuple[int, ...]) -> list[np.ndarray]:
-    """Concatenate scores and the other fields over frames; `empty` are the shapes of the others without frames."""
-    if not detections:
-        return [np.zeros(shape) for shape in ((0,), *empty)]
-    return [np.concatenate(field, -1) for field in zip(*detections, strict=True)]

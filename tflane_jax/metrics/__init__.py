@@ -1,5 +1,6 @@
 """Official lane metrics, re-implemented, with the version of the protocol in their name."""
 
+from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.frames import (
     ElementDetections,
     ElementTruth,
@@ -22,6 +23,7 @@ from tflane_jax.metrics.vector_map import MapDetections, MapTruth, VectorMapMetr
 __all__ = [
     "AreaDetections",
     "AreaTruth",
+    "CenterlineFScore",
     "CenterlineMetrics",
     "ElementDetections",
     "ElementTruth",

@@ -68,8 +68,7 @@ class TemporalEncoder(nn.Module):
     @nn.compact
     def __call__(self, tokens: TrafficFlowTokens) -> Float[Array, "t d"]:
         """Return TF_Feat; what stands at invalid instances is finite and meaningless."""
-        where = self._where(tokens)
-        x = self._embed(tokens, where)
+        x = self._embed(tokens)
         for i in range(self.config.depth):
             x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, tokens.frame_valid)
         x = nn.LayerNorm(name="norm")(x)
@@ -78,20 +77,21 @@ class TemporalEncoder(nn.Module):
         # A mean blurs where a moving instance was; its first and its last valid frame say it.
         first = tokens.frame_valid.argmax(-1)
         last = weight.shape[1] - 1 - tokens.frame_valid[:, ::-1].argmax(-1)
-        ends = [jnp.take_along_axis(where, i[:, None, None], 1)[:, 0] for i in (first, last)]
-        return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, *ends], -1))
+        ends = jnp.stack([first, last], 1)[..., None]
+        # Taken before they are encoded: XLA would encode all frames a second time.
+        where = self._where(*(jnp.take_along_axis(x, ends, 1) for x in (tokens.position, tokens.heading)))
+        return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, where.reshape(len(mean), -1)], -1))
 
-    def _where(self, tokens: TrafficFlowTokens) -> Float[Array, "t n e"]:
-        """Encode position and heading of every frame."""
-        where = tokens.position
+    def _where(self, position: Float[Array, "t n 3"], heading: Float[Array, "t n 2"]) -> Float[Array, "t n e"]:
+        """Encode position and heading."""
         if self.config.position_encoding == "sine":
-            where = jnp.concatenate([sine_encoding(where[..., :2], self.config.bands), where], -1)
-        return jnp.concatenate([where, tokens.heading], -1)
+            position = jnp.concatenate([sine_encoding(position[..., :2], self.config.bands), position], -1)
+        return jnp.concatenate([position, heading], -1)
 
-    def _embed(self, tokens: TrafficFlowTokens, where: Float[Array, "t n e"]) -> Float[Array, "t n c"]:
-        """Add size, category and age of every frame."""
+    def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
+        """Encode where, how large, of which category and how long ago every frame is."""
         width, (instances, frames) = self.config.width, tokens.frame_valid.shape
-        x = nn.Dense(width, name="frame")(where)
+        x = nn.Dense(width, name="frame")(self._where(tokens.position, tokens.heading))
         category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
         size = nn.Dense(width, use_bias=False, name="size")(tokens.size)
         age = self.param("age", nn.initializers.normal(0.02), (frames, width))

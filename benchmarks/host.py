@@ -9,6 +9,7 @@ turn (`benchmarks.timing`).
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import subprocess
 import sys
 import time
@@ -22,7 +23,10 @@ from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdo
 from tflane_jax.config import load_config
 from tflane_jax.datasets.loading import for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
-from tflane_jax.models.toponet import TrafficFlowConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.lane_decoder import LaneDecoderConfig
+from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
 from tflane_jax.scene import Example
 from tflane_jax.training.lane_graph import LaneGraphTask
 
@@ -39,6 +43,18 @@ def tasks() -> dict[str, LaneGraphTask]:
     }
 
 
+def paper_size_tasks() -> dict[str, LaneGraphTask]:
+    """Return both with TopoNet's own decoder: 256 channels, 6 layers, 200 queries, 100 x 200 BEV cells.
+
+    The encoder stays small. With cameras and BEVFormer in its place the TFM's share would be smaller still.
+    """
+    decoder = LaneDecoderConfig(dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed")
+    model = TopoNetConfig(encoder=EvidenceEncoderConfig(dim=64, cell=1), decoder=decoder)
+    module = TrafficFlowModuleConfig(width=128, heads=8)
+    with_traffic = dataclasses.replace(model, traffic_flow=TrafficFlowConfig(module=module))
+    return {"baseline": LaneGraphTask(model), "+TFM": LaneGraphTask(with_traffic)}
+
+
 def examples() -> Example:
     """Return a batch of examples of the built-in world, on the device."""
     dataset = ProceduralDataset(ProceduralConfig(split="val", scenes=BATCH // 4))
@@ -46,17 +62,22 @@ def examples() -> Example:
 
 
 def inference(batch: Example, seconds: float) -> dict[str, Any]:
-    """Time prediction of one example and of a batch, with and without the TFM (N_t = 30)."""
+    """Time prediction of one example and of a batch, with and without the TFM (N_t = 30), and one at TopoNet's size."""
     one = jax.tree.map(lambda leaf: leaf[0], batch)
-    record = {}
-    for size, example in (("1", one), (str(BATCH), batch)):
+
+    def measured(models: dict[str, LaneGraphTask], batched: bool) -> dict[str, Any]:
         compiled = {}
-        for name, task in tasks().items():
+        for name, task in models.items():
             params = jax.jit(task.init)(jax.random.key(0), one)
-            predict = task.predict if size == "1" else jax.vmap(task.predict, in_axes=(None, 0))
-            compiled[name] = compile_jax(predict, params, example)
-        record[f"inference, batch {size}"] = _measured(compiled, seconds)
-    return record
+            predict = jax.vmap(task.predict, in_axes=(None, 0)) if batched else task.predict
+            compiled[name] = compile_jax(predict, params, batch if batched else one)
+        return _measured(compiled, seconds)
+
+    return {
+        "inference, batch 1": measured(tasks(), batched=False),
+        f"inference, batch {BATCH}": measured(tasks(), batched=True),
+        "inference, batch 1, TopoNet's decoder size": measured(paper_size_tasks(), batched=False),
+    }
 
 
 def training(batch: Example, seconds: float) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry.distances import discrete_frechet, vertex_distance
 from tflane_jax.metrics.frames import (
     ElementDetections,
     ElementTruth,
@@ -20,6 +19,7 @@ from tflane_jax.metrics.frames import (
     check_shape,
     checked_lines,
 )
+from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 from tflane_jax.metrics.topology import FILL, Version, matchings, topology_precision
 
@@ -44,18 +44,16 @@ def nearest_lanes(
     if len(truth) == 0 or len(detected) == 0:
         return nearest_truth(np.zeros((len(truth), len(detected))))
     relax = relaxation(truth)[:, None]
-    ends_truth, ends_detected = truth[:, None, [0, -1]], detected[None, :, [0, -1]]
-    bound = relax * vertex_distance(ends_truth, ends_detected).max(-1)
-
+    bound = relax * end_distance(truth, detected)
     distance = np.full(bound.shape, np.inf)
 
     def measure(lane: np.ndarray, detection: np.ndarray) -> None:
-        distance[lane, detection] = relax[lane, 0] * discrete_frechet(truth[lane], detected[detection])
+        distance[lane, detection] = relax[lane, 0] * pair_frechet(truth, detected, lane, detection)
 
     guess, every = bound.argmin(0), np.arange(len(detected))
     measure(guess, every)
     measure(*np.nonzero((bound <= distance[guess, every]) & np.isinf(distance)))
-    return distance.min(0), distance.argmin(0)
+    return nearest_truth(distance)
 
 
 def iou_distance(

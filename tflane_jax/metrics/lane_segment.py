@@ -7,24 +7,23 @@ DET_a. LaneSegNet and TF-Lane print the second. Rules: shared specs/metrics.md s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry.distances import discrete_frechet
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, match_lanes, relaxation
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape
+from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import average_precision_11, greedy_match, nearest_truth, pooled
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 
 Flavour = Literal["OpenLane-V2", "LaneSegNet"]
 AREA_THRESHOLDS = (0.5, 1.0, 1.5)  # metres, Chamfer
 CROSSING, BOUNDARY = 1, 2
-_MASKED = 1024.0  # the official distance of pairs that are too far apart to be measured
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,8 @@ class LaneSegmentMetrics:
     def __init__(self, flavour: Flavour = "OpenLane-V2") -> None:
         self.flavour: Flavour = flavour
         self._lanes = CenterlineMetrics("v2.1")
-        self._areas = {category: _AreaPrecision() for category in (CROSSING, BOUNDARY)}
+        self._true_areas = np.zeros(BOUNDARY + 1, np.int64)  # by category
+        self._area_detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, categories, hits
 
     @property
     def protocol(self) -> str:
@@ -101,9 +101,12 @@ class LaneSegmentMetrics:
             [truth.lanes.points, truth.left, truth.right],
             [detections.lanes.points, detections.left, detections.right],
         )
-        self._lanes.add(match_lanes(detections.lanes, truth.lanes, distance, nearest))
-        for category, precision in self._areas.items():
-            precision.update(detections.areas, truth.areas, category)
+        lanes = detections.lanes, truth.lanes
+        if self.flavour == "LaneSegNet":
+            lanes = replace(detections.lanes, elements=None), replace(truth.lanes, elements=None)
+        self._lanes.add(match_lanes(*lanes, distance, nearest))
+        self._area_detections.append(match_areas(detections.areas, truth.areas))
+        self._true_areas += np.bincount(truth.areas.categories, minlength=BOUNDARY + 1)
 
     def merge(self, other: Self) -> Self:
         """Return an accumulator of the frames of both, in this order (neither changes)."""
@@ -111,7 +114,8 @@ class LaneSegmentMetrics:
             raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one flavour")
         merged = type(self)(self.flavour)
         merged._lanes = self._lanes.merge(other._lanes)
-        merged._areas = {category: mine + other._areas[category] for category, mine in self._areas.items()}
+        merged._true_areas = self._true_areas + other._true_areas
+        merged._area_detections = self._area_detections + other._area_detections
         return merged
 
     def compute(self) -> dict[str, float]:
@@ -123,16 +127,24 @@ class LaneSegmentMetrics:
         - "LaneSegNet": `AP_ls` and `AP_ls@1.0` ..., `AP_ped`, `AP_boundary`, `mAP` (of the first two) and `TOP_lsls`.
         """
         lanes = self._lanes.compute()
+        scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
+        precision = {
+            name: [
+                average_precision_11(scores[members], row[members], int(self._true_areas[category])) for row in hits
+            ]
+            for name, category in (("crossing", CROSSING), ("boundary", BOUNDARY))
+            for members in [categories == category]
+        }
         areas = {
             f"{name}@{threshold}": value
-            for name, category in (("crossing", CROSSING), ("boundary", BOUNDARY))
-            for threshold, value in zip(AREA_THRESHOLDS, self._areas[category].compute(), strict=True)
+            for name, values in precision.items()
+            for threshold, value in zip(AREA_THRESHOLDS, values, strict=True)
         }
         if self.flavour == "LaneSegNet":
             count = {name: lanes[name] for name in ("frames", "lanes")}
             segments = {f"AP_ls@{t}": lanes[f"DET_l@{t}"] for t in LANE_THRESHOLDS}
-            ap_ls, ap_ped = lanes["DET_l"], float(np.mean(self._areas[CROSSING].compute()))
-            means = {"AP_ls": ap_ls, "AP_ped": ap_ped, "AP_boundary": float(np.mean(self._areas[BOUNDARY].compute()))}
+            ap_ls, ap_ped = lanes["DET_l"], float(np.mean(precision["crossing"]))
+            means = {"AP_ls": ap_ls, "AP_ped": ap_ped, "AP_boundary": float(np.mean(precision["boundary"]))}
             return count | means | {"mAP": (ap_ls + ap_ped) / 2, "TOP_lsls": lanes["TOP_ll"]} | segments | areas
         lanes.pop("OLS", None)
         lanes["DET_a"] = float(np.mean(list(areas.values())))
@@ -142,35 +154,25 @@ class LaneSegmentMetrics:
         return lanes | areas
 
 
-class _AreaPrecision:
-    """Detections of one category of areas, pooled over frames."""
+def match_areas(
+    detections: AreaDetections, truth: AreaTruth
+) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Bool[np.ndarray, "k p"]]:
+    """Return scores and categories of the detected areas, and which are true positives at each threshold.
 
-    def __init__(self) -> None:
-        self.truths = 0
-        self.detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, hits (thresholds, detections)
-
-    def update(self, detections: AreaDetections, truth: AreaTruth, category: int) -> None:
-        true = _of_category(truth.points, truth.categories, category, "truth")
-        found = _of_category(detections.points, detections.categories, category, "detections")
-        scores = np.asarray(detections.scores)
-        check_shape(scores, (len(detections.points),), "detections: area scores")
-        scores = scores[np.asarray(detections.categories) == category]
-        distance = _area_distance(true, found)
-        least, nearest = nearest_truth(distance)
-        self.truths += len(true)
-        hits = np.stack([greedy_match(least < t, nearest, scores) >= 0 for t in AREA_THRESHOLDS])
-        self.detections.append((scores, hits))
-
-    def __add__(self, other: _AreaPrecision) -> _AreaPrecision:
-        total = _AreaPrecision()
-        total.truths = self.truths + other.truths
-        total.detections = self.detections + other.detections
-        return total
-
-    def compute(self) -> list[float]:
-        """Return the average precision at each threshold."""
-        scores, hits = pooled(self.detections, (len(AREA_THRESHOLDS), 0))
-        return [average_precision_11(scores, row, self.truths) for row in hits]
+    An area of another category is never nearest. Only true areas lose the vertex that closes them.
+    """
+    true, found = PaddedLines.of(truth.points, "truth: areas"), PaddedLines.of(detections.points, "detections: areas")
+    true_categories = _checked_categories(truth.categories, len(true), "truth")
+    categories = _checked_categories(detections.categories, len(found), "detections")
+    scores = np.asarray(detections.scores)
+    check_shape(scores, (len(found),), "detections: area scores")
+    true = true.open_ends()
+    i, j = near_pairs(true, found, AREA_THRESHOLDS[-1], true_categories[:, None] == categories)
+    distance = np.full((len(true), len(found)), np.inf)
+    distance[i, j] = pair_chamfer(true, found, i, j)
+    least, nearest = nearest_truth(distance)
+    hits = np.stack([greedy_match(least < threshold, nearest, scores) >= 0 for threshold in AREA_THRESHOLDS])
+    return scores, categories, hits
 
 
 def nearest_segments(
@@ -179,7 +181,8 @@ def nearest_segments(
     """Return for each detection the distance to its nearest true segment (metres), and which one that is.
 
     The distance is half of Frechet(centerlines) + Chamfer(left) + Chamfer(right), relaxed like that of centerlines;
-    pairs whose relaxed centerline Chamfer distance is 3 m or more are never matched (1024), however near their sides.
+    pairs whose relaxed centerline Chamfer distance is 3 m or more are never matched (inf), however near their sides.
+    A distance of 3 m or more, which is never matched either, may be too large or inf: not all of those are measured.
 
     Args:
         truth: G centerlines, left lines, right lines.
@@ -192,38 +195,23 @@ def nearest_segments(
             raise UserError(f"{side}: {', '.join(f'{len(x)} {n}' for x, n in zip(three, _NAMES, strict=True))}"
                             ", expected as many of each")  # fmt: skip
     relax = relaxation(true[0].points)
+    # Nothing beyond the largest threshold is matched, and half the centerlines' distance is a part of the whole.
+    true_centers, centers = true[0].points, found[0].points
+    lane, detection = np.nonzero(0.5 * relax[:, None] * end_distance(true_centers, centers) < LANE_THRESHOLDS[-1])
     true = [lines.open_ends() for lines in true]
-    lane, detection = near_pairs(true[0], found[0], LANE_THRESHOLDS[-1] / relax)
-    near = relax[lane] * pair_chamfer(true[0], found[0], lane, detection) < LANE_THRESHOLDS[-1]
-    lane, detection = lane[near], detection[near]
-    total = discrete_frechet(true[0].points[lane], found[0].points[detection])
-    for i in (1, 2):
-        total = total + pair_chamfer(true[i], found[i], lane, detection)
-    distance = np.full((len(true[0]), len(found[0])), _MASKED)
-    distance[lane, detection] = relax[lane] * 0.5 * total
+    center, left, right = (pair_chamfer(a, b, lane, detection) for a, b in zip(true, found, strict=True))
+    total = pair_frechet(true_centers, centers, lane, detection) + left + right
+    distance = np.full((len(true[0]), len(found[0])), np.inf)
+    distance[lane, detection] = np.where(relax[lane] * center < LANE_THRESHOLDS[-1], relax[lane] * 0.5 * total, np.inf)
     return nearest_truth(distance)
 
 
 _NAMES = ("centerlines", "left lines", "right lines")
 
 
-def _of_category(
-    lines: Lines, categories: Int[np.ndarray, " a"], category: int, side: str
-) -> list[Float[np.ndarray, "n 3"]]:
-    categories = np.asarray(categories)
-    check_shape(categories, (len(lines),), f"{side}: area categories")
-    if not np.isin(categories, (CROSSING, BOUNDARY)).all():
+def _checked_categories(categories: Int[np.ndarray, " a"], count: int, side: str) -> Int[np.ndarray, " a"]:
+    categories = np.asarray(categories, np.int64)
+    check_shape(categories, (count,), f"{side}: area categories")
+    if ((categories != CROSSING) & (categories != BOUNDARY)).any():
         raise UserError(f"{side}: area categories must be {CROSSING} (crossing) or {BOUNDARY} (boundary)")
-    return [lines[i] for i in np.flatnonzero(categories == category).tolist()]
-
-
-def _area_distance(
-    true: list[Float[np.ndarray, "n 3"]], found: list[Float[np.ndarray, "m 3"]]
-) -> Float[np.ndarray, "g p"]:
-    """Return the Chamfer distance of all pairs of areas that may match; others are at 1024."""
-    distance = np.full((len(true), len(found)), _MASKED)
-    if distance.size:
-        a, b = PaddedLines.of(true, "truth: areas").open_ends(), PaddedLines.of(found, "detections: areas")
-        i, j = near_pairs(a, b, AREA_THRESHOLDS[-1])
-        distance[i, j] = pair_chamfer(a, b, i, j)
-    return distance
+    return categories

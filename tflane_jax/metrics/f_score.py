@@ -94,15 +94,20 @@ def _interpolated(points: Float[np.ndarray, "l n 3"], slope_type: np.dtype | typ
 
     Slopes are as precise as the line was, which is what the official program does.
     """
-    below = (points[:, None, :, 0] < SAMPLES[:, None]).sum(-1)
-    upper = np.clip(below, 1, points.shape[1] - 1)
-    lane = np.arange(len(points))[:, None]
-    start, stop = points[lane, upper - 1], points[lane, upper]
-    run = stop[..., :1] - start[..., :1]
-    rise = (stop[..., 1:] - start[..., 1:]).astype(slope_type)
+    lanes, n = points.shape[:2]
+    lane = np.arange(lanes)[:, None]
+    # How many vertices lie before each plane: those with a first plane beyond them up to here.
+    bins = len(SAMPLES) + 1
+    beyond = np.searchsorted(SAMPLES, points[..., 0], side="right") + lane * bins
+    below = np.bincount(beyond.ravel(), minlength=lanes * bins).reshape(lanes, bins).cumsum(1)[:, :-1]
+    start = np.clip(below - 1, 0, n - 2)
+
+    step = np.diff(points, axis=1)
+    run = step[..., :1]
     # Vertices of one x (padding among them) have no slope: the plane passes through the first.
-    slope = rise / np.where(run > 0.0, run, 1.0).astype(slope_type) * (run > 0.0)
-    return slope * (SAMPLES[:, None] - start[..., :1]) + start[..., 1:]
+    slope = step[..., 1:].astype(slope_type) / np.where(run > 0.0, run, 1.0).astype(slope_type) * (run > 0.0)
+    ahead = SAMPLES - points[lane, start, 0]
+    return slope[lane, start] * ahead[..., None] + points[lane, start, 1:]
 
 
 def found_lanes(true: SampledLanes, found: SampledLanes) -> tuple[int, int]:

@@ -35,9 +35,12 @@ def greedy_match(
     """
     order = descending(scores)
     order = order[near[order]]
-    _, first = np.unique(nearest[order], return_index=True)
+    # Of several predictions the last assigned takes a truth, so the best comes last.
+    winner = np.full(nearest.max(initial=-1) + 1, -1)
+    winner[nearest[order[::-1]]] = order[::-1]
+    winner = winner[winner >= 0]
     taken = np.full(len(nearest), -1)
-    taken[order[first]] = nearest[order[first]]
+    taken[winner] = nearest[winner]
     return taken
 
 
@@ -85,10 +88,13 @@ def vertex_average_precision(
     Entries with confidence above `threshold` (strictly) are predicted neighbours; true neighbours that are not
     predicted contribute 0. No true and no predicted neighbour is 1.
     """
-    order = descending(confidence)
-    predicted = np.take_along_axis(confidence, order, -1) > threshold
-    hits = np.take_along_axis(np.broadcast_to(edges, confidence.shape), order, -1) & predicted
-    precision = np.cumsum(hits, -1) / np.arange(1, hits.shape[-1] + 1)
+    edges = np.broadcast_to(edges, confidence.shape)
+    predicted = confidence > threshold
+    # Hits are few: each counts what ranks before it, which takes no sorting.
+    *vertex, neighbour = np.nonzero(edges & predicted)
+    row, hit = confidence[*vertex], confidence[*vertex, neighbour][:, None]
+    before = (row > hit) | ((row == hit) & (np.arange(row.shape[-1]) <= neighbour[:, None]))
+    total = np.zeros(edges.shape[:-1])
+    np.add.at(total, tuple(vertex), (before & edges[*vertex]).sum(-1) / before.sum(-1))
     truths = edges.sum(-1)
-    average = (hits * precision).sum(-1) / np.maximum(truths, 1)
-    return np.where((truths == 0) & ~predicted.any(-1), 1.0, average)
+    return np.where((truths == 0) & ~predicted.any(-1), 1.0, total / np.maximum(truths, 1))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks import metrics
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 
 
@@ -28,6 +29,20 @@ def test_compiled_program_sees_its_arguments():
     entry = compile_jax(lambda x, y: x @ y, np.eye(3, dtype=np.float32), np.full((3, 3), 2.0, np.float32))
     np.testing.assert_array_equal(entry.program(), np.full((3, 3), 2.0))
     assert entry.seconds > 0
+
+
+def test_frames_of_the_metrics_hold_hits_and_misses(tmp_path):
+    record = metrics.run(tmp_path, frames=1, rounds=1)
+    assert len(record["results"]) == len(metrics.comparisons())
+    assert (tmp_path / "metrics.md").read_text().count("\n| ") == len(record["results"])
+    for comparison in metrics.comparisons():
+        rng = np.random.default_rng(0)
+        for make in comparison.metrics:
+            accumulator = make()
+            accumulator.update(*comparison.frame(rng, comparison.detections))
+            result = accumulator.compute()
+            score = next(result[name] for name in ("DET_l", "F_score", "AP_ls", "mAP", "Accuracy") if name in result)
+            assert 0.2 < score < 1.0, comparison.name
 
 
 def test_table_is_aligned():

@@ -38,7 +38,7 @@ class PaddedLines:
     @classmethod
     def of(cls, lines: Lines, what: str, dims: int = 3) -> PaddedLines:
         """Return the given lines; raise UserError, which names them by `what`, for those that cannot be measured."""
-        return cls(checked_lines(lines, what, dims), np.array([len(line) for line in lines], int))
+        return cls(checked_lines(lines, what, dims), np.fromiter(map(len, lines), int, len(lines)))
 
     def __len__(self) -> int:
         return len(self.points)

@@ -59,10 +59,18 @@ def topology_precision(
     counts where both its ends are matched. Everywhere else stand no edge where there is one, and a false edge of
     confidence `fill` where there is none.
     """
-    matched = np.broadcast_to(np.where(edges, 0.0, fill), (len(rows), *edges.shape)).copy()
-    for layer, row, column in zip(matched, rows, columns, strict=True):
-        p, u = np.flatnonzero(row >= 0), np.flatnonzero(column >= 0)
-        layer[np.ix_(row[p], column[u])] = confidence[np.ix_(p, u)]
+    matched = np.broadcast_to(np.where(edges, 0.0, fill), (len(rows), *edges.shape))
+    if confidence.size:
+        row, column = _inverse(rows, edges.shape[0])[:, :, None], _inverse(columns, edges.shape[1])[:, None]
+        matched = np.where((row >= 0) & (column >= 0), confidence[row, column], matched)
     outgoing = vertex_average_precision(edges, matched)
     incoming = vertex_average_precision(edges.T, np.swapaxes(matched, -1, -2))
     return np.concatenate([outgoing, incoming], -1)
+
+
+def _inverse(taken: Int[np.ndarray, "k p"], truths: int) -> Int[np.ndarray, "k g"]:
+    """Return for each truth the detection that takes it, -1 for none."""
+    taker = np.full((len(taken), truths), -1)
+    matching, detection = np.nonzero(taken >= 0)
+    taker[matching, taken[matching, detection]] = detection
+    return taker

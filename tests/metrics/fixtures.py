@@ -130,5 +130,8 @@ class _Case:
     def official(self) -> list[Arrays]:
         """Return the official matches and distances of every frame."""
         matches = {key: self.rows(key, "pd_lane") for key in self.arrays if key.startswith("out_lane_match")}
-        matches["out_lane_dist"] = self.matrices("out_lane_dist", self.count("gt_lane"), self.count("pd_lane"))
+        for what in ("lane", "te", "area"):
+            if f"out_{what}_dist" in self.arrays:
+                sizes = self.count(f"gt_{what}"), self.count(f"pd_{what}")
+                matches[f"out_{what}_dist"] = self.matrices(f"out_{what}_dist", *sizes)
         return [{key: values[f] for key, values in matches.items()} for f in self.frames]

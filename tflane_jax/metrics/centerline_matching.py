@@ -140,7 +140,7 @@ def match_lanes(
     """Match one frame whose detections are at `distance` from their `nearest` lanes; see `match_frame`."""
     g, p = len(truth.points), len(detections.points)
     edges, confidence = np.asarray(truth.successor, bool), np.asarray(detections.successor)
-    scores = np.asarray(detections.scores)
+    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
     check_shape(edges, (g, g), "truth: successor")
     check_shape(scores, (p,), "detections: scores")
     check_shape(confidence, (p, p), "detections: successor")
@@ -165,7 +165,7 @@ def _match_elements(
 ) -> MatchedElements:
     t, u, p = len(truth.boxes), len(detections.boxes), lane_levels.shape[-1]
     edges, confidence = np.asarray(truth.lane, bool), np.asarray(detections.lane)
-    scores = np.asarray(detections.scores)
+    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
     check_shape(np.asarray(truth.boxes), (t, 2, 2), "truth: element boxes")
     check_shape(edges, (lanes, t), "truth: lane to element")
     check_shape(np.asarray(detections.boxes), (u, 2, 2), "detections: element boxes")
@@ -197,7 +197,7 @@ def _match_elements(
 
 
 def _checked_attributes(attributes: Int[np.ndarray, " n"], count: int, what: str) -> Int[np.ndarray, " n"]:
-    attributes = np.asarray(attributes, np.int64)
+    attributes = np.array(attributes, np.int64)
     check_shape(attributes, (count,), f"{what}: element attributes")
     if ((attributes < 0) | (attributes >= ATTRIBUTES)).any():
         raise UserError(f"{what}: element attributes must lie between 0 and {ATTRIBUTES - 1}")

@@ -1,8 +1,8 @@
 """The F-score of 3-D lanes that the OpenLane-V2 devkit prints beside the centerline metrics.
 
 Lanes are compared where they pass 100 planes across the road, 1 m apart, and paired one to one at the least total cost.
-Kept apart from `CenterlineMetrics`, since it takes about as long as all of those together and few papers report it. It did
-not change between devkit v1.0 and v2.1. Rules: shared specs/metrics.md section 2.7.
+Kept apart from `CenterlineMetrics`, since it takes about as long as all of those together and few papers report it. It
+did not change between devkit v1.0 and v2.1. Rules: shared specs/metrics.md section 2.7.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ class LaneSegmentMetrics:
             lanes = replace(detections.lanes, elements=None), replace(truth.lanes, elements=None)
         self._lanes.add(match_lanes(*lanes, distance, nearest))
         self._area_detections.append(match_areas(detections.areas, truth.areas))
-        self._true_areas += np.bincount(truth.areas.categories, minlength=BOUNDARY + 1)
+        self._true_areas += np.bincount(np.asarray(truth.areas.categories, np.int64), minlength=BOUNDARY + 1)
 
     def merge(self, other: Self) -> Self:
         """Return an accumulator of the frames of both, in this order (neither changes)."""
@@ -164,7 +164,7 @@ def match_areas(
     true, found = PaddedLines.of(truth.points, "truth: areas"), PaddedLines.of(detections.points, "detections: areas")
     true_categories = _checked_categories(truth.categories, len(true), "truth")
     categories = _checked_categories(detections.categories, len(found), "detections")
-    scores = np.asarray(detections.scores)
+    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
     check_shape(scores, (len(found),), "detections: area scores")
     true = true.open_ends()
     i, j = near_pairs(true, found, AREA_THRESHOLDS[-1], true_categories[:, None] == categories)
@@ -210,7 +210,7 @@ _NAMES = ("centerlines", "left lines", "right lines")
 
 
 def _checked_categories(categories: Int[np.ndarray, " a"], count: int, side: str) -> Int[np.ndarray, " a"]:
-    categories = np.asarray(categories, np.int64)
+    categories = np.array(categories, np.int64)
     check_shape(categories, (count,), f"{side}: area categories")
     if ((categories != CROSSING) & (categories != BOUNDARY)).any():
         raise UserError(f"{side}: area categories must be {CROSSING} (crossing) or {BOUNDARY} (boundary)")

@@ -83,7 +83,7 @@ class VectorMapMetrics:
         """Add one frame; raise UserError for arrays that do not fit together."""
         frame = match_map(detections, truth, self.sampling)
         self._frames += 1
-        self._truths += np.bincount(truth.classes, minlength=len(CLASSES))
+        self._truths += frame.truths
         self._detections.append((frame.scores, frame.classes.astype(np.int8), frame.hits))
 
     def merge(self, other: Self) -> Self:
@@ -132,6 +132,7 @@ class MatchedMap:
         nearest: (P,) the true line that each detection is nearest to; without meaning beyond the largest threshold.
         distance: (P,) Chamfer distance to it, metres; inf beyond the largest threshold.
         hits: (K, P) true positive.
+        truths: (3,) number of true lines of each class.
     """
 
     scores: Float[np.ndarray, " p"]
@@ -139,6 +140,7 @@ class MatchedMap:
     nearest: Int[np.ndarray, " p"]
     distance: Float[np.ndarray, " p"]
     hits: Bool[np.ndarray, "k p"]
+    truths: Int[np.ndarray, "3"]
 
 
 def match_map(detections: MapDetections, truth: MapTruth, sampling: Sampling = "maptr") -> MatchedMap:
@@ -157,7 +159,7 @@ def match_map(detections: MapDetections, truth: MapTruth, sampling: Sampling = "
     distance = map_distance(true.resampled(SAMPLES), _sampled(found, sampling), true_classes[:, None] == classes)
     least, nearest = nearest_truth(distance)
     hits = np.stack([greedy_match(least <= threshold, nearest, scores) >= 0 for threshold in MAP_THRESHOLDS])
-    return MatchedMap(scores, classes, nearest, least, hits)
+    return MatchedMap(scores, classes, nearest, least, hits, np.bincount(true_classes, minlength=len(CLASSES)))
 
 
 def map_distance(true: PaddedLines, found: PaddedLines, same: Bool[np.ndarray, "g p"]) -> Float[np.ndarray, "g p"]:

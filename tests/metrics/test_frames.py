@@ -1,5 +1,7 @@
 """From the scene's padded containers to what the metrics compare."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,15 +17,20 @@ def make_graph(garbage):
     both = valid[:, None] & valid[None]
     elements = TrafficElements.empty(3, 5)
     return (
-        lanes.replace(
+        dataclasses.replace(
+            lanes,
             points=np.where(valid[:, None, None], points, garbage),
             visibility=np.where(valid, np.float32(0.25), garbage),
             successor=np.where(both, rng.random((5, 5)) < 0.4, np.isnan(garbage)),
             valid=valid,
         ),
-        elements.replace(valid=np.array([False, True, False]), attribute=np.array([99, 3, 99]),
-                         lane=rng.random((5, 3)) < 0.5),
-    )  # fmt: skip
+        dataclasses.replace(
+            elements,
+            valid=np.array([False, True, False]),
+            attribute=np.array([99, 3, 99]),
+            lane=rng.random((5, 3)) < 0.5,
+        ),
+    )
 
 
 def make_prediction():
@@ -41,9 +48,10 @@ def test_truth_holds_the_valid_lanes_only():
     np.testing.assert_array_equal(truth.points, lanes.points[[0, 2, 4]])
     np.testing.assert_array_equal(truth.successor[1, 2], lanes.successor[2, 4])
     np.testing.assert_array_equal(truth.visibility, [0.25] * 3)
+    assert truth.elements is not None
     np.testing.assert_array_equal(truth.elements.attributes, [3])
     np.testing.assert_array_equal(truth.elements.lane[:, 0], elements.lane[[0, 2, 4], 1])
-    assert truth_from_example(LaneGraph.empty(4, 11)).points.shape == (0, 11, 3)
+    assert np.shape(truth_from_example(LaneGraph.empty(4, 11)).points) == (0, 11, 3)
 
 
 def test_padding_changes_no_metric():

@@ -17,6 +17,7 @@ from tflane_jax.metrics.lane_segment import (
     AREA_THRESHOLDS,
     AreaDetections,
     AreaTruth,
+    Flavour,
     LaneSegmentMetrics,
     SegmentDetections,
     SegmentTruth,
@@ -26,7 +27,7 @@ from tflane_jax.metrics.lane_segment import (
 CASES = list(expected_cases("lanesegment"))
 
 
-def evaluate(frames, flavour="OpenLane-V2"):
+def evaluate(frames, flavour: Flavour = "OpenLane-V2"):
     metrics = LaneSegmentMetrics(flavour)
     for detections, truth in frames:
         metrics.update(detections, truth)

@@ -1,6 +1,7 @@
 """OpenLane-V2 centerline metrics against the official evaluator, and against numbers worked out by hand."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ VERSIONS = {"v2.1": "", "v1.0": "v1_0_"}
 CASES = list(expected_cases())
 
 
-def evaluate(frames, metrics=None):
+def evaluate(frames, metrics: Any = None) -> Any:
     metrics = CenterlineMetrics() if metrics is None else metrics
     for detections, truth in frames:
         metrics.update(detections, truth)
@@ -67,6 +68,9 @@ def test_golden_frames(case):
             mean = frame.topology.sum(-1) / (2 * frame.lanes)
             np.testing.assert_allclose(mean, topology["TOP_ll"][:, f], atol=1e-6)
         elements = frame.elements
+        assert elements is not None
+        assert truth.elements is not None
+        assert detections.elements is not None
         boxes = truth.elements.boxes, detections.elements.boxes
         np.testing.assert_allclose(iou_distance(*boxes), official["out_te_dist"], atol=1e-6)
         if elements.vertices and not expected["tie_sensitive"]:
@@ -143,7 +147,7 @@ def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
 def test_groups_share_out_lanes_vertices_and_detections(seed):
     frames = [match_frame(*random_frame(seed + i)) for i in range(3)]
     for i, frame in enumerate(frames):
-        occluded = random_frame(seed + i)[1].visibility < 0.5
+        occluded = np.asarray(random_frame(seed + i)[1].visibility) < 0.5
         parts = frame.select(occluded), frame.select(~occluded)
         assert sum(part.lanes for part in parts) == frame.lanes
         assert sum(len(part.scores) for part in parts) == len(frame.scores)

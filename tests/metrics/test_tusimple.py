@@ -50,6 +50,7 @@ def test_official_numbers(name):
         metrics.update(detections, truth)
         np.testing.assert_allclose(score_image(detections, truth), official["per_frame_acc_fp_fn"], atol=1e-9)
         if official["pixel_threshold_per_gt_lane"]:
+            assert truth.rows is not None
             thresholds = pixel_thresholds(truth.x, truth.rows)
             np.testing.assert_allclose(thresholds, official["pixel_threshold_per_gt_lane"], atol=1e-6)
             if official["line_accuracy_gt_x_pred"] and np.size(official["line_accuracy_gt_x_pred"]):

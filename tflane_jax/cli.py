@@ -26,6 +26,10 @@ _FILES = """Protocols and their files:
   openlane-v2.1-lane-segment, lanesegnet
       The same files of the lane-segment task (TIMESTAMP-ls.json). The first gives the devkit's OLUS, the second the
       mAP of the LaneSegNet and TF-Lane papers.
+  openlane-v2-f-score
+      The files of the centerline protocols; the devkit's F-score of 3-D lanes.
+  maptr, maptrv2
+      MapTR's nuscmap_results.json and the *_map_anns_val.json that its evaluation writes.
   tusimple, tusimple-lstr
       Both files hold one JSON record a line: raw_file, lanes (x at every row, negative where there is none), h_samples
       (the truth) or run_time in ms (predictions). tusimple-lstr allows 20 s an image instead of 200 ms, like LSTR."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -9,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
+from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
-from tflane_jax.scoring import openlane_v2, tusimple
+from tflane_jax.metrics.vector_map import CLASSES, Sampling, VectorMapMetrics
+from tflane_jax.scoring import maptr, openlane_v2, tusimple
 from tflane_jax.scoring.score import Accumulator
 
 
@@ -55,6 +58,16 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
     )
 
 
+def _maptr(sampling: Sampling) -> ScoringProtocol:
+    return ScoringProtocol(
+        read_predictions=maptr.read_predictions,
+        read_truth=maptr.read_truth,
+        scene_of=lambda token: token,  # the files do not say which drive a sample is of
+        metrics=partial(VectorMapMetrics, sampling),
+        columns=("mAP", *(f"AP_{name}" for name in CLASSES)),
+    )
+
+
 def _tusimple(time_limit: float) -> ScoringProtocol:
     return ScoringProtocol(
         read_predictions=tusimple.read_predictions,
@@ -70,6 +83,11 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
     "openlane-v1.0-centerline": _centerline("v1.0"),
     "openlane-v2.1-lane-segment": _lane_segment("OpenLane-V2", ("OLUS", "DET_l", "DET_a", "DET_t", "TOP_ll", "TOP_lt")),
     "lanesegnet": _lane_segment("LaneSegNet", ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "AP_boundary")),
+    "openlane-v2-f-score": dataclasses.replace(
+        _centerline("v2.1"), metrics=CenterlineFScore, columns=("F_score", "F_recall", "F_precision")
+    ),
+    "maptr": _maptr("maptr"),
+    "maptrv2": _maptr("maptrv2"),
     "tusimple": _tusimple(OFFICIAL_TIME_LIMIT),
     "tusimple-lstr": _tusimple(LSTR_TIME_LIMIT),
 }

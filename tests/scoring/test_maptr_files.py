@@ -1,0 +1,74 @@
+"""`tflane score maptr` on MapTR's own files: official numbers, and what it says of damaged ones."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from tests.metrics.fixtures import expected_cases, load_maps
+from tflane_jax.cli import main
+from tflane_jax.metrics.vector_map import CLASSES
+
+
+def vectors(lines, scores=None):
+    return [
+        {"pts": np.asarray(points).tolist(), "pts_num": len(points), "cls_name": CLASSES[c], "type": int(c)}
+        | ({} if scores is None else {"confidence_level": float(scores[i])})
+        for i, (points, c) in enumerate(zip(lines.points, lines.classes, strict=True))
+    ]
+
+
+def write(folder, samples, change=lambda results: None):
+    """Write both files; samples holds (detections, truth)."""
+    results = [{"sample_token": f"s{i}", "vectors": vectors(d, d.scores)} for i, (d, _) in enumerate(samples)]
+    truth = [{"sample_token": f"s{i}", "vectors": vectors(t)} for i, (_, t) in enumerate(samples)]
+    change(results)
+    (folder / "nuscmap_results.json").write_text(json.dumps({"meta": {}, "results": results}))
+    (folder / "anns.json").write_text(json.dumps({"GTs": truth}))
+
+
+def run(folder, protocol="maptr"):
+    out = folder / "out"
+    files = [str(folder / "nuscmap_results.json"), str(folder / "anns.json")]
+    code = main(["score", protocol, *files, "--out", str(out)])
+    return code, json.loads(out.with_suffix(".json").read_text())["rows"][0] if code == 0 else {}
+
+
+@pytest.fixture
+def samples():
+    if not expected_cases("maptr"):
+        pytest.skip("golden/metrics/maptr is absent")
+    return [frame[:2] for frame in load_maps("rand_mid")]
+
+
+@pytest.mark.golden
+def test_files_give_the_official_numbers(tmp_path, samples):
+    write(tmp_path, samples)
+    official = expected_cases("maptr")["rand_mid"]["chamfer"]
+    code, row = run(tmp_path)
+    assert code == 0
+    assert row["mAP"] == pytest.approx(official["mAP"], abs=1e-6)
+    assert [row[f"AP_{name}"] for name in CLASSES] == pytest.approx(official["AP_per_class"], abs=1e-6)
+
+
+DAMAGE = {
+    "missing": (lambda r: r.pop(1), "frames are missing from the predictions: s1"),
+    "twice": (lambda r: r.append(r[0]), "sample s0 is there twice"),
+    "class": (lambda r: r[1]["vectors"][0].update(cls_name="kerb"), r"sample s1: vectors\[0\].cls_name is 'kerb'"),
+    "NaN": (lambda r: r[1]["vectors"][0]["pts"].__setitem__(1, [0.0, float("nan")]),
+            r"sample s1: vectors\[0\].pts holds nan at \[1, 1\]"),
+    "flat": (lambda r: r[1]["vectors"][0].update(pts=[1, 2, 3]), r"vectors\[0\].pts has shape \(3,\)"),
+    "no score": (lambda r: r[1]["vectors"][0].pop("confidence_level"), "lacks the entry 'confidence_level'"),
+    "no token": (lambda r: r[1].pop("sample_token"), r"results\[1\] lacks the entry 'sample_token'"),
+}  # fmt: skip
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_damaged_results_are_named_to_the_sample(tmp_path, samples, capsys, damage):
+    change, message = DAMAGE[damage]
+    write(tmp_path, samples, change)
+    assert run(tmp_path)[0] == 2
+    said = capsys.readouterr().err
+    assert re.search(message, said), said

@@ -1,0 +1,62 @@
+"""MapTR's files: `nuscmap_results.json` and the ground truth that its evaluation writes (`*_map_anns_val.json`).
+
+Both are lists of {"sample_token", "vectors": [{"pts", "cls_name", "confidence_level" (results only)}]}, under "results"
+and under "GTs"; MapTR's other fields (`pts_num`, `type`) repeat these.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tflane_jax.errors import UserError
+from tflane_jax.fields import items, load_file, member, numbers
+from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
+
+
+def read_predictions(path: Path) -> dict[str, MapDetections]:
+    """Return the detections by sample token; raises UserError that names file, sample and field."""
+    frames = {}
+    for token, vectors, where in _samples(path, "results"):
+        scores = [
+            member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)
+        ]
+        lines = _lines(vectors, where, least=0)
+        frames[token] = MapDetections(*lines, numbers(scores, (len(scores),), f"{where}: confidence_level"))
+    return frames
+
+
+def read_truth(path: Path) -> dict[str, MapTruth]:
+    """Return the annotations by sample token; raises UserError that names file, sample and field."""
+    return {token: MapTruth(*_lines(vectors, where, least=2)) for token, vectors, where in _samples(path, "GTs")}
+
+
+def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
+    """Return token, vectors and place of every sample."""
+    samples, seen = [], set()
+    for i, record in enumerate(items(load_file(path), field, str(path))):
+        token = str(member(record, "sample_token", f"{path}: {field}[{i}]"))
+        where = f"{path}, sample {token}"
+        if token in seen:
+            raise UserError(f"{where} is there twice")
+        seen.add(token)
+        samples.append((token, items(record, "vectors", where), where))
+    return samples
+
+
+def _lines(vectors: Any, where: str, least: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return points and classes; `least` is the number of points that a line must have."""
+    points, classes = [], []
+    for i, vector in enumerate(vectors):
+        at = f"{where}: vectors[{i}]"
+        line = numbers(member(vector, "pts", at), (None, None), f"{at}.pts")
+        if line.shape[1] not in (2, 3) or len(line) < max(least, 1):
+            raise UserError(f"{at}.pts has shape {line.shape}, expected (n, 2) with n of at least {max(least, 1)}")
+        name = member(vector, "cls_name", at)
+        if name not in CLASSES:
+            raise UserError(f"{at}.cls_name is {name!r:.40}, expected one of {', '.join(CLASSES)}")
+        points.append(line[:, :2])
+        classes.append(CLASSES.index(name))
+    return points, np.array(classes, np.int64)

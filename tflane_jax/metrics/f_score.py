@@ -104,8 +104,8 @@ def _interpolated(points: Float[np.ndarray, "l n 3"], slope_type: np.dtype | typ
 
     step = np.diff(points, axis=1)
     run = step[..., :1]
-    # Vertices of one x (padding among them) have no slope: the plane passes through the first.
-    slope = step[..., 1:].astype(slope_type) / np.where(run > 0.0, run, 1.0).astype(slope_type) * (run > 0.0)
+    # Between vertices of one x (padding among them) lies no plane, or one through the first: any slope will do.
+    slope = step[..., 1:].astype(slope_type) / np.where(run > 0.0, run, 1.0).astype(slope_type)
     ahead = SAMPLES - points[lane, start, 0]
     return slope[lane, start] * ahead[..., None] + points[lane, start, 1:]
 

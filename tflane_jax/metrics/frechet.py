@@ -36,7 +36,7 @@ def pair_frechet(
     cells = (step**2).sum(0).reshape(n * m, len(i))
     if n == 1 or m == 1:
         return np.sqrt(cells.max(0))
-    # The least cost to reach the cells (row, diagonal - row), by row; inf outside the table.
+    # The least cost to reach the cells (row, diagonal - row) of the last two diagonals, by row; inf where none was yet.
     before, last = (np.full((n + 1, len(i)), np.inf) for _ in range(2))
     last[1] = cells[0]
     for diagonal in range(1, n + m - 1):
@@ -47,6 +47,5 @@ def pair_frechet(
         best = np.minimum(last[low + 1 : high + 2], last[low : high + 1])
         np.minimum(best, before[low : high + 1], out=best)
         before[low + 1 : high + 2] = np.maximum(best, here, out=best)
-        before[: low + 1] = np.inf
         before, last = last, before
     return np.sqrt(last[n])

@@ -144,7 +144,7 @@ def test_traffic_flow_can_be_limited(trained, tmp_path, capsys):
 def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
     out = tmp_path / "predictions"
     assert main(["predict", str(trained), "--count", "2", "--out", str(out), "--threshold", "0"]) == 0
-    assert {p.name for p in out.iterdir()} == {"predictions.npz", "predictions.json", "pictures.png"}
+    assert {p.name for p in out.iterdir()} == {"predictions.npz", "truth.npz", "predictions.json", "pictures.png"}
     arrays, plain = np.load(out / "predictions.npz"), json.loads((out / "predictions.json").read_text())
     assert arrays["points"].shape == (2, 6, POINTS, 3)
     assert arrays["timestamp_ns"].tolist() == [10**18, 10**18 + 4]

@@ -22,7 +22,8 @@ _FILES = """Protocols and their files:
   openlane-v2.1-centerline, openlane-v1.0-centerline
       PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
       dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
-      of about four: say which one you report. v2.1 is also that of devkit v1.1.
+      of about four: say which one you report. v2.1 is also that of devkit v1.1. Both sides may also be plain .npz or
+      .json files (docs/scoring.md), such as `tflane predict` writes; without traffic elements.
   openlane-v2.1-lane-segment, lanesegnet
       The same files of the lane-segment task (TIMESTAMP-ls.json). The first gives the devkit's OLUS, the second the
       mAP of the LaneSegNet and TF-Lane papers.
@@ -174,7 +175,8 @@ def _score(commands) -> None:
     parser.add_argument("protocol", metavar="PROTOCOL", help="see below")
     parser.add_argument("predictions", metavar="PREDICTIONS", type=Path, help="file of predictions")
     parser.add_argument("truth", metavar="GROUND_TRUTH", type=Path, help="file or folder of annotations")
-    parser.add_argument("--by", choices=("scene",), help="report parts as well")
+    parser.add_argument("--by", choices=("scene", "distance", "occlusion"),
+                        help="report parts as well; distance and occlusion: of centerlines")  # fmt: skip
     parser.add_argument("--bootstrap", type=int, metavar="N", default=0,
                         help="95 percent intervals from N draws of whole scenes (some 200 are enough)")  # fmt: skip
     parser.add_argument("--out", metavar="STEM", type=Path, default=Path("score"),

@@ -3,6 +3,9 @@
 predictions.npz, arrays over F frames and Q queries:
     points (F, Q, P, 3) metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1, [f, i, j] lane j
     continues lane i; scene (F,) and timestamp_ns (F,), where the frame comes from.
+truth.npz, the true lanes of the same frames over G slots:
+    points (F, G, P, 3), successor (F, G, G), valid (F, G), visibility (F, G), scene and timestamp_ns. `tflane score`
+    takes the two.
 
 predictions.json, lanes from `threshold` on, best first:
     {"run", "step", "seed", "threshold", "frames": [{"source", "scene", "timestamp_ns",
@@ -53,9 +56,9 @@ def run(options: argparse.Namespace) -> int:
     arrays = {"points": points, "scores": scores, "successor": successor}
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
-    temporary = options.out / ".predictions.tmp.npz"
-    np.savez_compressed(temporary, **arrays)
-    temporary.replace(options.out / "predictions.npz")
+    _save_arrays(options.out / "predictions.npz", arrays)
+    truth = {name: np.asarray(getattr(examples.lanes, name)) for name in ("points", "successor", "valid", "visibility")}
+    _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     frames = [
         _frame(info, points[i], scores[i], successor[i], options.threshold) for i, info in enumerate(infos)
     ]
@@ -66,7 +69,8 @@ def run(options: argparse.Namespace) -> int:
         titles=titles(dataset, indices), ground=source.example.sensor.grid.range, view=source.example.range,
         threshold=options.threshold,
     )  # fmt: skip
-    print(f"{len(indices)} frames written to {options.out}: predictions.npz, predictions.json, pictures.png")
+    print(f"{len(indices)} frames written to {options.out}: predictions.npz, truth.npz, predictions.json, "
+          "pictures.png")  # fmt: skip
     return 0
 
 
@@ -87,6 +91,12 @@ def _frame(
             for i, j in np.argwhere(links >= _SUCCESSOR_THRESHOLD).tolist()
         ],
     }
+
+
+def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    temporary = path.with_name(f".{path.stem}.tmp.npz")
+    np.savez_compressed(temporary, **arrays)  # pyright: ignore[reportArgumentType]
+    temporary.replace(path)
 
 
 def _make_folder(folder: Path) -> None:

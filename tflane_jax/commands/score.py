@@ -16,9 +16,14 @@ def run(options: argparse.Namespace) -> int:
     protocol = find_protocol(options.protocol)
     if options.bootstrap < 0:
         raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws, 0 for none")
+    if options.by not in (None, "scene", *protocol.groups):
+        raise UserError(f"{options.protocol} cannot be reported by {options.by}")
     predictions, truth = protocol.read_predictions(options.predictions), protocol.read_truth(options.truth)
     scored = score(predictions, truth, protocol.metrics, protocol.scene_of)
     rows = _rows(scored, options.by, options.bootstrap)
+    if (grouping := protocol.groups.get(options.by or "")) is not None:
+        grouped = score(predictions, truth, grouping, protocol.scene_of).total()
+        rows += [{"part": group, **values} for group, values in grouped.items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
     shown = [name for name in ("part", *protocol.columns, "frames") if any(name in row for row in rows)]

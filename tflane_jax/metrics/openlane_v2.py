@@ -7,6 +7,8 @@ specs/metrics.md sections 1 and 2; the groups by occlusion are this project's ow
 
 from __future__ import annotations
 
+import copy
+import itertools
 from collections.abc import Sequence
 from typing import Literal, Self
 
@@ -145,7 +147,7 @@ class GroupedCenterlineMetrics:
     ) -> None:
         self.version: Version = version
         self.occluded_below = occluded_below
-        self._metrics: dict[Group, CenterlineMetrics] = {group: CenterlineMetrics(version) for group in groups}
+        self._metrics: dict[str, CenterlineMetrics] = {group: CenterlineMetrics(version) for group in groups}
 
     @property
     def protocol(self) -> str:
@@ -162,15 +164,16 @@ class GroupedCenterlineMetrics:
         """Return an accumulator of the frames of both, in this order (neither changes)."""
         if self.protocol != other.protocol or self._metrics.keys() != other._metrics.keys():
             raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
-        merged = type(self)(tuple(self._metrics), occluded_below=self.occluded_below, version=self.version)
+        merged = copy.copy(self)
         merged._metrics = {group: metrics.merge(other._metrics[group]) for group, metrics in self._metrics.items()}
         return merged
 
-    def compute(self) -> dict[Group, dict[str, float]]:
+    def compute(self) -> dict[str, dict[str, float]]:
         """Return `CenterlineMetrics.compute` of each group."""
         return {group: metrics.compute() for group, metrics in self._metrics.items()}
 
-    def _members(self, group: Group, truth: LaneTruth, lanes: int) -> Bool[np.ndarray, " g"]:
+    def _members(self, group: str, truth: LaneTruth, lanes: int) -> Bool[np.ndarray, " g"]:
+        """Return which of the true lanes belong to a group other than `all`."""
         if truth.visibility is None:
             raise UserError("the truth has no visibility of its lanes: report the group 'all' only")
         visibility = np.asarray(truth.visibility)
@@ -178,3 +181,33 @@ class GroupedCenterlineMetrics:
             raise UserError(f"truth: visibility has shape {visibility.shape}, expected {(lanes,)}")
         occluded = visibility < self.occluded_below
         return occluded if group == "occluded" else ~occluded
+
+
+class DistanceCenterlineMetrics(GroupedCenterlineMetrics):
+    """The centerline metrics of all lanes and of those whose nearest vertex lies within a range of distances.
+
+    Lanes and detections are shared out as `GroupedCenterlineMetrics` says.
+
+    Args:
+        edges: distances in the ground plane at which one group ends and the next begins, metres, ascending.
+        version: of the topology score.
+    """
+
+    def __init__(self, edges: Sequence[float] = (10.0, 20.0, 30.0), *, version: Version = "v2.1") -> None:
+        super().__init__((), version=version)
+        limits = [0.0, *edges, np.inf]
+        self._ranges = {
+            f"from {low:g} m" if high == np.inf else f"{low:g} to {high:g} m": (low, high)
+            for low, high in itertools.pairwise(limits)
+        }
+        self._metrics = {group: CenterlineMetrics(version) for group in ("all", *self._ranges)}
+
+    @property
+    def protocol(self) -> str:
+        """Name and version, to stand above every table of these numbers."""
+        return f"OpenLane-V2 centerline {self.version}, by distance of a lane's nearest vertex"
+
+    def _members(self, group: str, truth: LaneTruth, lanes: int) -> Bool[np.ndarray, " g"]:
+        low, high = self._ranges[group]
+        distance = np.array([np.linalg.norm(np.asarray(line)[:, :2], axis=-1).min() for line in truth.points])
+        return (low <= distance) & (distance < high)

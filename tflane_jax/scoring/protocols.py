@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,11 @@ from typing import Any
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
-from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, DistanceCenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
 from tflane_jax.metrics.vector_map import CLASSES, Sampling, VectorMapMetrics
-from tflane_jax.scoring import maptr, openlane_v2, tusimple
+from tflane_jax.scoring import maptr, openlane_v2, plain, tusimple
 from tflane_jax.scoring.score import Accumulator
 
 
@@ -29,6 +29,8 @@ class ScoringProtocol:
         scene_of: from a frame to the name of its scene.
         metrics: returns a fresh accumulator.
         columns: of its table, in this order; others stay in the JSON file.
+        groups: from the name of a way to part lanes, "occlusion" or "distance", to a fresh accumulator that does; its
+            numbers come by group.
     """
 
     read_predictions: Callable[[Path], Mapping[Any, Any]]
@@ -36,15 +38,24 @@ class ScoringProtocol:
     scene_of: Callable[[Any], str]
     metrics: Callable[[], Accumulator]
     columns: tuple[str, ...]
+    groups: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
+
+
+def _plain_or(read_plain: Callable[[Path], Any], read_official: Callable[[Path], Any]) -> Callable[[Path], Any]:
+    return lambda path: (read_plain if path.suffix in plain.SUFFIXES else read_official)(path)
 
 
 def _centerline(version: Version) -> ScoringProtocol:
     return ScoringProtocol(
-        read_predictions=openlane_v2.read_predictions,
-        read_truth=openlane_v2.read_truth,
+        read_predictions=_plain_or(plain.read_predictions, openlane_v2.read_predictions),
+        read_truth=_plain_or(plain.read_truth, openlane_v2.read_truth),
         scene_of=lambda key: key.scene,
         metrics=partial(CenterlineMetrics, version),
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
+        groups={
+            "occlusion": partial(GroupedCenterlineMetrics, version=version),
+            "distance": partial(DistanceCenterlineMetrics, version=version),
+        },
     )
 
 
@@ -84,7 +95,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
     "openlane-v2.1-lane-segment": _lane_segment("OpenLane-V2", ("OLUS", "DET_l", "DET_a", "DET_t", "TOP_ll", "TOP_lt")),
     "lanesegnet": _lane_segment("LaneSegNet", ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "AP_boundary")),
     "openlane-v2-f-score": dataclasses.replace(
-        _centerline("v2.1"), metrics=CenterlineFScore, columns=("F_score", "F_recall", "F_precision")
+        _centerline("v2.1"), metrics=CenterlineFScore, columns=("F_score", "F_recall", "F_precision"), groups={}
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),

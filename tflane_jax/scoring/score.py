@@ -33,7 +33,7 @@ class Accumulator(Protocol):
         """Return an accumulator of the frames of both."""
         ...
 
-    def compute(self) -> dict[str, float]:
+    def compute(self) -> dict[str, Any]:
         """Return the numbers."""
         ...
 
@@ -49,11 +49,11 @@ class Scored:
         """Name and version, to stand above every table."""
         return next(iter(self.scenes.values())).protocol
 
-    def total(self) -> dict[str, float]:
+    def total(self) -> dict[str, Any]:
         """Return the numbers over all frames."""
         return _merged(list(self.scenes.values())).compute()
 
-    def by_scene(self) -> dict[str, dict[str, float]]:
+    def by_scene(self) -> dict[str, dict[str, Any]]:
         """Return the numbers of each scene."""
         return {name: metrics.compute() for name, metrics in self.scenes.items()}
 

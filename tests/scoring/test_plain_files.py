@@ -1,0 +1,145 @@
+"""`tflane score` on this project's own files, and lanes parted by distance and occlusion."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from tests.metrics.cases import hand_frame, random_frame
+from tflane_jax.cli import main
+from tflane_jax.metrics import CenterlineMetrics
+from tflane_jax.metrics.openlane_v2 import DistanceCenterlineMetrics
+
+PROTOCOL = "openlane-v2.1-centerline"
+SCENES = [("a", 1), ("a", 2), ("b", 1)]
+
+
+def json_frames():
+    """Return both sides of three random frames as plain records, and the numbers that they must give."""
+    predictions, truths, metrics = [], [], CenterlineMetrics()
+    for seed, (scene, time) in enumerate(SCENES):
+        detections, truth = random_frame(seed)
+        metrics.update(detections, truth)
+        name = {"scene": scene, "timestamp_ns": time}
+        predictions.append(name | {"points": [p.tolist() for p in detections.points],
+                                   "scores": detections.scores.tolist(), "successor": detections.successor.tolist()})
+        truths.append(name | {"points": [p.tolist() for p in truth.points], "visibility": truth.visibility.tolist(),
+                              "successor": truth.successor.astype(int).tolist()})  # fmt: skip
+    return predictions, truths, metrics.compute()
+
+
+def write_json(folder, predictions, truths):
+    (folder / "p.json").write_text(json.dumps({"frames": predictions}))
+    (folder / "t.json").write_text(json.dumps({"frames": truths}))
+
+
+def write_npz(folder, **changes):
+    """Write the hand-made frame three times; the truth has one empty slot that holds NaN."""
+    detections, truth = hand_frame()
+    name = {"scene": np.array([s for s, _ in SCENES]), "timestamp_ns": np.array([t for _, t in SCENES])}
+    three = lambda array: np.stack([np.asarray(array)] * 3)  # noqa: E731
+    predictions = name | {"points": three(detections.points), "scores": three(detections.scores),
+                          "successor": three(detections.successor)}  # fmt: skip
+    slot = lambda array, axes: np.pad(three(array).astype(float), [(0, 0), *[(0, 1)] * axes,  # noqa: E731
+                                      *[(0, 0)] * (np.ndim(array) - axes)], constant_values=np.nan)  # fmt: skip
+    valid = three([True] * len(truth.points) + [False])
+    truths = name | {"points": slot(truth.points, 1), "successor": slot(truth.successor, 2), "valid": valid,
+                     "visibility": slot(truth.visibility, 1)}  # fmt: skip
+    np.savez(folder / "p.npz", **(predictions | changes))
+    np.savez(folder / "t.npz", **truths)
+
+
+def run(folder, kind, *more):
+    out = folder / "out"
+    files = [str(folder / f"p.{kind}"), str(folder / f"t.{kind}")]
+    code = main(["score", PROTOCOL, *files, "--out", str(out), *more])
+    return code, json.loads(out.with_suffix(".json").read_text())["rows"] if code == 0 else []
+
+
+def test_json_gives_what_the_metric_gives(tmp_path):
+    predictions, truths, expected = json_frames()
+    write_json(tmp_path, predictions, truths)
+    code, rows = run(tmp_path, "json", "--by", "scene")
+    assert code == 0
+    assert {name: rows[0][name] for name in expected} == pytest.approx(expected)
+    assert [row["part"] for row in rows] == ["all", "a", "b"]
+
+
+def test_arrays_with_empty_slots_give_the_hand_made_numbers(tmp_path):
+    write_npz(tmp_path)
+    code, rows = run(tmp_path, "npz", "--by", "occlusion")
+    assert code == 0
+    assert [row["part"] for row in rows] == ["all", "occluded", "clear"]
+    # One frame's numbers by hand: tests/metrics/test_openlane_v2.py.
+    single = CenterlineMetrics()
+    single.update(*hand_frame())
+    assert rows[0]["TOP_ll"] == pytest.approx(single.compute()["TOP_ll"])
+    assert [row["lanes"] for row in rows] == [9, 6, 3]
+
+
+def test_distances_share_out_all_lanes(tmp_path):
+    write_npz(tmp_path)
+    rows = run(tmp_path, "npz", "--by", "distance")[1]
+    # A touches the ego, B begins 10 m ahead, C is 4 m aside.
+    lanes = {row["part"]: row["lanes"] for row in rows}
+    assert lanes == {"all": 9, "0 to 10 m": 6, "10 to 20 m": 3, "20 to 30 m": 0, "from 30 m": 0}
+
+
+def test_distance_groups_are_a_partition_and_merge():
+    frames = [random_frame(seed) for seed in range(4)]
+    whole, first, second = (DistanceCenterlineMetrics((5.0, 15.0)) for _ in range(3))
+    for i, frame in enumerate(frames):
+        whole.update(*frame)
+        (first if i < 2 else second).update(*frame)
+    total = whole.compute()
+    assert total["all"]["lanes"] == sum(values["lanes"] for group, values in total.items() if group != "all")
+    official = CenterlineMetrics()
+    for frame in frames:
+        official.update(*frame)
+    assert total["all"] == official.compute()
+    merged = first.merge(second).compute()
+    assert {group: values["DET_l"] for group, values in merged.items()} == pytest.approx(
+        {group: values["DET_l"] for group, values in total.items()}
+    )
+
+
+def test_no_visibility_is_named(tmp_path, capsys):
+    predictions, truths, _ = json_frames()
+    write_json(tmp_path, predictions, [{k: v for k, v in t.items() if k != "visibility"} for t in truths])
+    assert run(tmp_path, "json", "--by", "occlusion")[0] == 2
+    assert "no visibility" in capsys.readouterr().err
+
+
+def test_what_cannot_be_parted_is_named(tmp_path, capsys):
+    assert main(["score", "tusimple", "a", "b", "--by", "distance"]) == 2
+    assert "tusimple cannot be reported by distance" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scores": np.ones((3, 5))}, r"scores has shape \(3, 5\), expected \(3, 4\)"),
+        ({"points": np.ones((3, 4, 11))}, r"points has shape \(3, 4, 11\), expected \(frames"),
+        ({"scores": np.full((3, 4), 2.0)}, r"frame a at 1 ns: scores: number 0 is 2"),
+        ({"timestamp_ns": np.array([1, 1, 1])}, r"frame a at 1 ns is there twice"),
+        ({"scene": np.array(["a", "a", "c"])}, r"missing from the predictions: b at 1 ns"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_named(tmp_path, capsys, changes, message):
+    write_npz(tmp_path, **changes)
+    assert run(tmp_path, "npz")[0] == 2
+    said = capsys.readouterr().err
+    assert re.search(message, said), said
+
+
+def test_damaged_files_are_named(tmp_path, capsys):
+    write_npz(tmp_path)
+    whole = (tmp_path / "p.npz").read_bytes()
+    for damaged in (b"", b"no archive", whole[:200], whole[: len(whole) // 2]):
+        (tmp_path / "p.npz").write_bytes(damaged)
+        assert run(tmp_path, "npz")[0] == 2
+        assert "p.npz" in capsys.readouterr().err
+    np.savez(tmp_path / "p.npz", points=np.array([{"a": 1}], dtype=object))
+    assert run(tmp_path, "npz")[0] == 2
+    assert "no .npz file of plain arrays" in capsys.readouterr().err

@@ -1,0 +1,119 @@
+"""This project's own form of centerline files, for predictions of any framework: arrays in .npz, or .json.
+
+.npz, F frames of L lanes: `scene` (F,) and `timestamp_ns` (F,), which together name a frame; `points` (F, L, n, 3),
+metres, ego frame, in driving direction; `successor` (F, L, L), [f, i, j] lane j continues lane i; `scores` (F, L), 0 to
+1 (predictions); optional `valid` (F, L), false where a slot is empty, and `visibility` (F, L), 0 to 1 (ground truth).
+`tflane predict` writes both sides.
+
+.json: {"frames": [{"scene", "timestamp_ns", "points", "successor", "scores" or "visibility"}]}, the same by frame,
+where lines may have different numbers of points.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tflane_jax.errors import UserError
+from tflane_jax.fields import items, load_json, member, numbers, scores
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth
+
+SUFFIXES = (".npz", ".json")
+
+
+class PlainKey(NamedTuple):
+    """Which frame."""
+
+    scene: str
+    timestamp_ns: str
+
+    def __str__(self) -> str:
+        return f"{self.scene} at {self.timestamp_ns} ns"
+
+
+def read_predictions(path: Path) -> dict[PlainKey, LaneDetections]:
+    """Return the detections by frame; raises UserError that names file, frame and field."""
+    return {
+        key: LaneDetections(_lines(record, where), _column(record, "scores", where), _successor(record, where))
+        for key, record, where in _frames(path)
+    }
+
+
+def read_truth(path: Path) -> dict[PlainKey, LaneTruth]:
+    """Return the true lanes by frame; raises UserError that names file, frame and field."""
+    return {
+        key: LaneTruth(
+            _lines(record, where),
+            _successor(record, where) > 0.5,
+            visibility=_column(record, "visibility", where) if "visibility" in record else None,
+        )
+        for key, record, where in _frames(path)
+    }
+
+
+def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
+    records = _npz_records(path) if path.suffix == ".npz" else items(load_json(path), "frames", str(path))
+    seen = set()
+    for i, record in enumerate(records):
+        at = f"{path}: frames[{i}]"
+        key = PlainKey(str(member(record, "scene", at)), str(member(record, "timestamp_ns", at)))
+        if key in seen:
+            raise UserError(f"{path}: frame {key} is there twice")
+        seen.add(key)
+        yield key, record, f"{path}, frame {key}"
+
+
+def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
+    """Return the frames of a file of arrays, without the empty slots."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"{path} is no .npz file of plain arrays, or it is damaged ({error})") from None
+    points = member(arrays, "points", str(path))
+    if points.ndim != 4:
+        raise UserError(f"{path}: points has shape {points.shape}, expected (frames, lanes, points, 3)")
+    frames, lanes = points.shape[:2]
+    shapes = {"scene": (frames,), "timestamp_ns": (frames,), "successor": (frames, lanes, lanes)}
+    shapes |= dict.fromkeys(("scores", "visibility", "valid"), (frames, lanes))
+    for name, shape in shapes.items():
+        if name in arrays and arrays[name].shape != shape:
+            raise UserError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape}")
+    valid = arrays.pop("valid", np.ones((frames, lanes), bool)).astype(bool)
+    known = {name: array for name, array in arrays.items() if name in (*shapes, "points")}
+    for f in range(frames):
+        record: dict[str, Any] = {name: array[f] for name, array in known.items()}
+        for name in record.keys() & {"points", "scores", "visibility"}:
+            record[name] = record[name][valid[f]]
+        if "successor" in record:
+            record["successor"] = record["successor"][np.ix_(valid[f], valid[f])]
+        yield record
+
+
+def _lines(record: Any, where: str) -> list[np.ndarray]:
+    lines = []
+    for i, line in enumerate(items(record, "points", where)):
+        points = numbers(line, (None, 3), f"{where}: points[{i}]")
+        if len(points) == 0:
+            raise UserError(f"{where}: points[{i}] is empty: a line has at least one point")
+        lines.append(points)
+    return lines
+
+
+def _successor(record: Any, where: str) -> np.ndarray:
+    lanes = len(items(record, "points", where))
+    return numbers(member(record, "successor", where), (lanes, lanes), f"{where}: successor")
+
+
+def _column(record: Any, name: str, where: str) -> np.ndarray:
+    values = scores(items(record, name, where), f"{where}: {name}")
+    if len(values) != len(record["points"]):
+        raise UserError(f"{where}: {name} has {len(values)} numbers for {len(record['points'])} lanes")
+    return values

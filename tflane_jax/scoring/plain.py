@@ -71,8 +71,12 @@ def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
 def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
     """Return the frames of a file of arrays, without the empty slots."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with path.open("rb") as stream:
+            if not zipfile.is_zipfile(stream):
+                raise ValueError("no archive")  # numpy would take other kinds of files for one
+            stream.seek(0)
+            with np.load(stream, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}") from None
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:

@@ -30,7 +30,8 @@ from tflane_jax.training.evaluate import evaluate_lanes, scores
 from tflane_jax.training.run_folder import write_json
 from tflane_jax.training.runtime import configure_jax
 
-METRICS = ("all/DET_l", "occluded/DET_l", "clear/DET_l", "all/TOP_ll", "occluded/TOP_ll", "clear/TOP_ll")
+_GROUPS = ("all", "occluded", "clear")
+METRICS = tuple(f"{group}/{metric}" for metric in ("DET_l", "TOP_ll", "recall") for group in _GROUPS)
 
 
 @dataclass(frozen=True)

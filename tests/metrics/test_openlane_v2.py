@@ -91,6 +91,9 @@ def test_by_hand():
     assert result["TOP_lt"] == pytest.approx((2 + 3 + 3) / 12)
     parts = [18 / 33, 12 / 13, (4 / 18) ** 0.5, (8 / 12) ** 0.5]
     assert result["OLS"] == pytest.approx(np.mean(parts))
+    # One of three lanes is found at 1 m (A), two at 2 and 3 m.
+    assert [result[f"recall@{t}"] for t in LANE_THRESHOLDS] == pytest.approx([1 / 3, 2 / 3, 2 / 3])
+    assert result["recall"] == pytest.approx(5 / 9)
     assert (result["frames"], result["lanes"]) == (1, 3)
 
 

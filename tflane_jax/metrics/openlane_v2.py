@@ -83,6 +83,8 @@ class CenterlineMetrics:
         - `frames`, `lanes`: number of frames and of true lanes;
         - `DET_l` and, per threshold in metres, `DET_l@1.0`, `DET_l@2.0`, `DET_l@3.0` (1 if there is neither a true
           lane nor a detection, as officially);
+        - `recall` and `recall@1.0`, `recall@2.0`, `recall@3.0`: share of the true lanes that some detection takes,
+          whatever its score. Not official; it moves smoothly where DET_l, which rests on eleven recalls, jumps;
         - `TOP_ll`: 0 without true lanes in v2.1; missing in v1.0, whose official program stops with an error;
         - only if every frame had traffic elements on both sides: `DET_t` and, per attribute, `DET_t@0` ...
           `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is.
@@ -92,6 +94,9 @@ class CenterlineMetrics:
         precisions = [average_precision_11(scores, row, self._lanes) for row in hits]
         result["DET_l"] = float(np.mean(precisions))
         result |= {f"DET_l@{t}": value for t, value in zip(LANE_THRESHOLDS, precisions, strict=True)}
+        found = hits.sum(1) / max(self._lanes, 1)
+        result["recall"] = float(found.mean())
+        result |= {f"recall@{t}": float(value) for t, value in zip(LANE_THRESHOLDS, found, strict=True)}
         result |= self._topology("TOP_ll", self._lane_topology, self._lane_vertices)
         if self._frames_with_elements == 0:
             return result

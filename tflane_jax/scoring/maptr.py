@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_file, member, numbers
+from tflane_jax.fields import items, load_file, member, numbers, scores
 from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
 
 
@@ -20,11 +20,9 @@ def read_predictions(path: Path) -> dict[str, MapDetections]:
     """Return the detections by sample token; raises UserError that names file, sample and field."""
     frames = {}
     for token, vectors, where in _samples(path, "results"):
-        scores = [
-            member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)
-        ]
-        lines = _lines(vectors, where, least=0)
-        frames[token] = MapDetections(*lines, numbers(scores, (len(scores),), f"{where}: confidence_level"))
+        levels = [member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)]
+        lines = _lines(vectors, where, least=1)
+        frames[token] = MapDetections(*lines, scores(levels, f"{where}: confidence_level"))
     return frames
 
 
@@ -52,8 +50,8 @@ def _lines(vectors: Any, where: str, least: int) -> tuple[list[np.ndarray], np.n
     for i, vector in enumerate(vectors):
         at = f"{where}: vectors[{i}]"
         line = numbers(member(vector, "pts", at), (None, None), f"{at}.pts")
-        if line.shape[1] not in (2, 3) or len(line) < max(least, 1):
-            raise UserError(f"{at}.pts has shape {line.shape}, expected (n, 2) with n of at least {max(least, 1)}")
+        if line.shape[1] not in (2, 3) or len(line) < least:
+            raise UserError(f"{at}.pts has shape {line.shape}, expected (n, 2) with n of at least {least}")
         name = member(vector, "cls_name", at)
         if name not in CLASSES:
             raise UserError(f"{at}.cls_name is {name!r:.40}, expected one of {', '.join(CLASSES)}")

@@ -192,7 +192,7 @@ def test_root_is_taken_from_the_environment(tmp_path, monkeypatch):
 
 
 SCRIPT = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from tests.fakes import FakeConfig, FakeDataset
 from tflane_jax.datasets import cache, parallel
@@ -205,6 +205,8 @@ class Slow(FakeDataset):
         return super().example(index)
 
 if __name__ == "__main__":
+    # A shell that runs the tests in the background has its children ignore Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     print(cache.cached(Slow(FakeConfig(size=6)), root=Path(sys.argv[1]), workers=1, progress=False).folder)
 """
 

@@ -72,6 +72,14 @@ def numbers(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray
     return array
 
 
+def line_points(value: Any, where: str) -> np.ndarray:
+    """Return a line's points (n, 3), n >= 1."""
+    points = numbers(value, (None, 3), where)
+    if len(points) == 0:
+        raise UserError(f"{where} is empty: a line has at least one point")
+    return points
+
+
 def scores(values: Sequence[Any], where: str) -> np.ndarray:
     """Return confidences, which must lie between 0 and 1."""
     array = numbers(values, (len(values),), where)

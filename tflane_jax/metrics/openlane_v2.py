@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,8 +20,6 @@ from tflane_jax.metrics.centerline_matching import ATTRIBUTES, LANE_THRESHOLDS, 
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.topology import Version
-
-Group = Literal["all", "occluded", "clear"]
 
 
 class CenterlineMetrics:
@@ -145,7 +143,7 @@ class GroupedCenterlineMetrics:
 
     def __init__(
         self,
-        groups: Sequence[Group] = ("all", "occluded", "clear"),
+        groups: Sequence[str] = ("all", "occluded", "clear"),
         *,
         occluded_below: float = 0.5,
         version: Version = "v2.1",
@@ -199,13 +197,12 @@ class DistanceCenterlineMetrics(GroupedCenterlineMetrics):
     """
 
     def __init__(self, edges: Sequence[float] = (10.0, 20.0, 30.0), *, version: Version = "v2.1") -> None:
-        super().__init__((), version=version)
         limits = [0.0, *edges, np.inf]
         self._ranges = {
             f"from {low:g} m" if high == np.inf else f"{low:g} to {high:g} m": (low, high)
             for low, high in itertools.pairwise(limits)
         }
-        self._metrics = {group: CenterlineMetrics(version) for group in ("all", *self._ranges)}
+        super().__init__(("all", *self._ranges), version=version)
 
     @property
     def protocol(self) -> str:

@@ -121,8 +121,8 @@ def line_accuracy(
 
 def _checked(x: Float[np.ndarray, "l h"], rows: int, what: str) -> Float[np.ndarray, "l h"]:
     x = np.asarray(x, np.float64)
-    if x.size == 0:
-        return np.zeros((0 if x.ndim < 2 else len(x), rows)) if rows or x.ndim < 2 else x
+    if x.ndim and len(x) == 0:  # no lanes: an empty list does not know its rows
+        return np.zeros((0, rows))
     if x.ndim != 2 or x.shape[1] != rows:
         raise UserError(f"{what}: lanes have shape {x.shape}, expected (lanes, {rows}), one x for each row")
     if not np.isfinite(x).all():

@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_file, load_json, member, numbers, scores, whole_number
+from tflane_jax.fields import items, line_points, load_file, load_json, member, numbers, scores, whole_number
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.centerline_matching import ATTRIBUTES
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
@@ -209,10 +209,7 @@ def _lines(record: Any, things: str, field: str, where: str) -> list[np.ndarray]
     lines = []
     for i, thing in enumerate(items(record, things, where)):
         at = f"{where}: {things}[{i}]"
-        points = numbers(member(thing, field, at), (None, 3), f"{at}.{field}")
-        if len(points) == 0:
-            raise UserError(f"{at}.{field} is empty: a line has at least one point")
-        lines.append(points)
+        lines.append(line_points(member(thing, field, at), f"{at}.{field}"))
     return lines
 
 

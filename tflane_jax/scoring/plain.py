@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_json, member, numbers, scores
+from tflane_jax.fields import items, line_points, load_json, member, numbers, scores
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
 SUFFIXES = (".npz", ".json")
@@ -102,13 +102,7 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _lines(record: Any, where: str) -> list[np.ndarray]:
-    lines = []
-    for i, line in enumerate(items(record, "points", where)):
-        points = numbers(line, (None, 3), f"{where}: points[{i}]")
-        if len(points) == 0:
-            raise UserError(f"{where}: points[{i}] is empty: a line has at least one point")
-        lines.append(points)
-    return lines
+    return [line_points(line, f"{where}: points[{i}]") for i, line in enumerate(items(record, "points", where))]
 
 
 def _successor(record: Any, where: str) -> np.ndarray:

@@ -347,3 +347,66 @@ class Prediction:
 def stack_examples(examples: list[Any]) -> Any:
     """Stack pytrees of equal structure into one batch with a leading axis (numpy, host)."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *examples)
+
+
+@struct.dataclass
+class LaneLines:
+    """Lane lines in one front-view image: L lines of up to P points, from the horizon down.
+
+    Attributes:
+        points: (L, P, 2) column u and row v as shares of the image's width and height, v ascending.
+        point_valid: (L, P) the line has this point; what stands at the others is arbitrary.
+        valid: (L,).
+    """
+
+    points: Float[Array, "l p 2"]
+    point_valid: Bool[Array, "l p"]
+    valid: Bool[Array, " l"]
+
+    @classmethod
+    def empty(cls, capacity: int, points: int) -> LaneLines:
+        """Return a set with room for `capacity` lines of `points` points and none valid."""
+        return cls(
+            np.zeros((capacity, points, 2), np.float32), np.zeros((capacity, points), bool), np.zeros(capacity, bool)
+        )
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        l, p = self.points.shape[:2]
+        chex.assert_shape(self.points, (l, p, 2))
+        chex.assert_shape(self.point_valid, (l, p))
+        chex.assert_shape(self.valid, (l,))
+
+
+@struct.dataclass
+class RoadImage:
+    """One front-view image and the lane lines in it: an example of the monocular task.
+
+    Attributes:
+        image: (H, W, 3) uint8, RGB.
+        image_valid: (H, W) false where augmentation left no image.
+        lines: truth.
+    """
+
+    image: UInt8[Array, "h w 3"]
+    image_valid: Bool[Array, "h w"]
+    lines: LaneLines
+
+    def validate(self) -> None:
+        """Validate every part; raise AssertionError naming the first field that does not fit."""
+        h, w = self.image_valid.shape
+        chex.assert_shape(self.image, (h, w, 3))
+        self.lines.validate()
+
+
+@struct.dataclass
+class LaneCurvePrediction:
+    """Lane lines predicted by Q queries as parameters of the lane shape model (GTN paper, Eq. 7 and 8).
+
+    Attributes:
+        logits: (Q, 2) class logits (softmax), index 1 is a lane.
+        curves: (Q, 8) lower and upper end (alpha, beta: rows v), k'', f'', m'', n', b'', b''' in shares of the image.
+    """
+
+    logits: Float[Array, "*layers q 2"]
+    curves: Float[Array, "*layers q 8"]

@@ -86,7 +86,7 @@ def _finite_max(logits):
 
 def _log_total(logits):
     """Return log sum exp of each row; 0 for a row without keys, so that exp(logits - it) is 0 there."""
-    top = _finite_max(logits)
+    top = lax.stop_gradient(_finite_max(logits))
     total = jnp.exp(logits - top).sum(-1, keepdims=True)
     return jnp.where(total > 0, top + jnp.log(jnp.where(total > 0, total, 1.0)), 0.0)
 
@@ -210,10 +210,12 @@ class MultiHeadAttention(nn.Module):
     Attributes:
         dim: channels out, split over the heads.
         heads: number of heads.
+        dropout: share of attention weights that training drops.
     """
 
     dim: int
     heads: int
+    dropout: float = 0.0
 
     @nn.compact
     def __call__(
@@ -222,6 +224,8 @@ class MultiHeadAttention(nn.Module):
         key: Float[Array, "k c"],
         value: Float[Array, "k c"],
         mask: Mask | None = None,
+        *,
+        deterministic: bool = True,
     ) -> Float[Array, "q d"]:
         """Return the attended values, without residual; 0 for a query that may see no key.
 
@@ -241,7 +245,13 @@ class MultiHeadAttention(nn.Module):
         )
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "probabilities", attention_probabilities(q, k, mask))
-        attended = masked_attention(q, k, v, mask).swapaxes(0, 1).reshape(query.shape[0], self.dim)
+        if self.dropout > 0 and not deterministic and key.shape[0]:
+            drop = nn.Dropout(self.dropout, name="dropout")
+            weights = drop(attention_probabilities(q, k, mask).astype(v.dtype), deterministic=False)
+            heads = jnp.einsum("hqk,hke->hqe", weights, v)
+        else:
+            heads = masked_attention(q, k, v, mask)
+        attended = heads.swapaxes(0, 1).reshape(query.shape[0], self.dim)
         out = nn.Dense(self.dim, name="output")(attended)
         # The output's bias must not stand in for an attention over nothing.
         if key.shape[0] == 0:

@@ -1,0 +1,112 @@
+"""ResNet and its norm against PyTorch's numbers, in training and in inference."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import (
+    assert_gradients_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tflane_jax.convert.lstr import backbone_variables
+from tflane_jax.layers.batch_norm import BATCH_AXIS, BatchNorm
+from tflane_jax.layers.resnet import ResNet, ResNetConfig, StemConvolution
+
+BLOCKS = {18: ("basic", (2, 2, 2, 2)), 50: ("bottleneck", (3, 4, 6, 3))}
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("resnet*"), ids=case_id)
+def test_matches_pytorch(path):
+    case = load_module_case(path)
+    config = case.meta["config"]
+    block, blocks = BLOCKS[config["depth"]]
+    channels = tuple(config["base_channels"] * 2**i for i in range(4))
+    model = ResNet(ResNetConfig(blocks, channels, (1, 2, 2, 2), config["stem_channels"], block))
+    train = case.meta["mode"] == "train"
+
+    def scalar(torch_params, inputs):
+        variables = backbone_variables(torch_params)
+
+        def one(x):
+            return model.apply(variables, x[None], train=train, mutable=["batch_stats"])
+
+        images = inputs["x"].transpose(0, 2, 3, 1)
+        stages, statistics = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, None))(images)
+        outs = {f"c{i + 2}": stages[i][:, 0].transpose(0, 3, 1, 2) for i in config["out_indices"]}
+        return sum((case.weights[name] * out).sum() for name, out in outs.items()), (outs, statistics)
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (_, (outs, statistics)), (by_param, by_input) = step(case.params, case.inputs)
+    for name, out in outs.items():
+        # The reference's own distance to double precision, which is 3e-3 where ResNet-50's features reach 7,000.
+        noise = case.meta.get("max_abs_diff_vs_float64", {}).get(name, 0.0)
+        np.testing.assert_allclose(out, case.outputs[name], rtol=2e-5, atol=max(2e-5, noise), err_msg=name)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+    after = {name.removeprefix("bn_after/"): v for name, v in case.outputs.items() if name.startswith("bn_after/")}
+    assert bool(after) == train
+    ours, theirs = jax.tree.leaves_with_path(statistics), backbone_variables(after)
+    for place, value in ours if train else []:
+        wanted = theirs["batch_stats"]
+        for key in place[1:]:
+            wanted = wanted[key.key]
+        np.testing.assert_allclose(value, wanted, rtol=2e-5, atol=2e-5, err_msg=str(place))
+
+
+def one_norm(x, *, train, **options):
+    norm = BatchNorm(**options)
+    variables = norm.init(jax.random.key(0), x[0], train=train)
+    apply = lambda one: norm.apply(variables, one, train=train, mutable=["batch_stats"])  # noqa: E731
+    return jax.vmap(apply, axis_name=BATCH_AXIS, out_axes=(0, None))(x)
+
+
+def test_batch_statistics_are_those_of_the_stacked_batch():
+    x = np.random.default_rng(0).normal(2.0, 3.0, (4, 5, 6, 2)).astype(np.float32)
+    out, state = one_norm(jnp.asarray(x), train=True)
+    mean, variance = x.mean((0, 1, 2)), x.var((0, 1, 2))
+    np.testing.assert_allclose(out, (x - mean) / np.sqrt(variance + 1e-5), rtol=1e-4, atol=1e-5)
+    count = x.size // 2
+    np.testing.assert_allclose(state["batch_stats"]["mean"], 0.1 * mean, rtol=1e-5)
+    np.testing.assert_allclose(state["batch_stats"]["var"], 0.9 + 0.1 * variance * count / (count - 1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("options", [{"train": False}, {"train": True, "frozen": True}])
+def test_running_statistics_stay_without_training(options):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 2)).astype(np.float32))
+    out, state = one_norm(x, **options)
+    np.testing.assert_allclose(out, x / np.sqrt(1 + 1e-5), rtol=1e-6)
+    np.testing.assert_array_equal(state["batch_stats"]["mean"], np.zeros(2))
+    np.testing.assert_array_equal(state["batch_stats"]["var"], np.ones(2))
+
+
+def test_a_frozen_norm_has_nothing_to_learn():
+    variables = BatchNorm(frozen=True).init(jax.random.key(0), jnp.zeros((1, 3)), train=True)
+    assert "params" not in variables
+    assert set(variables["batch_stats"]) == {"mean", "var", "scale", "bias"}
+
+
+def test_one_value_does_not_divide_by_zero():
+    out, state = one_norm(jnp.full((1, 1, 2), 7.0), train=True)
+    np.testing.assert_array_equal(out, np.zeros((1, 1, 2)))
+    np.testing.assert_allclose(state["batch_stats"]["var"], [0.9, 0.9])
+
+
+def test_works_for_one_example_without_a_batch():
+    norm, x = BatchNorm(), jnp.asarray(np.random.default_rng(1).normal(size=(6, 2)).astype(np.float32))
+    variables = norm.init(jax.random.key(0), x, train=True)
+    out, _ = norm.apply(variables, x, train=True, mutable=["batch_stats"])
+    np.testing.assert_allclose(out.mean(0), [0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (2, 2), (1, 1)])
+def test_stem_is_a_convolution_of_stride_two_at_any_size(size):
+    stem = StemConvolution(4)
+    x = jnp.asarray(np.random.default_rng(2).normal(size=(2, *size, 3)).astype(np.float32))
+    variables = stem.init(jax.random.key(0), x)
+    plain = nn.Conv(4, (7, 7), (2, 2), [(3, 3), (3, 3)], use_bias=False)
+    np.testing.assert_allclose(stem.apply(variables, x), plain.apply(variables, x), rtol=1e-5, atol=1e-5)

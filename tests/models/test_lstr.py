@@ -1,0 +1,199 @@
+"""LSTR against the published weights, the reference's numbers and gradients, and the ten real TuSimple frames."""
+
+import json
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tests.shared import shared_root
+from tflane_jax.convert.lstr import convert_lstr
+from tflane_jax.layers.batch_norm import BATCH_AXIS
+from tflane_jax.layers.resnet import ResNetConfig
+from tflane_jax.layers.transformer import TransformerConfig
+from tflane_jax.losses.lane_curve import (
+    LaneCurveLossConfig,
+    LaneCurveTargets,
+    lane_curve_loss,
+    lane_weights,
+    matching_cost,
+)
+from tflane_jax.matching import match
+from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
+from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig, normalise
+from tflane_jax.scene import LaneCurvePrediction
+
+PUBLISHED = LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))
+pytestmark = pytest.mark.golden
+
+
+def of_kind(kind):
+    return [path for path in golden_modules("lstr_*") if path.stem.startswith(f"lstr_{kind}")]
+
+
+def tiny_config(config):
+    layer = TransformerConfig(config["heads"], config["ff"], dropout=0.0)
+    backbone = ResNetConfig(
+        tuple(config["layers"]), tuple(config["dims"]), stem_channels=config["dims"][0], frozen_stem_norm=True
+    )
+    encoder = TransformerEncoderConfig(config["enc"], layer)
+    return LstrConfig(backbone, config["attn"], encoder, config["dec"], layer, config["q"])
+
+
+@pytest.mark.parametrize("path", of_kind("tiny"), ids=case_id)
+def test_network_matches_the_reference(path):
+    case = load_module_case(path)
+    train = case.meta["mode"] == "train"
+    model = tiny_config(case.meta["config"]).build()
+
+    def scalar(torch_params, images):
+        variables = convert_lstr(torch_params).variables
+
+        def one(image, padded):
+            arguments = (image.transpose(1, 2, 0), padded[0] == 0)
+            return model.apply(variables, *arguments, train=train, mutable=["batch_stats", "intermediates"],
+                               rngs={"dropout": jax.random.key(0)})  # fmt: skip
+
+        prediction, state = jax.vmap(one, axis_name=BATCH_AXIS)(images, case.inputs["masks"])
+        layers = state["intermediates"]["encoder"]
+        attention = layers[max(layers)]["self_attention"]["probabilities"][0].mean(1)
+        outs = named(prediction) | {"enc_attn": attention}
+        return sum((case.weights[name] * out).sum() for name, out in outs.items()), (outs, state["batch_stats"])
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, (outs, statistics)), (by_param, by_input) = step(case.params, case.inputs["images"])
+    assert_outputs_close(outs | {"grad_scalar": total}, {k: v for k, v in case.outputs.items() if "bn_after" not in k})
+    assert_gradients_close(named_gradients(by_param, {"images": by_input}), case.gradients)
+    after = {name.removeprefix("bn_after/"): v for name, v in case.outputs.items() if name.startswith("bn_after/")}
+    wanted = convert_lstr(after).variables["batch_stats"]
+    statistics = dict(statistics["backbone"])
+    statistics.pop("bn1")
+    for place, value in jax.tree.leaves_with_path(statistics) if train else []:
+        expected = wanted["backbone"]
+        for key in place:
+            expected = expected[key.key]
+        np.testing.assert_allclose(value[0], expected, rtol=2e-5, atol=2e-5, err_msg=str(place))
+
+
+def named(prediction):
+    """Return a batch of predictions by the reference's names."""
+    names = [*(f"aux{i}." for i in range(prediction.logits.shape[1] - 1)), ""]
+    return {
+        f"{name}pred_{part}": getattr(prediction, part)[:, i]
+        for i, name in enumerate(names)
+        for part in ("logits", "curves")
+    }
+
+
+@cache
+def published_weights():
+    path = shared_root() / "golden" / "modules" / "lstr_pretrained_weights.npz"
+    return convert_lstr(load_module_case(path).params).variables
+
+
+@partial(jax.jit, static_argnums=0)
+def predict(config, variables, images, valid):
+    return jax.vmap(lambda image, v: config.build().apply(variables, image, v))(images, valid)
+
+
+@pytest.mark.parametrize("path", [p for p in of_kind("pretrained") if "weights" not in p.stem], ids=case_id)
+def test_published_weights_match_the_reference(path):
+    case = load_module_case(path)
+    if "images_x4_i8" in case.inputs:
+        images = jnp.asarray(case.inputs["images_x4_i8"].astype(np.float32) / 4).transpose(0, 2, 3, 1)
+        valid = jnp.asarray(case.inputs["masks_u8"][:, 0] == 0)
+    else:
+        rgb = jnp.asarray(case.inputs["resized_bgr_u8"][None, ..., ::-1])
+        valid = jnp.ones(rgb.shape[:3], bool)
+        images = normalise(rgb, valid)
+        strided = np.asarray(images).transpose(0, 3, 1, 2)[:, :, ::8, ::8]
+        np.testing.assert_allclose(strided, case.inputs["images_s"], rtol=1e-6, atol=1e-6)
+    prediction = predict(PUBLISHED, published_weights(), images, valid)
+    outs = named(prediction)
+    assert_outputs_close(outs, {name: case.outputs[name] for name in outs})
+
+    for b in range(len(images)):
+        one = jax.tree.map(lambda leaf, b=b: np.asarray(leaf)[b, -1], prediction)
+        found = detected(one)
+        np.testing.assert_array_equal(found, case.outputs["results"][b, :, 0] == 1)
+        for heights in (48, 56):
+            rows = case.inputs[f"h_samples_{heights}"]
+            ours = row_lanes(one, rows, height=720, width=1280).x
+            expected = case.outputs[f"b{b}.tusimple_x_h{heights}"]
+            np.testing.assert_array_equal(ours == -2, expected == -2)
+            np.testing.assert_allclose(ours, expected, atol=0.05)  # pixels
+        for height in (720, 360):
+            lanes = pixel_points(one, height=height, width=height * 16 // 9)
+            counts = case.outputs[f"b{b}.pixel_count_{height}"]
+            assert [len(lane) for lane in lanes] == counts.tolist()
+            for lane, expected, count in zip(lanes, case.outputs[f"b{b}.pixel_points_{height}"], counts, strict=True):
+                assert np.abs(lane - expected[:count]).max(initial=0) <= 1  # truncation on either side of an integer
+
+
+@pytest.mark.parametrize("path", of_kind("matcher"), ids=case_id)
+def test_costs_assignments_and_losses_match_the_reference(path):
+    case = load_module_case(path)
+    weights = {name: case.meta["weight_dict"][f"loss_{name}"] for name in ("ce", "curves", "lowers")}
+    config = LaneCurveLossConfig(weights["ce"], weights["curves"], weights["lowers"], shared_horizon=False)
+    targets = stacked_targets([case.inputs[f"targets.{b}"] for b in range(len(case.meta["counts"]))])
+    layers = ("aux0", "main")
+    prediction = LaneCurvePrediction(
+        *(jnp.stack([case.inputs[f"{layer}.pred_{part}"] for layer in layers], 1) for part in ("logits", "curves"))
+    )
+    lane_weight = lane_weights(targets, targets.valid)
+    cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, lane_weight)
+    assignment = match(cost, targets.valid[:, None])
+    for b, count in enumerate(case.meta["counts"]):
+        for i, layer in enumerate(layers):
+            expected = case.outputs[f"{layer}.cost.{b}"]
+            np.testing.assert_allclose(cost[b, i, :, :count], expected, rtol=1e-4, atol=1e-4)
+            by_target = np.argsort(case.outputs[f"{layer}.match_tgt.{b}"])
+            source = case.outputs[f"{layer}.match_src.{b}"][by_target]
+            np.testing.assert_array_equal(assignment.query[b, i, :count], source)
+
+    total, terms = lane_curve_loss(prediction, targets, config)
+    names = ("ce", "curves", "lowers", "uppers")
+    scale = {name: case.meta["weight_dict"][f"loss_{name}"] for name in names}
+    wanted = {name: scale[name] * case.outputs[f"loss_{name}"] for name in names}
+    np.testing.assert_allclose(terms["class"], wanted["ce"], rtol=2e-5)
+    np.testing.assert_allclose(terms["curve"], wanted["curves"], rtol=2e-5)
+    np.testing.assert_allclose(terms["extent"], wanted["lowers"] + wanted["uppers"], rtol=2e-5)
+    np.testing.assert_allclose(total, case.outputs["total"], rtol=2e-5)
+
+
+def stacked_targets(images):
+    """Return the reference's target rows, [1, lower, upper, xs, ys] with -1e5 for no point, as a padded batch."""
+    most, points = max(map(len, images)), (images[0].shape[1] - 3) // 2
+    rows = np.full((len(images), most, 3 + 2 * points), np.nan, np.float32)
+    for b, image in enumerate(images):
+        rows[b, : len(image)] = image
+    columns, heights = rows[..., 3 : 3 + points], rows[..., 3 + points :]
+    point_valid = columns >= 0
+    columns, heights = (np.where(point_valid, x, 0) for x in (columns, heights))
+    valid = ~np.isnan(rows[..., 0])
+    extent = np.where(valid[..., None], rows[..., 1:3], 0)
+    return LaneCurveTargets(*map(jnp.asarray, (columns, heights, point_valid, extent, valid)))
+
+
+def test_every_published_tensor_is_accounted_for():
+    path = shared_root() / "data" / "lstr" / "LSTR_500000.npz"
+    with np.load(path) as file:
+        state = {name: file[name] for name in file.files}
+    converted = convert_lstr(state)
+    assert [row["tensor"] for row in converted.table] == list(state)
+    model = PUBLISHED.build()
+    fresh = jax.eval_shape(model.init, jax.random.key(0), jnp.zeros((360, 640, 3)), jnp.ones((360, 640), bool))
+    shapes = lambda tree: jax.tree.map(lambda leaf: leaf.shape, tree)  # noqa: E731
+    assert shapes(converted.variables) == shapes(fresh)
+    assert sum(leaf.size for leaf in jax.tree.leaves(fresh["params"])) == 765_754
+    assert json.dumps(converted.table)

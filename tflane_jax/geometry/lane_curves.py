@@ -1,0 +1,137 @@
+"""The lane shape model of the LSTR family: a cubic on flat ground and its image in a pitched camera.
+
+GTN paper Eq. (5) to (8), with its misprints read as LSTR states them (Liu et al. 2020). On the ground, X to the right
+and Z ahead of the camera, a lane line is
+
+    X = k Z^3 + m Z^2 + n Z + b                                                                                 (5)
+
+and its image is a curve u(v), u to the right and v down from the principal point, in pixels or in any other unit:
+
+    u = k'' / (v - f'')^2 + m'' / (v - f'') + n' + b'' v - b'''                                                 (7)
+
+The paper reaches (7) by turning image points with the camera, (u, v, f) -> (u', v', f'), and leaving out the division
+by f' / f (Eq. 6, `tilted_image_curve`), which is right for small pitch only. Projecting the ground curve through a
+pinhole at any pitch gives the same family of curves, with other coefficients: `pinhole_image_curve`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from jaxtyping import Float
+
+from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
+
+
+class GroundCurve(NamedTuple):
+    """Coefficients of Eq. (5), each (*b): k 1/m^2, m 1/m, n 1, b metres."""
+
+    k: Any
+    m: Any
+    n: Any
+    b: Any
+
+
+class ImageCurve(NamedTuple):
+    """Coefficients of Eq. (7), each (*b), named k'', f'', m'', n', b'', b'''."""
+
+    k: Any
+    f: Any
+    m: Any
+    n: Any
+    b: Any
+    offset: Any
+
+
+def ground_offset(curve: GroundCurve, ahead: AnyArray) -> Any:
+    """Return X of the ground curve at distances Z ahead (metres): Eq. (5)."""
+    return ((curve.k * ahead + curve.m) * ahead + curve.n) * ahead + curve.b
+
+
+def flat_image_curve(curve: GroundCurve, focal: float, height: float) -> ImageCurve:
+    """Return the image curve of a level camera: u = k' / v^2 + m' / v + n' + b' v.
+
+    Args:
+        curve: on the ground.
+        focal: focal length, pixels.
+        height: of the camera above the ground, metres.
+    """
+    # u = f X / Z and v = f h / Z, so that Z = f h / v.
+    depth = focal * height
+    return ImageCurve(
+        k=focal * depth**2 * curve.k, f=0.0 * curve.k, m=focal * depth * curve.m,
+        n=focal * curve.n, b=curve.b / height, offset=0.0 * curve.b,
+    )  # fmt: skip
+
+
+def tilted_image_curve(flat: ImageCurve, focal: float, pitch: float) -> ImageCurve:
+    """Return the curve on the tilted image plane as the paper has it, Eq. (6) in the form of Eq. (7).
+
+    Args:
+        flat: of a level camera.
+        focal: focal length, pixels.
+        pitch: phi, angle between optical axis and ground, radians, positive where the horizon moves down the image.
+    """
+    xp = namespace(flat.k)
+    cos, sin, tan = xp.cos(pitch), xp.sin(pitch), xp.tan(pitch)
+    return ImageCurve(
+        k=flat.k * cos**2, f=focal * sin + 0.0 * flat.k, m=flat.m * cos, n=flat.n,
+        b=flat.b / cos, offset=flat.b * focal * tan,
+    )  # fmt: skip
+
+
+def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: float) -> ImageCurve:
+    """Return the exact image of a ground curve in a pinhole camera at any pitch; arguments as above.
+
+    A pixel's ray meets the ground at Z = h z / y and X = h u / y, where y = v cos(phi) - f sin(phi) is how fast it
+    falls and z = f cos(phi) + v sin(phi) = f / cos(phi) + y tan(phi) how fast it moves ahead. With (5),
+
+        u = (k h^2 z^3 / y^2) + (m h z^2 / y) + n z + b y / h,
+
+    and expanding z in powers of y gives (7) with y = cos(phi) (v - f'').
+    """
+    xp = namespace(curve.k)
+    cos, tan = xp.cos(pitch), xp.tan(pitch)
+    near, horizon = focal / cos, focal * tan
+    k, m = curve.k * height**2, curve.m * height
+    # Coefficients of y^-2, y^-1, 1 and y.
+    inverse_square = k * near**3
+    inverse = 3.0 * k * near**2 * tan + m * near**2
+    constant = 3.0 * k * near * tan**2 + 2.0 * m * near * tan + curve.n * near
+    linear = k * tan**3 + m * tan**2 + curve.n * tan + curve.b / height
+    return ImageCurve(
+        k=inverse_square / cos**2, f=horizon + 0.0 * k, m=inverse / cos, n=constant,
+        b=linear * cos, offset=linear * cos * horizon,
+    )  # fmt: skip
+
+
+def normalised_image_curve(curve: ImageCurve, centre: tuple[float, float], size: tuple[float, float]) -> ImageCurve:
+    """Return the same curve with rows and columns as shares of the image, counted from its top-left corner.
+
+    Args:
+        curve: in pixels from the principal point.
+        centre: principal point (u, v), pixels.
+        size: width and height, pixels.
+    """
+    (cu, cv), (width, height) = centre, size
+    return ImageCurve(
+        k=curve.k / height**2 / width, f=(curve.f + cv) / height, m=curve.m / height / width,
+        n=(curve.n + cu) / width, b=curve.b * height / width, offset=(curve.offset + curve.b * cv) / width,
+    )  # fmt: skip
+
+
+def curve_columns(
+    curves: Float[ArrayT, "*b 6"], rows: Float[AnyArray, "*#b r"], least: float = 1e-6
+) -> Float[ArrayT, "*b r"]:
+    """Return u(v) of curves (k'', f'', m'', n', b'', b''') at rows v: Eq. (7).
+
+    Args:
+        curves: coefficients, last axis.
+        rows: v, for each curve.
+        least: at rows nearer to the horizon f'' than this, the curve is continued as if they were this far below it.
+    """
+    xp = namespace(curves)
+    k, f, m, n, b, offset = (curves[..., i, None] for i in range(6))
+    below = rows - f
+    below = xp.where(xp.abs(below) < least, least, below)
+    return k / below**2 + m / below + n + b * rows - offset  # Eq. (7)

@@ -1,0 +1,74 @@
+"""Batch normalisation as PyTorch does it: running variances are unbiased, the normalisation itself is not."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+STATISTICS = "batch_stats"
+BATCH_AXIS = "batch"
+
+
+class BatchNorm(nn.Module):
+    """Normalise channels by the mean and variance over positions and, under `vmap`, over the named batch axis.
+
+    The collection `batch_stats` holds the running mean and variance, which inference uses (all examples of a batch
+    get the same update). Where there is no axis of the given name, the statistics are those of the one example.
+
+    Attributes:
+        frozen: never learn: scale and bias are constants in `batch_stats` too, and training uses the running
+            statistics (hosts with a pretrained backbone; the stem of the published LSTR).
+        axis_name: of the batch axis.
+        momentum: weight of the new statistics in the running ones (PyTorch's sense).
+        epsilon: added to the variance.
+    """
+
+    frozen: bool = False
+    axis_name: str = BATCH_AXIS
+    momentum: float = 0.1
+    epsilon: float = 1e-5
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*b c"], *, train: bool) -> Float[Array, "*b c"]:
+        """Return the normalised features; `train` takes the batch's own statistics and updates the running ones."""
+        channels = x.shape[-1]
+        mean = self.variable(STATISTICS, "mean", jnp.zeros, channels)
+        variance = self.variable(STATISTICS, "var", jnp.ones, channels)
+        if self.frozen:
+            scale = self.variable(STATISTICS, "scale", jnp.ones, channels).value
+            bias = self.variable(STATISTICS, "bias", jnp.zeros, channels).value
+        else:
+            scale = self.param("scale", nn.initializers.ones, (channels,))
+            bias = self.param("bias", nn.initializers.zeros, (channels,))
+        used_mean, used_variance = mean.value, variance.value
+        if train and not self.frozen:
+            used_mean, used_variance, count = self._batch_statistics(x)
+            if not self.is_initializing() and self.is_mutable_collection(STATISTICS):
+                unbiased = used_variance * (count / jnp.maximum(count - 1.0, 1.0))
+                mean.value += self.momentum * (used_mean - mean.value)
+                variance.value += self.momentum * (unbiased - variance.value)
+        factor = scale * lax.rsqrt(used_variance + self.epsilon)
+        return x * _like(factor, x) + _like(bias - used_mean * factor, x)
+
+    def _batch_statistics(self, x):
+        """Return mean, biased variance and number of values per channel, over the batch axis where there is one."""
+        axes = tuple(range(x.ndim - 1))
+        average = self._over_batch
+        count = average(jnp.float32(x.size // x.shape[-1]), lax.psum)
+        mean = average(x.mean(axes), lax.pmean)
+        variance = average(jnp.square(x - _like(mean, x)).mean(axes), lax.pmean)
+        return mean, variance, count
+
+    def _over_batch(self, value, reduce):
+        if self.is_initializing():
+            return value
+        try:
+            return reduce(value, self.axis_name)
+        except NameError:  # the axis is not bound: one example on its own
+            return value
+
+
+def _like(vector, x):
+    return vector.reshape((1,) * (x.ndim - 1) + vector.shape)

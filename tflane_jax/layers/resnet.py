@@ -1,0 +1,144 @@
+"""ResNet (He et al. 2016) with basic or bottleneck blocks, at any width (specs/modules.md sections 2.2 and 11).
+
+Strides stand on the 3x3 convolutions ("pytorch style"). Names follow torchvision's: conv1, bn1, layer1_0, ...
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from tflane_jax.layers.batch_norm import BatchNorm
+
+# PyTorch's default: uniform within 1 / sqrt(fan in).
+_INIT = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
+
+
+@dataclass(frozen=True)
+class ResNetConfig:
+    """Sizes of the backbone; the defaults are LSTR's reduced ResNet-18.
+
+    Attributes:
+        blocks: blocks of each stage.
+        channels: of each stage (before a bottleneck's expansion by 4).
+        strides: of each stage.
+        stem_channels: of the 7x7 convolution with stride 2.
+        block: "basic" (ResNet-18, 34) or "bottleneck" (50, 101, 152).
+        frozen_stem_norm: the norm behind the stem never learns. The published LSTR has it so, as the identity but for
+            its epsilon.
+        frozen_norms: no norm learns (fine-tuning from ImageNet with few images a step).
+    """
+
+    blocks: tuple[int, ...] = (1, 2, 2, 2)
+    channels: tuple[int, ...] = (16, 32, 64, 128)
+    strides: tuple[int, ...] = (1, 2, 2, 2)
+    stem_channels: int = 16
+    block: Literal["basic", "bottleneck"] = "basic"
+    frozen_stem_norm: bool = False
+    frozen_norms: bool = False
+
+
+class ResNet(nn.Module):
+    """A stack of views in, the features of every stage out."""
+
+    config: ResNetConfig
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "v h w c"], *, train: bool) -> list[Float[Array, "v hs ws cs"]]:
+        """Return the feature maps of the stages, finest first; the stem alone reduces height and width by 4."""
+        config = self.config
+        x = StemConvolution(config.stem_channels, name="conv1")(images)
+        x = nn.relu(BatchNorm(config.frozen_stem_norm or config.frozen_norms, name="bn1")(x, train=train))
+        x = nn.max_pool(x, (3, 3), (2, 2), [(1, 1), (1, 1)])  # pyright: ignore[reportArgumentType]
+        block = BasicBlock if config.block == "basic" else Bottleneck
+        outputs = []
+        stages = zip(config.blocks, config.channels, config.strides, strict=True)
+        for stage, (blocks, channels, stride) in enumerate(stages, 1):
+            for i in range(blocks):
+                name = f"layer{stage}_{i}"
+                x = block(channels, stride if i == 0 else 1, config.frozen_norms, name=name)(x, train=train)
+            outputs.append(x)
+        return outputs
+
+
+class StemConvolution(nn.Module):
+    """The 7x7 convolution with stride 2, without bias.
+
+    Where the image's sides are even, blocks of 2x2 pixels become channels first: the same sums, but with four times the
+    channels and half the size, which takes a quarter less time on a CPU.
+
+    Attributes:
+        channels: out.
+    """
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v ho wo co"]:
+        """Return the features."""
+        v, h, w, c = x.shape
+        kernel = self.param("kernel", _INIT, (7, 7, c, self.channels))
+        layout = ("NHWC", "HWIO", "NHWC")
+        if h % 2 or w % 2:
+            return lax.conv_general_dilated(x, kernel, (2, 2), [(3, 3), (3, 3)], dimension_numbers=layout)
+        # Output i sees rows 2i-3 to 2i+3: blocks i-2 to i+1, of which it leaves out the very first row.
+        x = x.reshape(v, h // 2, 2, w // 2, 2, c).swapaxes(2, 3).reshape(v, h // 2, w // 2, 4 * c)
+        kernel = jnp.pad(kernel, ((1, 0), (1, 0), (0, 0), (0, 0))).reshape(4, 2, 4, 2, c, self.channels)
+        kernel = kernel.swapaxes(1, 2).reshape(4, 4, 4 * c, self.channels)
+        return lax.conv_general_dilated(x, kernel, (1, 1), [(2, 1), (2, 1)], dimension_numbers=layout)
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions around a shortcut."""
+
+    channels: int
+    stride: int
+    frozen: bool
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
+        """Return the block's features."""
+        y = _conv(self.channels, 3, self.stride, "conv1")(x)
+        y = nn.relu(BatchNorm(self.frozen, name="bn1")(y, train=train))
+        y = _conv(self.channels, 3, 1, "conv2")(y)
+        y = BatchNorm(self.frozen, name="bn2")(y, train=train)
+        return nn.relu(y + _shortcut(x, self.channels, self.stride, self.frozen, train))
+
+
+class Bottleneck(nn.Module):
+    """A 3x3 convolution between two 1x1 ones, the last of which has four times the channels."""
+
+    channels: int
+    stride: int
+    frozen: bool
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
+        """Return the block's features."""
+        y = nn.relu(BatchNorm(self.frozen, name="bn1")(_conv(self.channels, 1, 1, "conv1")(x), train=train))
+        y = _conv(self.channels, 3, self.stride, "conv2")(y)
+        y = nn.relu(BatchNorm(self.frozen, name="bn2")(y, train=train))
+        y = BatchNorm(self.frozen, name="bn3")(_conv(4 * self.channels, 1, 1, "conv3")(y), train=train)
+        return nn.relu(y + _shortcut(x, 4 * self.channels, self.stride, self.frozen, train))
+
+
+def _shortcut(x: jax.Array, channels: int, stride: int, frozen: bool, train: bool) -> jax.Array:
+    """Return x, projected where the block changes its shape (inside the calling module's compact method)."""
+    if stride == 1 and x.shape[-1] == channels:
+        return x
+    projected = _conv(channels, 1, stride, "downsample_conv")(x)
+    return BatchNorm(frozen, name="downsample_bn")(projected, train=train)
+
+
+def _conv(channels: int, size: int, stride: int, name: str) -> nn.Conv:
+    pad = size // 2
+    return nn.Conv(
+        channels, (size, size), (stride, stride), [(pad, pad), (pad, pad)],
+        use_bias=False, kernel_init=_INIT, name=name,
+    )  # fmt: skip

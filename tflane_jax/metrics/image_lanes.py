@@ -1,0 +1,52 @@
+"""Predicted lane curves as what is measured, written and drawn: points in the image (specs/modules.md section 2.6)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.special import softmax
+
+from tflane_jax.geometry.lane_curves import curve_columns
+from tflane_jax.metrics.tusimple import RowLanes
+from tflane_jax.scene import LaneCurvePrediction
+
+_NO_POINT = -2.0  # TuSimple's mark of a row without a point
+
+
+def lane_scores(prediction: LaneCurvePrediction) -> Float[np.ndarray, " q"]:
+    """Return the probability that each query is a lane (numpy, one example, one layer)."""
+    return softmax(np.asarray(prediction.logits), -1)[..., 1]
+
+
+def detected(prediction: LaneCurvePrediction) -> Bool[np.ndarray, " q"]:
+    """Return which queries are lanes: those of which it is likelier than not."""
+    logits = np.asarray(prediction.logits)
+    return logits[..., 1] > logits[..., 0]
+
+
+def row_lanes(
+    prediction: LaneCurvePrediction, rows: Float[np.ndarray, " h"], *, height: float, width: float
+) -> RowLanes:
+    """Return the detected lanes as x at image rows, -2 outside each lane's extent; nothing is cut off at the borders.
+
+    Args:
+        prediction: one example, one layer, numpy.
+        rows: image rows, pixels.
+        height, width: of the image, pixels.
+    """
+    curves = np.asarray(prediction.curves)[detected(prediction)]
+    share = np.asarray(rows, np.float32) / height
+    columns = curve_columns(curves[:, 2:], share[None]) * width
+    inside = (share >= curves[:, :1]) & (share <= curves[:, 1:2])
+    return RowLanes(np.where(inside, columns, _NO_POINT))
+
+
+def pixel_points(
+    prediction: LaneCurvePrediction, *, height: int, width: int, count: int = 100
+) -> list[Int[np.ndarray, "p 2"]]:
+    """Return the pixels (column, row) of each detected lane for drawing, at `count` rows of its extent."""
+    curves = np.asarray(prediction.curves, np.float64)[detected(prediction)]
+    rows = np.linspace(curves[:, 0], curves[:, 1], count, axis=-1)
+    columns = curve_columns(curves[:, 2:], rows)
+    pixels = np.stack([columns * width, rows * height], -1).astype(np.int64)
+    return [lane[(lane[:, 0] > 0) & (lane[:, 0] < width)] for lane in pixels]

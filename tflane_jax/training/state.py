@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Int
 
 from tflane_jax.training.rng import stream
-from tflane_jax.training.task import Params, Task
+from tflane_jax.training.task import Params, Task, split_statistics
 
 
 @struct.dataclass
@@ -21,7 +21,7 @@ class TrainState:
 
     Attributes:
         step: () number of updates made.
-        params: the task's parameters.
+        params: the task's parameters, running statistics included.
         ema_params: their exponential moving average, which is what gets evaluated.
         opt_state: of the optimiser.
         key: () root key of the run; it never changes, streams are derived from it by name and step.
@@ -41,7 +41,7 @@ def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Arr
         step=jnp.zeros((), jnp.int32),
         params=params,
         ema_params=jax.tree.map(jnp.copy, params),  # the update donates its buffers, so none may be shared
-        opt_state=optimizer.init(params),
+        opt_state=optimizer.init(split_statistics(params)[0]),
         key=key,
     )
 
@@ -70,7 +70,8 @@ def with_params(state: TrainState, params: Params, optimizer: optax.GradientTran
     """Return the state of a run that starts from given parameters, as fine-tuning does (all seeds from the same)."""
     if state.step.ndim:
         params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.step.shape, *leaf.shape)), params)
-    opt_state = jax.vmap(optimizer.init)(params) if state.step.ndim else optimizer.init(params)
+    learned, _ = split_statistics(params)
+    opt_state = jax.vmap(optimizer.init)(learned) if state.step.ndim else optimizer.init(learned)
     params = jax.tree.map(jnp.array, params)
     ema_params = jax.tree.map(jnp.copy, params)
     return state.replace(params=params, ema_params=ema_params, opt_state=opt_state)  # pyright: ignore

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
 from tflane_jax.training.state import TrainState
-from tflane_jax.training.task import Params, Task
+from tflane_jax.training.task import Params, Task, split_statistics
 
 Metrics = dict[str, jax.Array]
 UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
@@ -81,10 +81,16 @@ def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
         key = stream(state.key, "dropout", state.step)
-        (loss, terms), grads = jax.value_and_grad(task.loss, has_aux=True)(state.params, batch, key)
+        learned, statistics = split_statistics(state.params)
+
+        def loss_of(learned: Params):
+            return task.loss(learned | statistics, batch, key)
+
+        (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(learned)
+        terms, statistics = split_statistics(aux)
         grad_norm = optax.tree.norm(grads)
-        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        params: Params = optax.apply_updates(state.params, updates)  # pyright: ignore[reportAssignmentType]
+        updates, opt_state = optimizer.update(grads, state.opt_state, learned)
+        params: Params = optax.apply_updates(learned, updates) | statistics  # pyright: ignore
         new = TrainState(
             step=state.step + 1,
             params=params,

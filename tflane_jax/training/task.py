@@ -8,6 +8,10 @@ import jax
 from jaxtyping import Array, Float
 
 Params = dict[str, Any]
+"""What a task predicts with. Its entry `STATISTICS`, where there is one, holds running statistics (those of batch
+norms), which no gradient reaches and no optimiser sees."""
+
+STATISTICS = "batch_stats"
 
 
 class Task(Protocol):
@@ -19,10 +23,19 @@ class Task(Protocol):
 
     def loss(
         self, params: Params, batch: Any, key: jax.Array
-    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        """Return the loss of a batch (leading axis on every leaf) and named terms to report; `key` is for dropout."""
+    ) -> tuple[Float[Array, ""], dict[str, Any]]:
+        """Return the loss of a batch (leading axis on every leaf) and named terms to report; `key` is for dropout.
+
+        A task with running statistics puts their new values among the terms, as the entry `STATISTICS`.
+        """
         ...
 
     def predict(self, params: Params, example: Any) -> Any:
         """Return the answer for one example: no batch axis, no dropout, no host callback."""
         ...
+
+
+def split_statistics(params: Params) -> tuple[Params, Params]:
+    """Return what is learned, and the statistics as a tree with the one entry `STATISTICS` or none."""
+    learned = {name: value for name, value in params.items() if name != STATISTICS}
+    return learned, {name: value for name, value in params.items() if name == STATISTICS}

@@ -15,7 +15,7 @@ from tests.golden import (
 )
 from tflane_jax.convert.lstr import backbone_variables
 from tflane_jax.layers.batch_norm import BATCH_AXIS, BatchNorm
-from tflane_jax.layers.resnet import ResNet, ResNetConfig, StemConvolution
+from tflane_jax.layers.resnet import ResNet, ResNetConfig, StemConvolution, max_pool
 
 BLOCKS = {18: ("basic", (2, 2, 2, 2)), 50: ("bottleneck", (3, 4, 6, 3))}
 
@@ -110,3 +110,16 @@ def test_stem_is_a_convolution_of_stride_two_at_any_size(size):
     variables = stem.init(jax.random.key(0), x)
     plain = nn.Conv(4, (7, 7), (2, 2), [(3, 3), (3, 3)], use_bias=False)
     np.testing.assert_allclose(stem.apply(variables, x), plain.apply(variables, x), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9), (1, 1)])
+def test_pooling_takes_the_largest_of_three_by_three(size):
+    x = jnp.asarray(np.random.default_rng(3).normal(size=(2, *size, 3)).astype(np.float32))
+    weights = np.random.default_rng(4).normal(size=max_pool(x).shape).astype(np.float32)
+    by_window = lambda x: nn.max_pool(x, (3, 3), (2, 2), [(1, 1), (1, 1)])  # noqa: E731
+    for pool in (max_pool, by_window):
+        out, pull = jax.vjp(pool, x)
+        if pool is max_pool:
+            ours, gradient = out, pull(weights)[0]
+    np.testing.assert_array_equal(ours, out)
+    np.testing.assert_allclose(gradient, pull(weights)[0], rtol=1e-6)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int
+
+Prepare = Callable[[Any, tuple[int, int]], Any]
+"""(a batch, numpy, and the run's seed with the step) -> the batch that the step sees: seeded augmentation."""
 
 
 def batch_indices(seed: int, step: int, examples: int, batch_size: int) -> Int[np.ndarray, " b"]:
@@ -32,7 +35,9 @@ def _permutation(seed: int, epoch: int, examples: int) -> Int[np.ndarray, " n"]:
     return order
 
 
-def batches(arrays: Any, seeds: Sequence[int], steps: range, batch_size: int) -> Generator[Any]:
+def batches(
+    arrays: Any, seeds: Sequence[int], steps: range, batch_size: int, prepare: Prepare | None = None
+) -> Generator[Any]:
     """Yield the batch of each step on the device, the next one being gathered in a thread meanwhile.
 
     Args:
@@ -40,13 +45,18 @@ def batches(arrays: Any, seeds: Sequence[int], steps: range, batch_size: int) ->
         seeds: of the run; each has an order of its own, and more than one gives batches a leading seed axis.
         steps: which steps.
         batch_size: examples of a step (and seed).
+        prepare: called in that thread.
     """
     examples = len(jax.tree.leaves(arrays)[0])
 
     def fetch(step: int) -> Any:
-        order = np.stack([batch_indices(seed, step, examples, batch_size) for seed in seeds])
-        order = order[0] if len(seeds) == 1 else order
-        return jax.device_put(jax.tree.map(lambda leaf: np.take(leaf, order, axis=0), arrays))
+        parts = []
+        for seed in seeds:
+            order = batch_indices(seed, step, examples, batch_size)
+            part = jax.tree.map(lambda leaf, order=order: np.take(leaf, order, axis=0), arrays)
+            parts.append(part if prepare is None else prepare(part, (seed, step)))
+        batch = parts[0] if len(seeds) == 1 else jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        return jax.device_put(batch)
 
     with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
         ahead = None

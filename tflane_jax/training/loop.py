@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
-from tflane_jax.training.batches import batches
+from tflane_jax.training.batches import Prepare, batches
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
@@ -103,7 +103,7 @@ class TrainingResult:
 def train(
     task: Task, arrays: Any, folder: Path, *, config: TrainingConfig, optim: OptimConfig,
     resolved: dict[str, Any], resolved_text: str = "", start: Start = "new",
-    evaluate: Evaluate | None = None, draw: Draw | None = None, progress: bool = True,
+    prepare: Prepare | None = None, evaluate: Evaluate | None = None, draw: Draw | None = None, progress: bool = True,
 ) -> TrainingResult:  # fmt: skip
     """Train a task on arrays in memory and leave everything about the run in `folder`.
 
@@ -115,6 +115,7 @@ def train(
         resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
         resolved_text: the same for people.
         start: see `run_folder.claimed`.
+        prepare: augments every batch, see `training.batches`.
         evaluate, draw: called at every evaluation.
         progress: show a bar with rate and time left.
 
@@ -154,7 +155,7 @@ def train(
         # Compile
         # =============================================================================================================
         began = time.perf_counter()
-        feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size)
+        feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size, prepare)
         batch = next(feed, None)
         if len(config.seeds) == 1:
             update = make_update_step(task, optim, config.steps)

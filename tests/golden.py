@@ -23,6 +23,7 @@ CLAIMS = {
     "metrics/resample": "tests/geometry/test_polylines.py",
     "metrics/tusimple": "tests/metrics/test_tusimple.py",
     "modules/custom_msda_decoder*": "tests/layers/test_deformable.py",
+    "modules/lr_schedules*": "tests/training/test_schedule.py",
     "modules/lstr_*": "tests/models/test_lstr.py",
     "modules/mha_*": "tests/layers/test_attention.py",
     "modules/mmdet_losses*": "tests/losses/test_costs.py",

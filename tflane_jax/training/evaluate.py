@@ -60,17 +60,6 @@ def evaluate_lanes(task: Task, params: Params, arrays: Example, batch_size: int 
     return metrics
 
 
-def scores(metrics: GroupedCenterlineMetrics) -> dict[str, float]:
-    """Return the metrics as "group/name", without counts: what a run records and checkpoints are chosen by."""
-    computed = metrics.compute()
-    return {
-        f"{group}/{name}": value
-        for group, values in computed.items()
-        for name, value in values.items()
-        if name not in ("frames", "lanes")
-    }
-
-
 def _lanes(answer: Prediction) -> LanePrediction:
     if answer.lanes is None:
         raise ValueError("this task predicts no lanes, so there is nothing to measure")

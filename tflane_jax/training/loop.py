@@ -19,11 +19,13 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.batches import Prepare, batches
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter
+from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config, write_json, write_text
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import TrainState, init_states, per_seed, with_params
@@ -124,6 +126,9 @@ def train(
             after the last good state was written.
     """
     _check(config)
+    adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
+    if adaptive is not None and evaluate is None:
+        raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
     with claimed(folder, start), StopRequest() as stop:
         # =============================================================================================================
         # Run folder
@@ -142,11 +147,13 @@ def train(
         optimizer = make_optimizer(optim, config.steps)
         state = init_states(task, optimizer, config.seeds, jax.tree.map(lambda leaf: leaf[0], arrays))
         window, metrics, seconds = _Window(), {}, 0.0
+        memories = [Memory() for _ in config.seeds]
         if start == "resume" and (written := checkpoints.steps()):
             manifest = checkpoints.manifest(written[-1])
             state = checkpoints.restore(manifest.step, state)
             window, seconds = _Window(**manifest.progress["window"]), manifest.progress["seconds"]
             metrics = manifest.progress["metrics"]
+            memories = [Memory(**memory) for memory in manifest.progress.get("cycles", [])] or memories
         elif config.init_from is not None:
             state = with_params(state, _params_of_run(Path(config.init_from), state), optimizer)
         first = step = int(np.max(state.step))
@@ -172,6 +179,8 @@ def train(
         # =============================================================================================================
         def save(evaluated: dict[str, float]) -> None:
             carried = {"window": asdict(window), "seconds": seconds, "metrics": metrics}
+            if adaptive is not None:
+                carried["cycles"] = [asdict(memory) for memory in memories]
             checkpoints.save(state, Manifest(step=step, config=resolved, metrics=evaluated, progress=carried))
 
         stepping, saved_step = 0.0, first
@@ -202,7 +211,14 @@ def train(
                     bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
                     window = _Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
-                    metrics = _evaluate(evaluate, state, step, config.seeds, writer)
+                    evaluations = [evaluate(params) for params in per_seed(state.ema_params, config.seeds)]
+                    writer.write(_seed_record(step, "val", {k: [e[k] for e in evaluations] for k in evaluations[0]}))
+                    metrics = {k: float(np.mean([e[k] for e in evaluations])) for k in evaluations[0]}
+                    if adaptive is not None:
+                        adapted = adapt(adaptive, state.opt_state, memories, evaluations, config.steps)
+                        opt_state, memories, cycles = adapted
+                        state = state.replace(opt_state=opt_state)  # pyright: ignore[reportAttributeAccessIssue]
+                        writer.write(_seed_record(step, "cycle", cycles))
                     save(metrics)
                     saved_step = step
                     if draw is not None:
@@ -228,14 +244,9 @@ def _check(config: TrainingConfig) -> None:
         raise UserError(f"training.seeds is {config.seeds}: give one or more different numbers")
 
 
-def _evaluate(
-    evaluate: Evaluate, state: TrainState, step: int, seeds: tuple[int, ...], writer: RecordWriter
-) -> dict[str, float]:
-    """Evaluate every seed, record the numbers and return their means over the seeds."""
-    every = [evaluate(params) for params in per_seed(state.ema_params, seeds)]
-    values = {name: [one[name] for one in every] for name in every[0]}
-    writer.write({"step": step, "split": "val"} | {k: v[0] if len(v) == 1 else v for k, v in values.items()})
-    return {name: float(np.mean(v)) for name, v in values.items()}
+def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:
+    """Return the record of values that every seed has one of."""
+    return {"step": step, "split": split} | {name: v[0] if len(v) == 1 else v for name, v in values.items()}
 
 
 def _params_of_run(folder: Path, state: TrainState) -> Params:

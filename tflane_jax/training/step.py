@@ -11,7 +11,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.training.rng import stream
-from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
 from tflane_jax.training.state import TrainState
 from tflane_jax.training.task import Params, Task, split_statistics
 
@@ -77,7 +77,7 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
 
 
 def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
-    optimizer, schedule = make_optimizer(optim, steps), make_schedule(optim, steps)
+    optimizer, rate = make_optimizer(optim, steps), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
         key = stream(state.key, "dropout", state.step)
@@ -101,7 +101,7 @@ def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
         metrics = {name if "/" in name else f"loss/{name}": value for name, value in terms.items()} | {
             "loss": loss,
             "grad_norm": grad_norm,
-            "learning_rate": schedule(state.step),
+            "learning_rate": rate(state.opt_state, state.step),
             "finite": jnp.isfinite(loss) & jnp.isfinite(grad_norm),
         }
         return new, metrics

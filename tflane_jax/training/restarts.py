@@ -1,0 +1,229 @@
+"""Cosine annealing with warm restarts (SGDR; GTN paper, section 2.2, Eq. 2) as a state that the optimiser carries.
+
+Eq. (2) as printed has the peak rate on its left and closes the cosine's parenthesis before pi. It is read as in the
+SGDR paper, which is what the text around it describes:
+
+    eta_t = eta_min + (eta_max - eta_min) (1 + cos(pi T_cur / T_i)) / 2
+
+from eta_max at T_cur = 0 to eta_min at T_cur = T_i. There the next cycle begins, which is `factor` times as long. Where
+a cycle stands is data, not a function of the step, so that one compiled update also serves cycles that are changed
+while they last (`training.adaptive`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.training.adaptive import AdaptiveConfig, Memory, check_adaptive, judge
+
+_LONGEST = 2**29  # steps; twice that still is an int32
+
+
+@dataclass(frozen=True)
+class RestartsConfig:
+    """Cycles of the learning rate.
+
+    A run of steps = warmup + cycle_steps (1 + factor + factor^2 + ...) ends at the end of a cycle.
+
+    Attributes:
+        cycle_steps: steps of the first cycle, T_0.
+        factor: length of a cycle relative to the one before it, at least 1.
+        floor: least learning rate, eta_min, relative to the peak, eta_max.
+        last_cycle: what happens to cycles at the end of the run. "cut": nothing, the run may end within one. "fit": a
+            cycle after which the next one could not be completed takes all the steps that are left.
+        adaptive: changes cycles by the validation loss; None leaves them as they are.
+    """
+
+    cycle_steps: int = 1000
+    factor: float = 2.0
+    floor: float = 0.0
+    last_cycle: Literal["cut", "fit"] = "cut"
+    adaptive: AdaptiveConfig | None = None
+
+
+class Cycle(NamedTuple):
+    """Where the learning rate stands; a leading axis on every leaf when several seeds train together.
+
+    Attributes:
+        count: updates made.
+        start: update with which the cycle began (it moves back where a cycle is extended).
+        length: its steps, T_i.
+        period: its steps before it was extended or fitted to the run; the next cycle has `factor` times these.
+        magnitude: eta_max - eta_min of this cycle, relative to that of the first.
+        number: of the cycle, from 0.
+    """
+
+    count: Int[Array, "*seeds"]
+    start: Int[Array, "*seeds"]
+    length: Int[Array, "*seeds"]
+    period: Int[Array, "*seeds"]
+    magnitude: Float[Array, "*seeds"]
+    number: Int[Array, "*seeds"]
+
+
+def check_restarts(config: RestartsConfig) -> None:
+    """Raise UserError where a setting cannot work."""
+    if not 1 <= config.cycle_steps < _LONGEST:
+        raise UserError(f"optim.restarts.cycle_steps is {config.cycle_steps}: it must be at least 1 (and below 2^29)")
+    if not config.factor >= 1.0:
+        raise UserError(f"optim.restarts.factor is {config.factor}: it must be at least 1")
+    if not 0.0 <= config.floor <= 1.0:
+        raise UserError(f"optim.restarts.floor is {config.floor}: it is relative to optim.lr, from 0 to 1")
+    if config.adaptive is not None:
+        check_adaptive(config.adaptive)
+
+
+def first_cycle(config: RestartsConfig, start: int, steps: int) -> Cycle:
+    """Return the state before the first update; the first cycle begins with update `start` of a run of `steps`."""
+    period = jnp.asarray(config.cycle_steps, jnp.int32)
+    return Cycle(
+        count=jnp.zeros((), jnp.int32),
+        start=jnp.asarray(start, jnp.int32),
+        length=fitted_length(config, start, period, steps),
+        period=period,
+        magnitude=jnp.ones((), jnp.float32),
+        number=jnp.zeros((), jnp.int32),
+    )
+
+
+def fitted_length(
+    config: RestartsConfig, start: Int[ArrayLike, ""], period: Int[Array, ""], steps: int
+) -> Int[Array, ""]:
+    """Return the steps of a cycle of `period` steps that begins with update `start` of a run of `steps`."""
+    if config.last_cycle == "cut":
+        return period
+    ends = start + period + next_period(config, period)
+    return jnp.where(ends <= steps, period, jnp.maximum(steps - start, 1)).astype(jnp.int32)
+
+
+def next_period(config: RestartsConfig, period: Int[Array, ""]) -> Int[Array, ""]:
+    """Return the steps of the cycle that follows one of `period` steps: T_{i+1} = factor T_i, rounded."""
+    return jnp.minimum(jnp.round(period * config.factor), _LONGEST).astype(jnp.int32)
+
+
+def current_cycle(config: RestartsConfig, cycle: Cycle, steps: int) -> Cycle:
+    """Return the cycle of the next update: a new one where `cycle` has ended.
+
+    A cycle is replaced no earlier than that, so that an evaluation at its very end still finds it.
+    """
+    period = next_period(config, cycle.period)
+    new = Cycle(
+        count=cycle.count,
+        start=cycle.count,
+        length=fitted_length(config, cycle.count, period, steps),
+        period=period,
+        magnitude=cycle.magnitude,
+        number=cycle.number + 1,
+    )
+    ended = cycle.count - cycle.start >= cycle.length
+    return jax.tree.map(lambda after, before: jnp.where(ended, after, before), new, cycle)
+
+
+def relative_rate(config: RestartsConfig, cycle: Cycle) -> Float[Array, ""]:
+    """Return the learning rate of the next update relative to the first peak, Eq. (2); 1 before the first cycle."""
+    elapsed = jnp.maximum(cycle.count - cycle.start, 0)
+    return config.floor + (1.0 - config.floor) * cycle.magnitude * half_cosine(elapsed, cycle.length)
+
+
+def half_cosine(elapsed: ArrayLike, length: ArrayLike) -> Float[Array, "..."]:
+    """Return (1 + cos(pi elapsed / length)) / 2 for counts, precise relative to its value also near its end at 0."""
+    # The same as sin^2(pi/2 (1 - elapsed / length)): no difference of nearly equal numbers, and exactly 1 and 0 at
+    # the two ends.
+    return jnp.sin(jnp.pi / 2 * (jnp.subtract(length, elapsed) / jnp.asarray(length))) ** 2
+
+
+def _is_cycle(node: Any) -> bool:
+    return isinstance(node, Cycle)
+
+
+def cycle_of(opt_state: Any) -> Cycle:
+    """Return the cycle in the state of an optimiser that restarts."""
+    (cycle,) = filter(_is_cycle, jax.tree.leaves(opt_state, is_leaf=_is_cycle))
+    return cycle
+
+
+def with_cycle(opt_state: Any, cycle: Cycle) -> Any:
+    """Return an optimiser's state with another cycle (numpy) in it."""
+    new = jax.tree.map(jnp.asarray, cycle)
+    return jax.tree.map(lambda node: new if _is_cycle(node) else node, opt_state, is_leaf=_is_cycle)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Cycles that follow the evaluations: on the host, between two updates.
+
+
+def adapt(
+    config: RestartsConfig, opt_state: Any, memories: Sequence[Memory], evaluations: Sequence[Mapping[str, float]],
+    steps: int,
+) -> tuple[Any, list[Memory], dict[str, list[Any]]]:  # fmt: skip
+    """Judge the cycle of every seed by its evaluation and change those that are to be changed.
+
+    Args:
+        config: with `adaptive`.
+        opt_state: of the optimiser, with a leading seed axis where there are several seeds.
+        memories, evaluations: one per seed.
+        steps: of the run.
+
+    Returns:
+        The optimiser's new state (same shapes and types: no compilation), the new memories, and the cycles as they
+        are now, for the record: `number`, `length`, `magnitude` and `extensions`, one value per seed.
+
+    Raises:
+        UserError: the evaluation has no number of that name.
+    """
+    adaptive = config.adaptive
+    assert adaptive is not None
+    for evaluation in evaluations:
+        if adaptive.metric not in evaluation:
+            raise UserError(f"optim.restarts.adaptive.metric is {adaptive.metric}, which the evaluation does not give: "
+                            f"choose one of {', '.join(sorted(evaluation))}")  # fmt: skip
+    cycle: Any = jax.device_get(cycle_of(opt_state))
+    count, start, length, number = (np.atleast_1d(v) for v in (cycle.count, cycle.start, cycle.length, cycle.number))
+    judged = [
+        judge(
+            adaptive, memory, evaluation[adaptive.metric],
+            number=int(number[i]), elapsed=int(count[i] - start[i]), length=int(length[i]), left=int(steps - count[i]),
+        )
+        for i, (memory, evaluation) in enumerate(zip(memories, evaluations, strict=True))
+    ]  # fmt: skip
+    memories, verdicts = [memory for memory, _ in judged], np.array([verdict for _, verdict in judged])
+    for verdict, change in (
+        ("extend", extended_cycle(cycle, adaptive.extend, steps)),
+        ("restart", restarted_cycle(config, cycle, adaptive.shrink, steps)),
+    ):
+        chosen = np.reshape(verdicts == verdict, cycle.count.shape)
+        cycle = jax.tree.map(lambda after, before, chosen=chosen: np.where(chosen, after, before), change, cycle)
+    values = {name: np.atleast_1d(getattr(cycle, name)).tolist() for name in ("number", "length", "magnitude")}
+    return with_cycle(opt_state, cycle), memories, values | {"extensions": [m.extensions for m in memories]}
+
+
+def extended_cycle(cycle: Any, extend: float, steps: int) -> Any:
+    """Return a cycle (numpy) whose rest takes 1 + `extend` times as long, at most up to the end of the run.
+
+    Time is stretched also for what has passed, so that the learning rate is the same after the change as before it (up
+    to the rounding to whole steps).
+    """
+    elapsed = cycle.count - cycle.start
+    left = cycle.length - elapsed
+    longer = np.maximum(np.minimum(np.round(left * (1.0 + extend)), steps - cycle.count), left)
+    stretched = np.minimum(np.round(elapsed * (longer / np.maximum(left, 1))), _LONGEST)
+    start, length = cycle.count - stretched, stretched + longer
+    return cycle._replace(start=start.astype(np.int32), length=length.astype(np.int32))
+
+
+def restarted_cycle(config: RestartsConfig, cycle: Any, shrink: float, steps: int) -> Any:
+    """Return the cycle (numpy) that begins now in place of one that is stuck: of the same period, with less height."""
+    return cycle._replace(
+        start=cycle.count,
+        length=np.asarray(fitted_length(config, cycle.count, cycle.period, steps)),
+        magnitude=cycle.magnitude * np.float32(shrink),
+        number=cycle.number + np.int32(1),
+    )

@@ -25,6 +25,7 @@ CLAIMS = {
     "modules/custom_msda_decoder*": "tests/layers/test_deformable.py",
     "modules/lr_schedules*": "tests/training/test_schedule.py",
     "modules/lstr_*": "tests/models/test_lstr.py",
+    "modules/lstr_preprocess*": "tests/test_images.py",
     "modules/mha_*": "tests/layers/test_attention.py",
     "modules/mmdet_losses*": "tests/losses/test_costs.py",
     "modules/mmdet_match_costs*": "tests/losses/test_costs.py",

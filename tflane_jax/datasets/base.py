@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.scene import Example
+from tflane_jax.scene import Example, RoadImage
 from tflane_jax.world.bev_sensor import BevSensorConfig
 
 
@@ -67,8 +67,8 @@ class FrameInfo:
     global_from_ego: np.ndarray
 
 
-class Dataset(Protocol):
-    """Indexed examples as numpy arrays without a batch axis, all of one shape."""
+class Source(Protocol):
+    """Indexed examples of one task as numpy arrays without a batch axis, all of one shape."""
 
     name: str
 
@@ -76,10 +76,18 @@ class Dataset(Protocol):
         """Return the number of examples."""
         ...
 
-    def example(self, index: int) -> Example:
+    def example(self, index: int) -> Example | RoadImage:
         """Return one example; the same index always gives the same bits."""
         ...
 
     def info(self, index: int) -> FrameInfo:
         """Return where an example comes from, without making it."""
+        ...
+
+
+class Dataset(Source, Protocol):
+    """Indexed examples of what is around the vehicle."""
+
+    def example(self, index: int) -> Example:
+        """Return one example; the same index always gives the same bits."""
         ...

@@ -1,6 +1,6 @@
 """Datasets built once and kept on disk as memory-mappable arrays.
 
-An entry is a folder with one .npy file per leaf of `Example` and an `index.json`. Its name carries a
+An entry is a folder with one .npy file per leaf of an example and an `index.json`. Its name carries a
 fingerprint of the dataset's configuration and of the code that makes examples, so that a changed world never
 reads stale examples. Entries appear whole or not at all: they are built beside their place under a lock and
 renamed into it.
@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 
 import tflane_jax
-from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.base import FrameInfo, Source
 from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
 from tflane_jax.errors import UserError
@@ -36,7 +36,7 @@ from tflane_jax.scene import Example
 _SOURCES = ("scene.py", "logs.py", "geometry", "world", "datasets")
 
 
-class Cacheable(Dataset, Protocol):
+class Cacheable(Source, Protocol):
     """A dataset that its configuration describes completely, and that can be sent to worker processes
     (pickle)."""
 
@@ -93,7 +93,7 @@ def fingerprint(dataset: Cacheable) -> str:
     return digest.hexdigest()
 
 
-def _kind(dataset: Dataset) -> str:
+def _kind(dataset: Source) -> str:
     return f"{type(dataset).__module__}.{type(dataset).__qualname__}"
 
 
@@ -165,19 +165,19 @@ class CachedDataset:
             global_from_ego=np.array(self._arrays["info.global_from_ego"][index]),
         )
 
-    def arrays(self, parts: Collection[str] | None = None) -> Mapping[str, np.ndarray]:
-        """Read the leaves of all examples, (len, ...) each, into memory and check them against their
-        checksums.
+    def arrays(self, parts: Collection[str] | None = None, *, mapped: bool = False) -> Mapping[str, np.ndarray]:
+        """Read the leaves of all examples, (len, ...) each, and check them against their checksums.
 
         Args:
-            parts: fields of `Example` to read, default all.
+            parts: fields of the examples to read, default all.
+            mapped: leave them on disk, as read-only memory maps, instead of holding them in memory.
 
         Raises UserError where the content of a file has changed since it was written.
         """
         read = {}
         for name, array in self._leaves().items():
             if parts is None or name.split(".")[0] in parts:
-                read[name] = np.array(array)
+                read[name] = array.view(np.ndarray) if mapped else np.array(array)
                 if zlib.crc32(read[name].reshape(-1).view(np.uint8)) != self._index["leaves"][name]["crc32"]:
                     raise UserError(
                         f"{leaf_path(self.folder, name)} is corrupt: delete {self.folder} and run again"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from tflane_jax.scene import (
     Areas,
     Example,
     LaneGraph,
+    LaneLines,
     MarkerObservations,
+    RoadImage,
     SdMap,
     TrafficElements,
     TrafficFlow,
@@ -29,15 +32,20 @@ PARTS = {
 }
 
 
-def example_leaves(example: Example) -> dict[str, np.ndarray]:
+# The same of an example of the monocular task.
+IMAGE_PARTS = {"lines": LaneLines}
+
+
+def example_leaves(example: Example | RoadImage) -> dict[str, np.ndarray]:
     """Return the example's arrays by name in the order of the fields; a part that is None has no entry."""
+    parts = IMAGE_PARTS if isinstance(example, RoadImage) else PARTS
     leaves = {}
-    for field in fields(Example):
+    for field in fields(example):
         value = getattr(example, field.name)
         if value is None:
             continue
-        if field.name in PARTS:
-            for inner in fields(PARTS[field.name]):
+        if field.name in parts:
+            for inner in fields(parts[field.name]):
                 leaves[f"{field.name}.{inner.name}"] = np.asarray(getattr(value, inner.name))
         else:
             leaves[field.name] = np.asarray(value)
@@ -46,13 +54,22 @@ def example_leaves(example: Example) -> dict[str, np.ndarray]:
 
 def example_from_leaves(leaves: Mapping[str, np.ndarray]) -> Example:
     """Return the example whose arrays these are, with or without leading axes; absent parts become None."""
-    parts = {}
-    for field in fields(Example):
-        container = PARTS.get(field.name)
+    return Example(**_gathered(Example, PARTS, leaves))
+
+
+def image_from_leaves(leaves: Mapping[str, np.ndarray]) -> RoadImage:
+    """Return the road image whose arrays these are, with or without leading axes; absent parts become None."""
+    return RoadImage(**_gathered(RoadImage, IMAGE_PARTS, leaves))
+
+
+def _gathered(kind: type, containers: Mapping[str, type], leaves: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    parts: dict[str, Any] = {}
+    for field in fields(kind):
+        container = containers.get(field.name)
         if container is None:
             parts[field.name] = leaves.get(field.name)
             continue
         inner = {f.name: leaves.get(f"{field.name}.{f.name}") for f in fields(container)}
         absent = all(value is None for value in inner.values())
         parts[field.name] = None if absent else container(**inner)
-    return Example(**parts)
+    return parts

@@ -1,0 +1,202 @@
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from tests.shared import shared_path
+from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.tusimple import ROWS, TuSimpleConfig, TuSimpleDataset, lane_lines, load_road_images, row_lanes
+from tflane_jax.errors import UserError
+from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+
+ROWS_48 = ROWS[8:]
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Two label files of two frames each, 48 and 56 heights, and their images."""
+    files = {"label_data_0313.json": ROWS_48, "label_data_0531.json": ROWS}
+    for f, (name, rows) in enumerate(files.items()):
+        records = []
+        for i in range(2):
+            raw = f"clips/{f}/{i}/20.jpg"
+            (tmp_path / raw).parent.mkdir(parents=True)
+            image = np.full((720, 1280, 3), 40 * (2 * f + i), np.uint8)
+            assert cv2.imwrite(str(tmp_path / raw), image)
+            present = [-2] * 5 + list(range(100, 100 + len(rows) - 5))
+            lanes = [[x + 500 if x > 0 else x for x in present], present, [-2] * len(rows)]
+            records.append({"raw_file": raw, "lanes": lanes, "h_samples": rows.tolist()})
+        (tmp_path / name).write_text("".join(json.dumps(record) + "\n" for record in records))
+    return tmp_path
+
+
+def dataset_of(root, **changes):
+    return TuSimpleDataset(TuSimpleConfig(str(root), **changes))
+
+
+def test_labels_of_48_heights_stand_in_the_56_rows(root):
+    dataset = dataset_of(root)
+    assert [dataset.raw_file(i) for i in (0, 3)] == ["clips/0/0/20.jpg", "clips/1/1/20.jpg"]
+    for index, first in ((0, 13), (2, 5)):
+        example = dataset.example(index)
+        example.validate()
+        assert dataset.info(index).scene == dataset.raw_file(index)
+        assert example.image.shape == (360, 640, 3)
+        assert np.abs(example.image.astype(int) - 40 * index).max() <= 1
+        assert example.image_valid.all()
+        lines = example.lines
+        np.testing.assert_array_equal(lines.valid, [True, True] + [False] * 6)  # the all -2 lane is no line
+        np.testing.assert_array_equal(lines.point_valid[:2], np.broadcast_to(np.arange(56) >= first, (2, 56)))
+        assert not lines.point_valid[2:].any()
+        np.testing.assert_allclose(lines.points[..., 1] * 720, np.broadcast_to(ROWS, (8, 56)), rtol=1e-6)
+        left = 100 + np.arange(56 - first)
+        np.testing.assert_allclose(lines.points[0, first:, 0] * 1280, left, rtol=1e-6)  # sorted from left to right
+        np.testing.assert_allclose(lines.points[1, first:, 0] * 1280, left + 500, rtol=1e-6)
+
+
+def test_truth_is_what_the_file_says(root):
+    truth = dataset_of(root).truth(0)
+    assert truth.rows is not None
+    np.testing.assert_array_equal(truth.rows, ROWS_48)
+    assert truth.x.shape == (3, 48)
+    assert (truth.x[2] == -2).all()
+
+
+def test_splits_name_their_files(root):
+    assert [len(dataset_of(root, split=split)) for split in ("train", "val", "all")] == [2, 2, 4]
+    train = dataset_of(root, split="train")
+    assert train.name == "tusimple-train"
+    assert train.summary() == "tusimple-train: 2 frames of label_data_0313.json; not found: label_data_0601.json"
+    assert train.absent_files == ("label_data_0601.json",)
+    with pytest.raises(UserError, match=r"lacks the label file test_label.json of split test \(it has label_data_0313"):
+        dataset_of(root, split="test")
+    shutil.copy(root / "label_data_0531.json", root / "test_label.json")
+    test = dataset_of(root, split="test")
+    assert (len(test), test.summary()) == (2, "tusimple-test: 2 frames of test_label.json")
+    assert len(dataset_of(root, split="all")) == 4  # never the test set
+    own = dataset_of(root, label_files=("label_data_0531.json",))
+    assert (own.name, own.raw_file(0)) == ("tusimple-custom", "clips/1/0/20.jpg")
+    with pytest.raises(UserError, match=r"lacks the label file mine.json of `label_files`"):
+        dataset_of(root, label_files=("label_data_0531.json", "mine.json"))
+
+
+def test_further_label_files_join_the_whole(root):
+    (root / "label_data_0313.json").rename(root / "label_data_mine.json")
+    found = dataset_of(root)
+    assert [file.name for file in found.label_files] == ["label_data_0531.json", "label_data_mine.json"]
+    assert len(found) == 4
+
+
+def test_mistakes_in_the_folder_are_named(root):
+    with pytest.raises(UserError, match=r"no folder .*nowhere"):
+        dataset_of(root / "nowhere")
+    shutil.copy(root / "label_data_0531.json", root / "label_data_copy.json")
+    with pytest.raises(UserError, match=r"label_data_copy.json labels clips/1/0/20.jpg, which an earlier"):
+        dataset_of(root)
+    (root / "label_data_copy.json").write_text("\n")
+    with pytest.raises(UserError, match="no labelled frames"):
+        dataset_of(root, label_files=("label_data_copy.json",))
+
+
+def test_missing_images_are_one_error(root):
+    for name in ("0/0", "0/1", "1/0", "1/1"):
+        (root / "clips" / name / "20.jpg").unlink()
+    names = r"\(clips/0/0/20.jpg, clips/0/1/20.jpg, clips/1/0/20.jpg, \.\.\.\)"
+    with pytest.raises(UserError, match=rf"4 of 4 labelled images are missing {names}: unpack"):
+        dataset_of(root)
+
+
+def test_labels_without_their_images_are_refused():
+    root = shared_path("data/tusimple/labels_only")
+    with pytest.raises(UserError, match="2858 of 2858 labelled images are missing"):
+        dataset_of(root)
+
+
+@pytest.mark.parametrize("index", [-1, 4])
+def test_there_is_nothing_outside(root, index):
+    dataset = dataset_of(root)
+    for read in (dataset.example, dataset.truth, dataset.raw_file, dataset.info):
+        with pytest.raises(IndexError, match="tusimple-all has 4 examples"):
+            read(index)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_loading_stacks_the_examples_in_order(root, workers):
+    dataset = dataset_of(root, height=36, width=64)
+    arrays = load_road_images(dataset, progress=False, workers=workers)
+    assert arrays.image.shape == (4, 36, 64, 3)
+    for index in range(4):
+        jax.tree.map(lambda a, b, i=index: np.testing.assert_array_equal(a[i], b), arrays, dataset.example(index))
+
+
+def test_a_damaged_image_ends_loading_with_its_name(root):
+    (root / "clips/1/0/20.jpg").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(UserError, match=r"clips/1/0/20.jpg is damaged"):
+        load_road_images(dataset_of(root), progress=False)
+
+
+@pytest.mark.parametrize("lanes", [np.zeros((0, 56)), np.full((2, 56), -2.0), np.zeros((0, 0))])
+def test_images_without_lanes(lanes):
+    rows = ROWS[: lanes.shape[1]]
+    lines = lane_lines(RowLanes(lanes, rows), 720, 1280)
+    assert not lines.valid.any()
+    assert not lines.point_valid.any()
+    assert row_lanes(lines).x.shape == (0, 56)
+
+
+def test_too_many_lines_leave_out_the_shortest():
+    x = np.where(np.arange(56) < np.array([[30], [10], [50]]), [[300.0], [200.0], [100.0]], -2.0)
+    with pytest.warns(TruncationWarning, match="an image has 3 lines and room for 2: raise `capacity`"):
+        lines = lane_lines(RowLanes(x, ROWS), 720, 1280, capacity=2)
+    np.testing.assert_array_equal(lines.point_valid.sum(1), [50, 30])
+    assert lane_lines(RowLanes(x, ROWS), 720, 1280, capacity=3).valid.all()
+
+
+def test_other_rows_are_interpolated_where_labelled_on_both_sides():
+    """A 1080-row camera: TuSimple's row r is row 1.5 r of its image, between labels of every 20 rows."""
+    rows = np.arange(300.0, 1080.0, 20.0)
+    x = (rows * 2.0)[None].copy()
+    x[0, 10] = -2  # a gap at row 500
+    lines = lane_lines(RowLanes(x[:, ::-1], rows[::-1]), 1080, 4000, capacity=1)
+    own = ROWS * 1.5
+    inside = (own >= 300.0) & (own <= 1060.0) & ~((own > 480.0) & (own < 520.0))
+    np.testing.assert_array_equal(lines.point_valid[0], inside)
+    np.testing.assert_allclose(lines.points[0, inside, 0], own[inside] * 2.0 / 4000, rtol=1e-6)
+
+
+def test_rows_return_from_lines(root):
+    dataset = dataset_of(root)
+    truth, lines = dataset.truth(2), dataset.example(2).lines
+    back = row_lanes(lines)
+    assert back.rows is not None
+    np.testing.assert_array_equal(back.rows, ROWS)
+    np.testing.assert_allclose(back.x, truth.x[[1, 0]], rtol=1e-6)  # left to right
+    points = np.where(lines.point_valid[..., None], lines.points, np.nan)
+    np.testing.assert_array_equal(row_lanes(replace(lines, points=points)).x, back.x)
+    with pytest.raises(ValueError, match="do not stand at TuSimple's rows"):
+        row_lanes(replace(lines, points=lines.points + np.float32(0.01)))
+    left = replace(lines, points=lines.points - np.float32([0.1, 0.0]))  # 128 pixels
+    assert ((row_lanes(left).x == -2) | (row_lanes(left).x >= 0)).all()
+
+
+@pytest.mark.golden
+def test_real_frames_agree_with_their_labels():
+    dataset = dataset_of(shared_path("data/tusimple/LaneDetection"))
+    arrays = load_road_images(dataset, progress=False)
+    assert len(dataset) == len(arrays.image) == 10
+    metrics = TuSimpleMetrics()
+    for index in range(10):
+        truth, lines = dataset.truth(index), dataset.example(index).lines
+        assert truth.rows is not None
+        assert lines.valid.sum() == (truth.x >= 0).any(1).sum()
+        found = row_lanes(lines)
+        metrics.update(RowLanes(found.x[:, np.searchsorted(ROWS, truth.rows)]), truth)
+    # One frame labels an absent lane, which no prediction can find (specs/data_formats.md section 5, record 3).
+    scores = metrics.compute()
+    assert scores["FP"] == 0.0
+    assert scores["FN"] == pytest.approx(0.025)
+    assert scores["Accuracy"] > 0.97

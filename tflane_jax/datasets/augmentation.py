@@ -1,0 +1,208 @@
+"""Random changes of a training example: geometry, colour and lighting, by default LSTR's (specs/modules.md 2.8).
+
+On the host with numpy and OpenCV: all geometry is one affine warp, all colour one affine map of RGB. What stands in
+padding never reaches the result, and the pixels that a warp leaves without an image are black and not valid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.images import opencv
+from tflane_jax.scene import LaneLines, RoadImage, stack_examples
+
+Seed = int | Sequence[int]
+
+GREY = np.array([0.299, 0.587, 0.114])
+"""Share of red, green and blue in grey (ITU-R BT.601, as OpenCV has it)."""
+
+# Principal components of the colours of natural images in [0, 1] (Krizhevsky et al. 2012), with CornerNet's numbers.
+# Rows are red, green, blue; the reference has them the other way round, because its images are BGR.
+PCA_VALUES = np.array([0.2141788, 0.01817699, 0.00341571])
+PCA_VECTORS = np.array([
+    [-0.56089297, 0.71832671, 0.41158938],
+    [-0.5832747, 0.00994535, -0.81221408],
+    [-0.58752847, -0.69563484, 0.41340352],
+])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    """What may happen to an example; the defaults are LSTR's recipe.
+
+    Attributes:
+        geometry: probability that rotation, flip and crop are drawn at all.
+        rotation: most rotation about the centre to either side, radians.
+        flip: probability of a mirror image, where geometry is drawn.
+        crop: share of height and of width that remains, anywhere in the image, and is enlarged to its size.
+        brightness, contrast, saturation: most change of each factor from 1; they are applied in random order.
+        lighting: standard deviation of the change along the principal components of colour.
+    """
+
+    geometry: float = 10 / 11
+    rotation: float = math.radians(10.0)
+    flip: float = 0.5
+    crop: float = 0.9
+    brightness: float = 0.4
+    contrast: float = 0.4
+    saturation: float = 0.4
+    lighting: float = 0.1
+
+
+NO_AUGMENTATION = AugmentationConfig(geometry=0.0, brightness=0.0, contrast=0.0, saturation=0.0, lighting=0.0)
+
+
+def augment(example: RoadImage, config: AugmentationConfig, seed: Seed) -> RoadImage:
+    """Return one example changed at random, or itself where nothing was drawn; the same seed gives the same bits.
+
+    Points that leave the image become invalid, points keep ascending rows and lines their order from left to right by
+    the first point; a line that the warp leaves with fewer than two points is dropped.
+
+    Args:
+        example: numpy.
+        config: what may happen.
+        seed: an integer or several, such as (run seed, epoch, index).
+    """
+    geometry, colour = np.random.default_rng(seed).spawn(2)
+    height, width = example.image_valid.shape
+    warp = draw_warp(config, geometry, height, width)
+    if warp is not None:
+        example = warp_example(example, warp)
+    factors, order = _draw_jitter(config, colour)
+    light = PCA_VECTORS @ (PCA_VALUES * colour.normal(scale=config.lighting, size=3))
+    if not (factors == 1.0).all() or light.any():
+        example = replace(example, image=_recoloured(example, factors, order, light))
+    return example
+
+
+def augment_batch(
+    batch: RoadImage, config: AugmentationConfig, seeds: Sequence[Seed], *, workers: int = 1
+) -> RoadImage:
+    """Return changed copies of stacked examples, each with its own seed; `workers` threads share the work.
+
+    Raises ValueError where there is not one seed for each example.
+    """
+    if len(seeds) != len(batch.image):
+        raise ValueError(f"{len(batch.image)} examples and {len(seeds)} seeds: give one seed for each example")
+    if not len(seeds):
+        return batch
+
+    def one(index: int) -> RoadImage:
+        return augment(jax.tree.map(lambda leaf: leaf[index], batch), config, seeds[index])
+
+    if workers > 1:
+        with ThreadPoolExecutor(workers) as pool:
+            return stack_examples(list(pool.map(one, range(len(seeds)))))
+    return stack_examples([one(index) for index in range(len(seeds))])
+
+
+def draw_warp(
+    config: AugmentationConfig, rng: np.random.Generator, height: int, width: int
+) -> Float[np.ndarray, "3 3"] | None:
+    """Return a random affine map of the image onto itself, or None for no change.
+
+    It maps columns and rows of the old image to those of the new, pixels, (0, 0) the outer corner of the first pixel.
+    """
+    chance, angle, mirror, left, top = rng.uniform(size=5)
+    if chance >= config.geometry:
+        return None
+    angle = config.rotation * (2.0 * angle - 1.0)
+    cos, sin = math.cos(angle), math.sin(angle)
+    x, y = width / 2.0, height / 2.0
+    rotate = np.array([[cos, -sin, x - cos * x + sin * y], [sin, cos, y - sin * x - cos * y], [0.0, 0.0, 1.0]])
+    flipped = mirror < config.flip
+    flip = np.array([[-1.0 if flipped else 1.0, 0.0, width if flipped else 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    left, top = left * (1.0 - config.crop) * width, top * (1.0 - config.crop) * height
+    crop = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, config.crop]]) / config.crop
+    warp = crop @ flip @ rotate
+    return None if (warp == np.eye(3)).all() else warp
+
+
+def warp_example(example: RoadImage, warp: Float[np.ndarray, "3 3"]) -> RoadImage:
+    """Return an example under an affine map as `draw_warp` gives it (bilinear; padding is black)."""
+    cv2 = opencv()
+    height, width = example.image_valid.shape
+    # OpenCV counts from the centre of the first pixel, and reads the map from the new image to the old.
+    half = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    inverse = (np.linalg.inv(half) @ np.linalg.inv(warp) @ half)[:2]
+    seen = np.asarray(example.image_valid, np.uint8)
+    image = np.ascontiguousarray(example.image)
+    if not seen.all():
+        image = cv2.bitwise_and(image, image, mask=seen)
+    size, flags = (width, height), cv2.WARP_INVERSE_MAP
+    image = cv2.warpAffine(image, inverse, size, flags=flags | cv2.INTER_LINEAR)
+    seen = cv2.warpAffine(seen, inverse, size, flags=flags | cv2.INTER_NEAREST)
+    image = cv2.bitwise_and(image, image, mask=seen)
+    return RoadImage(image, seen.astype(bool), warp_lines(example.lines, warp, height, width))
+
+
+def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, width: int) -> LaneLines:
+    """Return lines under an affine map of the pixels of an image; see `augment` for what becomes of them."""
+    size = np.array([width, height], np.float64)
+    before = np.asarray(lines.point_valid & lines.valid[:, None])
+    points = np.where(before[..., None], lines.points, 0.0).astype(np.float64)
+    points = ((points * size) @ warp[:2, :2].T + warp[:2, 2]) / size
+    valid = before & ((points >= 0.0) & (points <= 1.0)).all(-1)
+
+    # Steep turns can swap the rows of points: sort the valid ones among the places that they hold.
+    places = np.argsort(~valid, axis=-1, kind="stable")
+    order = np.argsort(np.where(valid, points[..., 1], np.inf), axis=-1, kind="stable")
+    arranged = np.zeros_like(points)
+    np.put_along_axis(arranged, places[..., None], np.take_along_axis(points, order[..., None], 1), 1)
+    points = np.where(valid[..., None], arranged, 0.0)
+
+    enough = np.minimum(before.sum(-1), 2)
+    kept = np.asarray(lines.valid) & valid.any(-1) & (valid.sum(-1) >= enough)
+    first = points[np.arange(len(kept)), valid.argmax(-1), 0] if points.shape[1] else np.zeros(len(kept))
+    across = np.argsort(np.where(kept, first, np.inf), kind="stable")
+    kept, valid, points = kept[across], valid[across], points[across]
+    valid &= kept[:, None]
+    return LaneLines(np.where(valid[..., None], points, 0.0).astype(np.float32), valid, kept)
+
+
+def colour_map(
+    factors: Float[np.ndarray, "3"], order: Sequence[int], light: Float[np.ndarray, "3"], mean_grey: float
+) -> Float[np.ndarray, "3 4"]:
+    """Return brightness, contrast, saturation (0, 1, 2, in `order`) and lighting as one affine map of RGB in [0, 1].
+
+    As in the reference, contrast blends with the mean grey of the original image and saturation with the original
+    grey, whatever came before.
+
+    Args:
+        factors: alpha of brightness, contrast and saturation.
+        order: of application.
+        light: added at the end.
+        mean_grey: of the original image, in [0, 1].
+    """
+    blended = np.zeros((3, 3, 4))  # what each blends with: nothing, mean grey, grey
+    blended[1, :, 3] = mean_grey
+    blended[2, :, :3] = GREY
+    colour = np.eye(3, 4)
+    for kind in order:
+        colour = factors[kind] * colour + (1.0 - factors[kind]) * blended[kind]
+    colour[:, 3] += light
+    return colour
+
+
+def _draw_jitter(config: AugmentationConfig, rng: np.random.Generator) -> tuple[Float[np.ndarray, "3"], list[int]]:
+    spread = np.array([config.brightness, config.contrast, config.saturation])
+    return 1.0 + spread * rng.uniform(-1.0, 1.0, 3), rng.permutation(3).tolist()
+
+
+def _recoloured(example: RoadImage, factors: np.ndarray, order: Sequence[int], light: np.ndarray) -> np.ndarray:
+    """Return the image under a colour map, rounded and clipped to uint8, black where it is not valid."""
+    cv2 = opencv()
+    image = np.ascontiguousarray(example.image)
+    seen = np.asarray(example.image_valid, np.uint8)
+    mean_grey = float(GREY @ cv2.mean(image, mask=seen)[:3]) / 255.0
+    colour = colour_map(factors, order, light, mean_grey)
+    colour[:, 3] *= 255.0
+    image = cv2.transform(image, colour)
+    return image if seen.all() else cv2.bitwise_and(image, image, mask=seen)

@@ -1,0 +1,106 @@
+"""Front views of the built-in world as a dataset: endless, seeded, without a download.
+
+One integer is one image with its lane lines; each split owns a range of integers, so that training, validation and
+test images are disjoint by construction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.cache import cached
+from tflane_jax.datasets.leaves import image_from_leaves
+from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
+from tflane_jax.errors import UserError
+from tflane_jax.scene import LaneLines, RoadImage
+from tflane_jax.world.front_view import FrontWorldConfig, front_view
+from tflane_jax.world.front_view_lines import CAPACITY, ROWS
+
+
+@dataclass(frozen=True)
+class FrontViewConfig:
+    """Which front views of the built-in world.
+
+    Attributes:
+        split: train owns the scene ids [0, 1e8), val [1e8, 2e8), test [2e8, 3e8).
+        images: number of images, one a scene.
+        first: scenes of the split to skip.
+        world: camera, road, traffic, weather, and the `severity` of it all (0 to 1).
+    """
+
+    split: Literal["train", "val", "test"] = "train"
+    images: int = 4000
+    first: int = 0
+    world: FrontWorldConfig = FrontWorldConfig()
+
+
+class FrontViewDataset:
+    """Road images made when they are asked for.
+
+    Raises UserError where the images do not lie in the split's range of ids.
+    """
+
+    def __init__(self, config: FrontViewConfig):
+        if config.images < 0 or config.first < 0 or config.first + config.images > SCENES_PER_SPLIT:
+            raise UserError(
+                f"{config.split} has images 0 to {SCENES_PER_SPLIT - 1}, not {config.first} to "
+                f"{config.first + config.images - 1}: change `first` or `images`"
+            )
+        self.config = config
+        self.name = f"front-views-{config.split}"
+
+    def __len__(self) -> int:
+        return self.config.images
+
+    def example(self, index: int) -> RoadImage:
+        """Return one image with its lane lines."""
+        return front_view(self.scene_id(index), self.config.world)
+
+    def info(self, index: int) -> FrameInfo:
+        """Return where one image comes from; a front view has a frame of its own and no time."""
+        return FrameInfo("front-views", f"front-{self.scene_id(index):09d}", 0, np.eye(4))
+
+    def scene_id(self, index: int) -> int:
+        """Return the world's number of one image; raises IndexError outside the dataset."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.name} has {len(self)} images, no number {index}")
+        return FIRST_SCENE[self.config.split] + self.config.first + index
+
+
+class _StoredViews(FrontViewDataset):
+    """The same images as they are kept on disk: without the mask, which is true everywhere."""
+
+    def example(self, index: int) -> RoadImage:
+        # `replace` of dataclasses: pyright does not know flax's.
+        return replace(super().example(index), image_valid=None)  # type: ignore[arg-type]
+
+
+def load_road_images(config: FrontViewConfig, *, progress: bool = True, workers: int | None = None) -> RoadImage:
+    """Return all images of the configuration, stacked along a new first axis.
+
+    They are made once, in parallel, and kept under the cache root (see `datasets.cache`). The images are read-only
+    maps of the file on disk, so that a large set needs no memory of its own, and `image_valid` is a broadcast view.
+
+    Args:
+        config: which images.
+        progress: show a bar with rate and time left while they are made.
+        workers: processes that make them, default one per core. More than one needs the caller's script to be guarded
+            by `if __name__ == "__main__":`.
+
+    Raises:
+        UserError: ids outside the split, a severity outside [0, 1], a full disk, a folder that cannot be written.
+    """
+    dataset = _StoredViews(config)
+    camera, count = config.world.camera, len(dataset)
+    shape = (count, camera.height, camera.width)
+    if count:
+        stored = image_from_leaves(cached(dataset, progress=progress, workers=workers).arrays(mapped=True))
+    else:
+        points, flags = np.zeros((0, CAPACITY, len(ROWS), 2), np.float32), np.zeros((0, CAPACITY, len(ROWS)), bool)
+        lines = LaneLines(points, flags, np.zeros((0, CAPACITY), bool))
+        stored = RoadImage(image=np.zeros((*shape, 3), np.uint8), image_valid=None, lines=lines)  # type: ignore
+    return replace(stored, image_valid=np.broadcast_to(True, shape))

@@ -66,7 +66,7 @@ def fakes():
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
             patch.setattr(LaneGraphTask, function.__name__, function)
-        for module in ("runs", "commands.predict", "compare"):
+        for module in ("systems.lane_graph", "commands.predict_lanes"):
             patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
         yield
 
@@ -237,14 +237,14 @@ def test_every_command_has_help(capsys):
 def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
     import signal
 
-    from tflane_jax import runs
+    from tflane_jax.systems import lane_graph
 
     def interrupting(*arguments):
         os.kill(os.getpid(), signal.SIGINT)
         return evaluate(*arguments)
 
-    evaluate = runs.evaluate_lanes
-    monkeypatch.setattr(runs, "evaluate_lanes", interrupting)
+    evaluate = lane_graph.evaluate_lanes
+    monkeypatch.setattr(lane_graph, "evaluate_lanes", interrupting)
     folder = tmp_path / "stopped"
     assert main(["train", "--config", f"{config}:baseline", "--out", str(folder)]) == 130
     said = capsys.readouterr().err

@@ -35,6 +35,11 @@ _FILES = """Protocols and their files:
       Both files hold one JSON record a line: raw_file, lanes (x at every row, negative where there is none), h_samples
       (the truth) or run_time in ms (predictions). tusimple-lstr allows 20 s an image instead of 200 ms, like LSTR."""
 
+_PREDICT = """Lane lines in photos of any size:
+  tflane predict RUN photo.jpg folder/          with a model that was trained here
+  tflane predict --config FILE photo.jpg        with the published weights that the config file names
+Photos of another camera than TuSimple's are cut to its field of view where --focal and --horizon say how."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
@@ -63,6 +68,8 @@ def build_parser() -> argparse.ArgumentParser:
     _train(commands)
     _evaluate(commands)
     _predict(commands)
+    _convert(commands)
+    _export(commands)
     _data(commands)
     _compare(commands)
     _score(commands)
@@ -103,36 +110,64 @@ def _checkpoint(text: str) -> int | str:
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a step")
 
 
-def _run_arguments(parser: argparse.ArgumentParser, split: str) -> None:
-    parser.add_argument("run", metavar="RUN", type=Path, help="run folder")
+def _model_arguments(parser: argparse.ArgumentParser, inputs: str = "run folder") -> None:
+    parser.add_argument("inputs", metavar="RUN", nargs="*", type=Path, help=inputs)
+    parser.add_argument("--config", metavar="FILE[:NAME]",
+                        help="instead of a run: a config file that names published weights")  # fmt: skip
     parser.add_argument("--checkpoint", metavar="best|last|STEP", type=_checkpoint,
                         help="default best, or last where nothing was evaluated")  # fmt: skip
+
+
+def _example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
     _split_arguments(parser, split)
     parser.add_argument("--max-instances", type=int, metavar="N", help="use at most N road users; 0 is no traffic flow")
 
 
 def _split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
     parser.add_argument("--split", choices=("train", "val", "test"), default=split, help=f"default {split}")
-    parser.add_argument("--data", choices=("procedural", "argoverse2"),
+    parser.add_argument("--data", choices=("procedural", "argoverse2", "front-views", "tusimple"),
                         help="take other data than the configuration's")  # fmt: skip
-    parser.add_argument("--root", metavar="PATH", help="a log or a folder of logs, for --data argoverse2")
+    parser.add_argument("--root", metavar="PATH", help="folder of --data argoverse2 (a log, or logs) or tusimple")
     parser.add_argument("--openlane", metavar="PATH", help="folder of the OpenLane-V2 split files, if there is one")
 
 
 def _evaluate(commands) -> None:
     parser = _command(commands, "eval", "evaluate a trained run", module="evaluate", function="run")
-    _run_arguments(parser, "test")
+    _model_arguments(parser)
+    _example_arguments(parser, "test")
     parser.add_argument("--out", metavar="STEM", type=Path,
                         help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)")  # fmt: skip
 
 
 def _predict(commands) -> None:
-    parser = _command(commands, "predict", "write predictions and pictures", module="predict", function="run")
-    _run_arguments(parser, "val")
+    parser = _command(commands, "predict", "write predictions and pictures", module="predict", function="run",
+                      epilog=_PREDICT)  # fmt: skip
+    _model_arguments(parser, "run folder; then photos or folders of photos, for models of lane lines in one image")
+    _example_arguments(parser, "val")
     parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
     parser.add_argument("--threshold", type=float, default=0.3,
                         help="least score of a lane in JSON and pictures (default 0.3)")  # fmt: skip
-    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
+    parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/predict"),
+                        help="where to write (default runs/predict)")  # fmt: skip
+
+
+def _export(commands) -> None:
+    parser = _command(commands, "export", "write a model of lane lines in one image as a StableHLO program",
+                      module="export", function="run")  # fmt: skip
+    _model_arguments(parser)
+    parser.add_argument("--out", metavar="FILE", type=Path, default=Path("model.stablehlo"),
+                        help="default model.stablehlo")  # fmt: skip
+
+
+def _convert(commands) -> None:
+    parser = _command(commands, "convert", "turn published PyTorch weights into a run folder", module="convert",
+                      function="run")  # fmt: skip
+    parser.add_argument("--config", metavar="FILE[:NAME]", required=True, help="config file of the same model")
+    parser.add_argument("--weights", metavar="FILE", type=Path,
+                        help="checkpoint, .pth, .pkl or .npz (default: the one that the config names)")  # fmt: skip
+    parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="run folder to write")
 
 
 def _data(commands) -> None:

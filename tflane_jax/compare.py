@@ -7,6 +7,7 @@ and any run of it can be evaluated or drawn by itself.
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import multiprocessing
 import os
@@ -17,21 +18,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.ablations.comparison import Variant, compact, summarise
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.runs import limit_instances, load_split, open_dataset, open_run, predict_examples, titles, train_run
-from tflane_jax.scene import Example, stack_examples
-from tflane_jax.training.evaluate import evaluate_lanes, scores
+from tflane_jax.runs import open_run, train_run
+from tflane_jax.systems import Model, System, system_of
 from tflane_jax.training.run_folder import write_json
 from tflane_jax.training.runtime import configure_jax
-
-_GROUPS = ("all", "occluded", "clear")
-METRICS = tuple(f"{group}/{metric}" for metric in ("DET_l", "TOP_ll", "recall") for group in _GROUPS)
 
 
 @dataclass(frozen=True)
@@ -55,8 +51,8 @@ class Job:
 def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, jobs: int = 1) -> Path:
     """Train what is not trained yet, evaluate on the test split, print and save tables and pictures.
 
-    A model with traffic flow is evaluated a second time without any at inference (TF-Lane, Table 7). All runs are
-    taken at their last step, so that no selection favours anyone.
+    What can be used in several ways is listed with each (traffic flow: with and without it at inference). All runs
+    are taken at their last step, so that no selection favours anyone.
 
     Args:
         configs: by the name that the table shows; the first one is what the others are compared with.
@@ -70,7 +66,9 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
     Raises:
         UserError: the configurations do not test on the same examples, or a training failed.
     """
-    if len({config.data.source("test") for config in configs.values()}) > 1:
+    first = next(iter(configs.values()))
+    source, system = first.data.source("test"), system_of(first)
+    if any(config.data.source("test") != source for config in configs.values()):
         raise UserError("the configurations have different test data (data.test): their numbers cannot be compared")
     plan = {
         name: [
@@ -79,27 +77,34 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
         ]
         for name, config in configs.items()
     }
-    for config in configs.values():  # before any worker starts, so that nobody builds the same data twice
-        for split in ("train", "val", "test"):
-            open_dataset(config.data.source(split))
+    # Before any worker starts, so that nobody builds the same data twice.
+    for each in {config.data.source(split) for config in configs.values() for split in ("train", "val", "test")}:
+        system.load(each)
     # Seed by seed, so that a comparison stopped early has pairs.
     train_all([plan[name][i] for i in range(len(seeds)) for name in plan], jobs)
 
-    arrays = load_split(next(iter(configs.values())), "test")
+    data = system.load(source)
     variants: list[Variant] = []
+    remarks: dict[str, dict[str, str]] = {}
+    models: dict[str, Model] = {}
     protocol = ""
     for name, trainings in plan.items():
-        measured, silent = [], []
+        measured: dict[str, list[dict[str, float]]] = {name: []}
         for job in tqdm(trainings, desc=f"evaluate {name}", unit="run"):
-            protocol, values = _measure(job, arrays, None)
-            measured.append(values)
-            if job.config.task.model.traffic_flow is not None:
-                silent.append(_measure(job, arrays, 0)[1])
-        variants.append(Variant(name, tuple(measured)))
-        if silent:
-            variants.append(Variant(f"{name}, no traffic flow at inference", tuple(silent)))
-    picture = draw_comparison({name: trainings[0] for name, trainings in plan.items()}, arrays, out / "comparison.png")
-    return _report(variants, protocol, out, picture, seeds)
+            run = open_run(job.folder, "last")
+            task, params, size = run.config.task, run.params[0], run.config.evaluation.batch_size
+            models.setdefault(name, Model(task, params))
+            ways = {name: task} | {f"{name}, {way}": other for way, other in system.inference_variants(task).items()}
+            for way, used in ways.items():
+                evaluation = system.evaluate(used, params, data, size)
+                protocol = evaluation.protocol
+                measured.setdefault(way, []).append(evaluation.scores())
+        remarks[name] = system.remarks(models[name])
+        variants += [Variant(way, tuple(scores)) for way, scores in measured.items()]
+    picture = None
+    if importlib.util.find_spec("matplotlib") is not None:
+        picture = system.draw_comparison(models, source, data, out / "comparison.png")
+    return _report(system, variants, remarks, protocol, out, picture, seeds)
 
 
 def train_all(jobs: Sequence[Job], parallel: int) -> None:
@@ -159,47 +164,18 @@ def _step(folder: Path) -> int:
         return 0
 
 
-def _measure(job: Job, arrays: Example, max_instances: int | None) -> tuple[str, dict[str, float]]:
-    run = open_run(job.folder, "last")
-    task = run.config.task if max_instances is None else limit_instances(run.config.task, max_instances)
-    metrics = evaluate_lanes(task, run.params[0], arrays, run.config.evaluation.batch_size)
-    return metrics.protocol, scores(metrics)
-
-
-def draw_comparison(models: dict[str, Job], arrays: Example, path: Path, count: int = 6) -> Path | None:
-    """Draw the test frames with the most hidden lanes, every model beside the truth; None without matplotlib."""
-    try:
-        from tflane_jax.plots import save_examples
-    except UserError:
-        return None
-    source = next(iter(models.values())).config.data.source("test")
-    dataset = open_dataset(source)
-    hidden = (arrays.lanes.valid & (arrays.lanes.visibility < 0.5)).sum(-1)
-    indices = np.argsort(-hidden, kind="stable")[:count].tolist()
-    examples = stack_examples([dataset.example(index) for index in indices])
-    lanes = {}
-    for name, job in models.items():
-        run = open_run(job.folder, "last")
-        _, lanes[name] = predict_examples(run.config.task, run.params[0], dataset, indices)
-    save_examples(
-        path, examples, lanes, titles=titles(dataset, indices),
-        ground=source.example.sensor.grid.range, view=source.example.range,
-    )  # fmt: skip
-    return path
-
-
 def _report(
-    variants: list[Variant], protocol: str, out: Path, picture: Path | None, seeds: Sequence[int]
-) -> Path:
+    system: System, variants: list[Variant], remarks: dict[str, dict[str, str]], protocol: str, out: Path,
+    picture: Path | None, seeds: Sequence[int],
+) -> Path:  # fmt: skip
     """Print the tables and save them beside the pictures."""
     title = f"{protocol}, test split, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}, percent (mean ± std)"
-    print("\n" + format_table(compact(variants, METRICS), title=title))
-    markdown, _ = save_table(
-        out / "table", compact(variants, METRICS), {"protocol": protocol, "seeds": list(seeds)}, title=title
-    )
+    rows = [row | remarks.get(row["model"], {}) for row in compact(variants, system.compared)] + system.quoted()
+    print("\n" + format_table(rows, title=title))
+    markdown, _ = save_table(out / "table", rows, {"protocol": protocol, "seeds": list(seeds)}, title=title)
     written = [markdown]
     if len(seeds) > 1:
-        rows = summarise(variants, METRICS)
+        rows = summarise(variants, system.compared)
         title = f"{protocol}: paired differences to {variants[0].name}, two-sided t-test over {len(seeds)} seeds"
         print("\n" + format_table(rows, title=title, digits=4))
         written.append(save_table(out / "paired", rows, {"protocol": protocol}, title=title, digits=4)[0])

@@ -19,16 +19,22 @@ from typing import Literal, TypeVar
 
 from tflane_jax.config_io import settings
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Keyframes
+from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.errors import UserError
+from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.simulate import WorldConfig
 
 Split = Literal["train", "val", "test"]
-Source = ProceduralConfig | Argoverse2Config
+LaneGraphSource = ProceduralConfig | Argoverse2Config
+LaneCurveSource = FrontViewConfig | TuSimpleConfig
+Source = LaneGraphSource | LaneCurveSource
 T = TypeVar("T")
 
 
@@ -77,6 +83,46 @@ class LogData:
 
 
 @dataclass(frozen=True)
+class FrontViewData:
+    """Front-view images of the built-in world for every split.
+
+    Attributes:
+        train, val, test: number of images of each split.
+        augmentation: of training images, or None.
+    """
+
+    train: int = 4000
+    val: int = 100
+    test: int = 400
+    augmentation: AugmentationConfig | None = AugmentationConfig()
+
+    def source(self, split: Split) -> FrontViewConfig:
+        """Return the dataset of a split."""
+        return FrontViewConfig(split, images=getattr(self, split))
+
+
+@dataclass(frozen=True)
+class TuSimpleData:
+    """TuSimple's images, where the folder exists.
+
+    Attributes:
+        root: folder with clips and label files.
+        train, val, test: which label files each split reads, see `TuSimpleConfig.split`.
+        augmentation: of training images, or None.
+    """
+
+    root: Path
+    train: Literal["train", "val", "test", "all"] = "train"
+    val: Literal["train", "val", "test", "all"] = "val"
+    test: Literal["train", "val", "test", "all"] = "test"
+    augmentation: AugmentationConfig | None = AugmentationConfig()
+
+    def source(self, split: Split) -> TuSimpleConfig:
+        """Return the dataset of a split."""
+        return TuSimpleConfig(str(self.root), getattr(self, split))
+
+
+@dataclass(frozen=True)
 class EvaluationConfig:
     """Evaluation while training and after it.
 
@@ -95,17 +141,19 @@ class RunConfig:
 
     Attributes:
         task: model, priors and losses.
-        data: examples.
+        data: examples, of the kind that the task takes.
         optim: optimiser.
         training: the program.
         evaluation: metrics and pictures.
+        weights: file of published PyTorch weights; `tflane predict` and `eval` take the configuration with them.
     """
 
-    task: LaneGraphTask = LaneGraphTask()
-    data: WorldData | LogData = WorldData()
+    task: LaneGraphTask | LaneCurveTask = LaneGraphTask()
+    data: WorldData | LogData | FrontViewData | TuSimpleData = WorldData()
     optim: OptimConfig = OptimConfig()
     training: TrainingConfig = TrainingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+    weights: Path | None = None
 
 
 def load_config(reference: str) -> RunConfig:

@@ -22,14 +22,15 @@ STEPS = 1400
 
 def configs() -> dict[str, RunConfig]:
     """Return the demo's two configurations: the baseline and the same with traffic flow."""
+    task = LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0))
     baseline = RunConfig(
-        task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
+        task=task,
         data=WorldData(train=400, val=10, test=50),
         optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0, ema_decay=0.99),
         training=TrainingConfig(steps=STEPS, batch_size=4, log_every=25, eval_every=STEPS // 2, checkpoint_every=350),
         evaluation=EvaluationConfig(pictures=2),
     )
-    with_traffic = LaneGraphTask(replace(TopoNetConfig(), traffic_flow=TrafficFlowConfig()), baseline.task.losses)
+    with_traffic = LaneGraphTask(replace(TopoNetConfig(), traffic_flow=TrafficFlowConfig()), task.losses)
     return {"baseline": baseline, "+TFM": replace(baseline, task=with_traffic)}
 
 

@@ -2,6 +2,7 @@
 
 A pickle is a program: loading an untrusted one with `pickle.load` lets it do whatever it wants. Here only containers,
 numbers, strings and numpy arrays come out; a file that asks for anything else is refused before it gets it.
+`convert.torch_file` adds to these what PyTorch's checkpoints are made of.
 """
 
 from __future__ import annotations
@@ -9,9 +10,10 @@ from __future__ import annotations
 import collections
 import io
 import pickle
-from collections.abc import Callable
+import reprlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -30,8 +32,8 @@ def load_plain_pickle(path: Path) -> Any:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from None
     try:
-        return _Unpickler(io.BytesIO(data)).load()
-    except _Refused as error:
+        return RestrictedUnpickler(io.BytesIO(data), PLAIN).load()
+    except Refused as error:
         raise UserError(
             f"{path} is refused: it is a pickle that names {error}, and only containers, numbers, strings and numpy "
             "arrays are read. Save the data as such (torch tensors with .numpy())"
@@ -41,37 +43,68 @@ def load_plain_pickle(path: Path) -> Any:
         raise UserError(f"{path} is no pickle file, or it is damaged ({type(error).__name__}: {error})") from None
 
 
-class _Refused(Exception):
-    """The name of something that plain data does not need."""
+class Refused(Exception):
+    """The name of something that the data does not need."""
 
 
-class _Unpickler(pickle.Unpickler):
+class Sealed(NamedTuple):
+    """A function that a pickle may call and cannot change.
+
+    A pickle may set attributes of whatever it holds, and functions and classes written in Python would keep them.
+    """
+
+    function: Callable[..., Any]
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function."""
+        return self.function(*arguments)
+
+
+class RestrictedUnpickler(pickle.Unpickler):
+    """An unpickler that knows a few names.
+
+    Attributes:
+        allowed: what each (module, name) stands for: classes written in C, `Sealed` functions, plain values.
+    """
+
+    def __init__(self, file: IO[bytes], allowed: Mapping[tuple[str, str], Any], *, encoding: str = "ASCII") -> None:
+        """Read from `file`; `encoding` is that of strings from Python 2."""
+        super().__init__(file, encoding=encoding)
+        self.allowed = allowed
+
     def find_class(self, module: str, name: str) -> Any:
+        """Return what stands for a name; raise `Refused` for one that is not allowed."""
         try:
-            return _PLAIN[module, name]
+            return self.allowed[module, name]
         except KeyError:
-            raise _Refused(f"{module}.{name}") from None
+            raise Refused(ascii(f"{module}.{name}")[1:-1][:120]) from None
 
     def persistent_load(self, pid: Any) -> Any:
-        raise _Refused(f"an object outside the file ({pid!r:.80})")
+        """Refuse objects outside the file."""
+        raise Refused(f"an object outside the file ({reprlib.repr(pid)})")
 
 
 def _array(kind: type, shape: Any, code: Any) -> np.ndarray:
     """Make the empty array that the file then fills; `shape` and `code` are placeholders there, and not believed."""
-    if kind is not np.ndarray:
-        raise _Refused(f"an array of type {kind!r:.80}")
+    if kind != _NDARRAY:
+        raise Refused(f"an array of type {reprlib.repr(kind)}")
     return np.ndarray.__new__(np.ndarray, (0,), "b")
 
 
 def _bytes(text: str | bytes = b"", encoding: str = "latin1") -> bytes:
     """Return bytes as the older protocols write them; a number, which asks for so many zeros, is refused."""
     if not isinstance(text, (str, bytes)) or encoding.replace("-", "") != "latin1":
-        raise _Refused(f"bytes made of {text!r:.40} by {encoding!r:.40}")
+        raise Refused(f"bytes made of {reprlib.repr(text)} by {reprlib.repr(encoding)}")
     return text.encode("latin1") if isinstance(text, str) else text
 
 
 def _bytearray(text: str | bytes = b"", encoding: str = "latin1") -> bytearray:
     return bytearray(_bytes(text, encoding))
+
+
+def _dtype(code: str, align: bool = False, copy: bool = True) -> np.dtype:
+    """Return a type of its own, which the file then completes."""
+    return np.dtype(code, align=bool(align), copy=True)
 
 
 def _scalar(dtype: np.dtype, data: bytes = b"") -> Any:
@@ -83,18 +116,23 @@ def _from_buffer(buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: Li
     return np.frombuffer(buffer, dtype).reshape(shape, order=order)
 
 
-_NUMPY: dict[str, dict[str, Any]] = {
+# Stands for the class, which called with a shape would take as much memory.
+_NDARRAY = "numpy.ndarray"
+_NUMPY: dict[str, dict[str, Callable[..., Any]]] = {
     "multiarray": {"_reconstruct": _array, "scalar": _scalar},
     "numeric": {"_frombuffer": _from_buffer},
 }
-_BUILTINS = {"set": set, "frozenset": frozenset, "complex": complex, "bytes": _bytes, "bytearray": _bytearray}
-_PLAIN: dict[tuple[str, str], Callable[..., Any]] = {
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
+_BUILTINS = {
+    "set": set, "frozenset": frozenset, "complex": complex, "bytes": Sealed(_bytes), "bytearray": Sealed(_bytearray),
+}  # fmt: skip
+PLAIN: Mapping[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): _NDARRAY,
+    ("numpy", "dtype"): Sealed(_dtype),
     ("collections", "OrderedDict"): collections.OrderedDict,
-    ("_codecs", "encode"): _bytes,
+    ("_codecs", "encode"): Sealed(_bytes),
     # Python 2 and 3, numpy 1 and 2 keep the same things in different places.
     **{(module, name): value for module in ("builtins", "__builtin__") for name, value in _BUILTINS.items()},
-    **{(f"numpy.{core}.{module}", name): value
+    **{(f"numpy.{core}.{module}", name): Sealed(value)
        for core in ("core", "_core") for module, names in _NUMPY.items() for name, value in names.items()},
 }  # fmt: skip
+"""What plain data may name."""

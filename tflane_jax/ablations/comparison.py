@@ -12,7 +12,7 @@ from tflane_jax.ablations.statistics import paired_difference
 from tflane_jax.errors import UserError
 
 Scores = dict[str, float]
-"""Metrics by "group/name", as `training.evaluate.scores` returns them."""
+"""Metrics by "group/name", as `systems.Evaluation.scores` returns them."""
 
 
 @dataclass(frozen=True)

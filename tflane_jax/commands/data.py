@@ -6,29 +6,65 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from tflane_jax.commands.sources import chosen_source, source_name
-from tflane_jax.config import RunConfig, apply_overrides, load_config
+import numpy as np
+
+from tflane_jax.commands.sources import lane_curve_source, lane_graph_source, source_name
+from tflane_jax.config import FrontViewData, LaneCurveSource, RunConfig, apply_overrides, load_config
 from tflane_jax.datasets.argoverse2 import check_log, find_logs, load_log
+from tflane_jax.datasets.front_views import FrontViewConfig
+from tflane_jax.datasets.front_views import load_road_images as load_front_views
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.errors import UserError
 from tflane_jax.plots import dataset_summary, format_table, save_table, show_dataset
-from tflane_jax.runs import open_dataset, spread
 from tflane_jax.scene import stack_examples
+from tflane_jax.systems import spread, system_of
+from tflane_jax.systems.lane_curve import open_images
+from tflane_jax.systems.lane_graph import open_dataset
+from tflane_jax.training.lane_curve import LaneCurveTask
 
 
 def show(options: argparse.Namespace) -> int:
     """Draw samples and print what they hold."""
     config = RunConfig() if options.config is None else load_config(options.config)
-    source = chosen_source(config, options)
+    if isinstance(config.task, LaneCurveTask) or options.data in ("front-views", "tusimple"):
+        config = _images(config)
+        return _show_images(lane_curve_source(config, options), config, options)
+    source = lane_graph_source(config, options)
     # Not from the cache: a few examples are made sooner than all of them.
     dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else open_dataset(source)
     picture = show_dataset(
         dataset, options.count, options.out, ground=source.example.sensor.grid.range, view=source.example.range
     )
-    indices = spread(dataset, options.count)
+    indices = spread(len(dataset), options.count)
     rows = dataset_summary(stack_examples([dataset.example(index) for index in indices]))
     print(format_table(rows, title=f"{source_name(source)}: the {len(indices)} examples drawn"))
     print(f"\nwritten to {picture}")
+    return 0
+
+
+def _images(config: RunConfig) -> RunConfig:
+    """Return a configuration whose data are images: a task needs no config file to have some shown."""
+    return config if isinstance(config.task, LaneCurveTask) else RunConfig(LaneCurveTask(), FrontViewData())
+
+
+def _show_images(source: LaneCurveSource, config: RunConfig, options: argparse.Namespace) -> int:
+    from tflane_jax.plots.images import save_road_images
+
+    dataset = open_images(source)
+    if options.count < 1 or len(dataset) == 0:
+        raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} images, {options.count} asked for")
+    indices = spread(len(dataset), options.count)
+    examples = stack_examples([dataset.example(index) for index in indices])
+    columns = {"images": examples}
+    if (prepare := system_of(config).prepare(config)) is not None:
+        columns["augmented"] = prepare(examples, (0, 0))
+    for name, shown in columns.items():
+        path = options.out if name == "images" else options.out.with_stem(f"{options.out.stem}-{name}")
+        print(f"{name} written to {save_road_images(path, shown, titles=[f'image {index}' for index in indices])}")
+    counts = np.bincount(examples.lines.valid.sum(-1))
+    rows = [{"lane lines": lines, "images": int(images)} for lines, images in enumerate(counts) if images]
+    print("\n" + format_table(rows, title=f"{source_name(source)}: the {len(indices)} images drawn"))
     return 0
 
 
@@ -74,8 +110,9 @@ def build(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     for split in ("train", "val", "test"):
         source = config.data.source(split)
         if isinstance(source, ProceduralConfig):
-            dataset = open_dataset(source)
-            print(f"{split}: {len(dataset)} examples ready")
+            print(f"{split}: {len(open_dataset(source))} examples ready")
+        elif isinstance(source, FrontViewConfig):
+            print(f"{split}: {len(load_front_views(source).image)} images ready")
         else:
             print(f"{split}: real logs are read when they are needed, nothing to build")
     return 0

@@ -1,4 +1,4 @@
-"""`tflane predict`: predictions as arrays, as plain JSON, and as pictures.
+"""`tflane predict` for lanes around the vehicle: predictions as arrays, as plain JSON, and as pictures.
 
 predictions.npz, arrays over F frames and Q queries:
     points (F, Q, P, 3) metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1, [f, i, j] lane j
@@ -24,35 +24,32 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import expit
 
-from tflane_jax.commands.sources import chosen_source
+from tflane_jax.commands.sources import lane_graph_source, limited_task, make_folder
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.errors import UserError
 from tflane_jax.plots import save_examples
-from tflane_jax.runs import limit_instances, open_dataset, open_run, predict_examples, spread, titles
+from tflane_jax.runs import Run
+from tflane_jax.systems import spread
+from tflane_jax.systems.lane_graph import open_dataset, predict_examples, titles
 from tflane_jax.training.run_folder import write_json
-from tflane_jax.training.runtime import configure_jax
 
 _SUCCESSOR_THRESHOLD = 0.5
 
 
-def run(options: argparse.Namespace) -> int:
-    """Predict with the first seed and write everything into --out."""
-    configure_jax()
-    trained = open_run(options.run, options.checkpoint)
-    task = trained.config.task
-    if options.max_instances is not None:
-        task = limit_instances(task, options.max_instances)
-    source = chosen_source(trained.config, options)
+def predict(trained: Run, options: argparse.Namespace) -> int:
+    """Predict some examples of a split with the first seed and write everything into --out."""
+    task = limited_task(trained, options) or trained.config.task
+    source = lane_graph_source(trained.config, options)
     dataset = open_dataset(source)
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
-    indices = spread(dataset, options.count)
+    indices = spread(len(dataset), options.count)
     examples, lanes = predict_examples(task, trained.params[0], dataset, indices)
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
     successor = expit(lanes.successor_logits)
 
-    _make_folder(options.out)
+    make_folder(options.out)
     arrays = {"points": points, "scores": scores, "successor": successor}
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
@@ -62,10 +59,10 @@ def run(options: argparse.Namespace) -> int:
     frames = [
         _frame(info, points[i], scores[i], successor[i], options.threshold) for i, info in enumerate(infos)
     ]
-    head = {"run": str(options.run), "step": trained.step, "seed": trained.config.training.seeds[0]}
+    head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
     save_examples(
-        options.out / "pictures.png", examples, {f"{options.run.name}, step {trained.step}": lanes},
+        options.out / "pictures.png", examples, {f"{Path(trained.name).name}, step {trained.step}": lanes},
         titles=titles(dataset, indices), ground=source.example.sensor.grid.range, view=source.example.range,
         threshold=options.threshold,
     )  # fmt: skip
@@ -97,10 +94,3 @@ def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     temporary = path.with_name(f".{path.stem}.tmp.npz")
     np.savez_compressed(temporary, **arrays)  # pyright: ignore[reportArgumentType]
     temporary.replace(path)
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror or error}") from error

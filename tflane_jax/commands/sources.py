@@ -1,35 +1,101 @@
-"""The data that a command's options name."""
+"""The model and the data that a command's options name."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
-from tflane_jax.config import RunConfig, Source
+from tflane_jax.config import LaneCurveSource, LaneGraphSource, RunConfig, Source, load_config
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
+from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.errors import UserError
+from tflane_jax.runs import Run, open_run, open_weights
+from tflane_jax.systems.lane_graph import limit_instances
+from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.training.lane_graph import LaneGraphTask
+
+
+def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
+    """Return the model that is named, by --config (published weights) or as first input (a run), and further inputs."""
+    if options.config is not None:
+        return open_weights(load_config(options.config)), options.inputs
+    if not options.inputs:
+        raise UserError("say which model: a run folder, or --config FILE with published weights")
+    return open_run(options.inputs[0], options.checkpoint), options.inputs[1:]
+
+
+def limited_task(run: Run, options: argparse.Namespace) -> Any:
+    """Return the run's task with the road users that --max-instances leaves; None where it is not given."""
+    if options.max_instances is None:
+        return None
+    if not isinstance(run.config.task, LaneGraphTask):
+        raise UserError("--max-instances limits traffic flow, and this model takes none")
+    return limit_instances(run.config.task, options.max_instances)
 
 
 def chosen_source(config: RunConfig, options: argparse.Namespace) -> Source:
-    """Return the source that --split, --data, --root and --openlane name; capacities stay as configured."""
-    configured: Source = config.data.source(options.split)
+    """Return the source that --split, --data, --root and --openlane name, of the kind that the task takes."""
+    if isinstance(config.task, LaneCurveTask):
+        return lane_curve_source(config, options)
+    return lane_graph_source(config, options)
+
+
+def lane_graph_source(config: RunConfig, options: argparse.Namespace) -> LaneGraphSource:
+    """Return the source of lanes around the vehicle that is named; capacities stay as configured."""
+    configured = config.data.source(options.split)
+    if not isinstance(configured, LaneGraphSource):
+        raise UserError("this configuration's data are images, but its task wants lanes around the vehicle")
     if options.data is None and options.root is not None and not isinstance(configured, Argoverse2Config):
         raise UserError("--root is the folder of real logs: add --data argoverse2")
     if options.data == "procedural":
         if isinstance(configured, ProceduralConfig):
             return configured
         return ProceduralConfig(split=options.split, scenes=100, example=configured.example)
-    if options.data == "argoverse2" or options.root is not None:
+    if options.data == "argoverse2" or (options.data is None and options.root is not None):
         if options.root is None:
             raise UserError("--data argoverse2 needs --root PATH, a log or a folder of logs")
         openlane = None if options.openlane is None else Path(options.openlane)
         return Argoverse2Config(Path(options.root), openlane=openlane, example=configured.example)
+    if options.data is not None:
+        raise UserError(f"--data {options.data} are images: this model takes procedural or argoverse2")
+    return configured
+
+
+def lane_curve_source(config: RunConfig, options: argparse.Namespace) -> LaneCurveSource:
+    """Return the source of front-view images that is named."""
+    configured = config.data.source(options.split)
+    if not isinstance(configured, LaneCurveSource):
+        raise UserError("this configuration's data are no images, but its task wants some")
+    if options.data is None and options.root is not None and not isinstance(configured, TuSimpleConfig):
+        raise UserError("--root is TuSimple's folder: add --data tusimple")
+    if options.data == "tusimple" or (options.data is None and options.root is not None):
+        if options.root is None:
+            raise UserError("--data tusimple needs --root PATH, the folder with clips and label files")
+        return TuSimpleConfig(options.root)
+    if options.data == "front-views":
+        return configured if isinstance(configured, FrontViewConfig) else FrontViewConfig(options.split, images=100)
+    if options.data is not None:
+        raise UserError(f"--data {options.data} are no images: this model takes front-views or tusimple")
     return configured
 
 
 def source_name(source: Source) -> str:
     """Return a name for titles and files."""
+    if isinstance(source, FrontViewConfig):
+        return f"front-views-{source.split}"
+    if isinstance(source, TuSimpleConfig):
+        return f"tusimple-{source.split}"
     if isinstance(source, ProceduralConfig):
         return f"procedural-{source.split}"
     return "argoverse2"
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for what a command writes; raises UserError where that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror or error}") from error

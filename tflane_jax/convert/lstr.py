@@ -9,10 +9,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
+from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.models.lstr import LstrConfig
+from tflane_jax.training.task import STATISTICS, Params
 
 _BACKBONE = (
     (r"(conv\d)\.weight", r"\1/kernel", "conv"),
@@ -86,8 +93,7 @@ def convert_lstr(state: Mapping[str, AnyArray]) -> Converted:
         state: tensors by PyTorch's names, with or without the prefix `module.`.
 
     Raises:
-        UserError: a tensor that LSTR does not have. What is missing shows when the variables are used: compare them
-            with `missing`.
+        UserError: a tensor that LSTR does not have.
     """
     table: list[dict[str, str]] = []
     variables: dict[str, Any] = {"params": {}, "batch_stats": {}}
@@ -95,7 +101,7 @@ def convert_lstr(state: Mapping[str, AnyArray]) -> Converted:
     for name, tensor in state.items():
         plain = name.removeprefix("module.")
         if _COUNTERS.fullmatch(plain):
-            table.append({"tensor": name, "shape": _shape_text(tensor), "becomes": "a counter, not needed"})
+            table.append({"tensor": name, "shape": _size(tensor.shape), "becomes": "a counter, not needed"})
             continue
         leaves = _renamed(plain, tensor, _LSTR)
         if leaves is None:
@@ -103,8 +109,38 @@ def convert_lstr(state: Mapping[str, AnyArray]) -> Converted:
         for path, value in leaves.items():
             is_statistic = path.endswith(("/mean", "/var")) or frozen.fullmatch(path) is not None
             _put(variables["batch_stats" if is_statistic else "params"], path, value)
-        table.append({"tensor": name, "shape": _shape_text(tensor), "becomes": ", ".join(leaves)})
+        table.append({"tensor": name, "shape": _size(tensor.shape), "becomes": ", ".join(leaves)})
     return Converted(variables, table)
+
+
+def load_lstr(path: Path, model: LstrConfig) -> tuple[Params, list[dict[str, str]]]:
+    """Return a task's parameters from a published checkpoint (.pth, .pkl, .npz), and the account of its tensors.
+
+    Raises:
+        UserError: the file cannot be read, or its tensors are not exactly those of the model.
+    """
+    state = read_state_dict(path)
+    converted = convert_lstr(state)
+    image = jax.ShapeDtypeStruct((360, 640, 3), jnp.float32), jax.ShapeDtypeStruct((360, 640), jnp.bool_)
+    expected = _shapes(dict(jax.eval_shape(model.build().init, jax.random.key(0), *image)))
+    found = _shapes(converted.variables)
+    for name in sorted(found.keys() | expected.keys()):
+        if found.get(name) != expected.get(name):
+            raise UserError(
+                f"{path} does not fit the model: {name} is {_size(found.get(name))} in the file and "
+                f"{_size(expected.get(name))} in the model. Change task.model to the sizes of the file"
+            )
+    variables = converted.variables
+    return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf.shape
+            for path, leaf in jax.tree.leaves_with_path(tree)}  # fmt: skip
+
+
+def _size(shape: tuple[int, ...] | None) -> str:
+    return "absent" if shape is None else "x".join(map(str, shape)) or "scalar"
 
 
 def backbone_variables(state: Mapping[str, AnyArray], *, frozen_stem_norm: bool = False) -> dict[str, Any]:
@@ -176,7 +212,3 @@ def _put(tree: dict[str, Any], path: str, value: Any) -> None:
     for parent in parents:
         tree = tree.setdefault(parent, {})
     tree[name] = value
-
-
-def _shape_text(tensor: Any) -> str:
-    return "x".join(map(str, tensor.shape)) or "scalar"

@@ -1,4 +1,4 @@
-"""Hungarian fitting loss of lane curves: GTN paper Eq. (3), (4) with the weights of LSTR (specs/modules.md section 2.7)."""
+"""Hungarian fitting loss of lane curves: GTN paper Eq. (3), (4), weighed as in LSTR (specs/modules.md section 2.7)."""
 
 from __future__ import annotations
 

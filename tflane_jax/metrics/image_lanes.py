@@ -24,6 +24,14 @@ def detected(prediction: LaneCurvePrediction) -> Bool[np.ndarray, " q"]:
     return logits[..., 1] > logits[..., 0]
 
 
+def left_to_right(prediction: LaneCurvePrediction) -> Int[np.ndarray, " l"]:
+    """Return the detected queries by the column in which their lanes end below."""
+    queries = np.flatnonzero(detected(prediction))
+    curves = np.asarray(prediction.curves, np.float64)[queries]
+    ends = curve_columns(curves[:, 2:], curves[:, 1:2])[:, 0]
+    return queries[np.argsort(ends, kind="stable")]
+
+
 def row_lanes(
     prediction: LaneCurvePrediction, rows: Float[np.ndarray, " h"], *, height: float, width: float
 ) -> RowLanes:

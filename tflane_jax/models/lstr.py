@@ -17,6 +17,7 @@ from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.positions import image_sine_encoding
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
+from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import LaneCurvePrediction
 
 # Of TuSimple images in [0, 1], blue, green, red: the order in which the published weights read them.
@@ -42,6 +43,9 @@ class TransformerEncoderConfig:
         return TransformerEncoder(self, name=name)
 
 
+EncoderConfig = TransformerEncoderConfig | GtnEncoderConfig | GcnEncoderConfig | HanEncoderConfig
+
+
 @dataclass(frozen=True)
 class LstrConfig:
     """The network; the defaults are LSTR's.
@@ -52,14 +56,17 @@ class LstrConfig:
         encoder: what lets the cells of the feature map look at each other.
         decoder_layers, decoder: layers that answer the queries.
         queries: most lanes that can be found.
+        shrink: side of the blocks of pixels that are averaged before the network sees them; 2 takes a quarter of the
+            time (the last stage's stride 1 then leaves as many cells as at full size).
     """
 
     backbone: ResNetConfig = ResNetConfig()
     dim: int = 32
-    encoder: TransformerEncoderConfig = TransformerEncoderConfig()
+    encoder: EncoderConfig = TransformerEncoderConfig()
     decoder_layers: int = 2
     decoder: TransformerConfig = TransformerConfig()
     queries: int = 7
+    shrink: int = 1
 
     def build(self) -> Lstr:
         """Return the Linen module."""
@@ -106,6 +113,7 @@ class Lstr(nn.Module):
             train: batch statistics in the norms (under `vmap` over the axis `batch_norm.BATCH_AXIS`), and dropout.
         """
         config = self.config
+        image, valid = shrink(image, valid, config.shrink)
         features = ResNet(config.backbone, name="backbone")(image[None], train=train)[-1][0]
         features = nn.Dense(config.dim, name="input_projection")(features)
         cells = nearest(valid, *features.shape[:2])
@@ -151,6 +159,19 @@ def normalise(image: UInt8[Array, "*b h w 3"], valid: Bool[Array, "*b h w"]) -> 
     lead = (1,) * (image.ndim - 1)
     mean, std = (jnp.asarray(values).reshape(*lead, 3) for values in (MEAN_BGR, STD_BGR))
     return (image[..., ::-1].astype(jnp.float32) / 255.0 - mean) / std
+
+
+def shrink(
+    image: Float[Array, "h w 3"], valid: Bool[Array, "h w"], side: int
+) -> tuple[Float[Array, "hs ws 3"], Bool[Array, "hs ws"]]:
+    """Return means of blocks of side x side pixels, valid where all are; raises ValueError where some are left."""
+    if side == 1:
+        return image, valid
+    height, width = valid.shape
+    if height % side or width % side:
+        raise ValueError(f"an image of {height} x {width} does not shrink by blocks of {side} x {side}")
+    blocks = (height // side, side, width // side, side)
+    return image.reshape(*blocks, 3).mean((1, 3)), valid.reshape(blocks).all((1, 3))
 
 
 def nearest(mask: Bool[Array, "h w"], rows: int, columns: int) -> Bool[Array, "rows columns"]:

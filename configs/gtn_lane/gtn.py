@@ -1,0 +1,19 @@
+"""LSTR with the GTN paper's encoder, a Graph Transformer Network, on front views of the built-in world.
+
+    tflane train --config configs/gtn_lane/gtn.py
+
+All but the encoder is that of `transformer.py`.
+"""
+
+import dataclasses
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.models.graph_encoders import GtnEncoderConfig
+
+
+def get_config() -> RunConfig:
+    """Return the baseline with this encoder."""
+    baseline = load_config(str(Path(__file__).with_name("transformer.py")))
+    model = dataclasses.replace(baseline.task.model, encoder=GtnEncoderConfig(dropout=0.0))
+    return dataclasses.replace(baseline, task=dataclasses.replace(baseline.task, model=model))

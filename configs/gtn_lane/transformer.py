@@ -1,0 +1,31 @@
+"""LSTR's own transformer encoder on front views of the built-in world, sized for two CPU cores: the baseline.
+
+    tflane train --config configs/gtn_lane/transformer.py
+    tflane compare configs/gtn_lane/{transformer,gtn,gcn,han}.py --seeds 0 1 2 --out runs/table1
+"""
+
+from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
+from tflane_jax.layers.resnet import ResNetConfig
+from tflane_jax.layers.transformer import TransformerConfig
+from tflane_jax.losses.lane_curve import LaneCurveLossConfig
+from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig
+from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+
+LAYER = TransformerConfig(dropout=0.0)
+
+
+def get_config() -> RunConfig:
+    """Return the baseline."""
+    # Half the resolution and as many cells as at the full one: four times as many steps in the same time.
+    model = LstrConfig(
+        ResNetConfig(strides=(1, 2, 2, 1)), encoder=TransformerEncoderConfig(layer=LAYER), decoder=LAYER, shrink=2
+    )
+    return RunConfig(
+        task=LaneCurveTask(model, LaneCurveLossConfig(least_depth=0.02)),
+        data=FrontViewData(train=4000, val=100, test=400),
+        optim=OptimConfig(lr=1e-3, warmup_steps=100, weight_decay=1e-4, b2=0.99, clip_norm=5.0, ema_decay=0.99),
+        training=TrainingConfig(steps=8000, batch_size=4, eval_every=2000, best_metric="all/Accuracy"),
+        evaluation=EvaluationConfig(batch_size=20),
+    )

@@ -1,0 +1,241 @@
+"""Graph Transformer Networks against the reference's numbers, and what its degree normalisation promises."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tflane_jax.layers.graph_transformer import (
+    GTN_2019,
+    GTN_2022,
+    FastGraphTransformer,
+    GraphTransformer,
+    convolve,
+    meta_path_graphs,
+    normalise,
+    propagate,
+    select,
+)
+
+VARIANTS = {"2019": GTN_2019, "2022": GTN_2022}
+
+
+def weight(params, name):
+    """A 1x1 convolution's kernel as (channels, edge types)."""
+    return params[f"{name}.weight"].reshape(params[f"{name}.weight"].shape[:2])
+
+
+def linear(params, name, x):
+    return x @ params[f"{name}.weight"].T + params[f"{name}.bias"][None]
+
+
+def classified(params, name, x, case):
+    """The reference's classifier of some of the nodes, and its loss."""
+    y = linear(params, name, x[case.inputs["target_x"]])
+    picked = jnp.take_along_axis(jax.nn.log_softmax(y), case.inputs["target"][:, None], 1)
+    return {"y": y, "loss": -picked.mean()}
+
+
+def shares(params, name):
+    return jax.nn.softmax(params[f"{name}.weight"], 1)
+
+
+def single_selection(case, params, inputs):
+    kernel = params["weight"]
+    return {"output": select(inputs["A"][0], kernel.reshape(kernel.shape[:2]))}
+
+
+def first_layer(case, params, inputs):
+    weights = jnp.stack([weight(params, "conv1"), weight(params, "conv2")])
+    graphs = meta_path_graphs(inputs["A"][0], weights, GTN_2019)
+    return {"H": graphs, "W0": shares(params, "conv1"), "W1": shares(params, "conv2")}
+
+
+def next_layer(case, params, inputs):
+    graphs = inputs["H"] @ select(inputs["A"][0], weight(params, "conv1"))
+    return {"H": graphs, "W0": shares(params, "conv1")}
+
+
+def selections(case, params):
+    further = [f"layers.{i}.conv1" for i in range(1, case.meta["config"]["layers"])]
+    names = ["layers.0.conv1", "layers.0.conv2", *further]
+    return names, jnp.stack([weight(params, name) for name in names])
+
+
+def dense_model(case, params, inputs):
+    """GTN of 2019: an MLP on the concatenated channels, then the classifier."""
+    config, (names, chosen) = case.meta["config"], selections(case, params)
+    adjacency = inputs["A"].transpose(2, 0, 1)
+    model = GraphTransformer(config["w_out"], config["channels"], config["layers"], GTN_2019)
+    variables = {"selection": chosen, "convolution": {"kernel": params["weight"]}}
+    x = model.apply({"params": variables}, adjacency, inputs["X"])
+    outs = {f"W.{name[7]}.{int(name[-1]) - 1}": shares(params, name) for name in names}
+    for i in range(config["layers"]):
+        outs[f"H.{i}"] = meta_path_graphs(adjacency, chosen[: i + 2], GTN_2019)
+    for i in range(config["layers"] - 1):
+        outs[f"Hnorm.{i}"] = normalise(outs[f"H.{i}"], "columns", "removed")
+    last = outs[f"H.{config['layers'] - 1}"]
+    identity = jnp.eye(len(inputs["X"]))
+    outs["norm_add.0"] = convolve(last, identity, GTN_2019)[0].T
+    outs["gcn.0"] = convolve(last, inputs["X"] @ params["weight"], GTN_2019)[0]
+    return outs | classified(params, "linear2", jax.nn.relu(linear(params, "linear1", x)), case)
+
+
+def sparse_model(case, params, inputs):
+    """GTN of 2022: the adjacency with receivers as rows, and the classifier on the concatenated channels."""
+    config, (_, chosen) = case.meta["config"], selections(case, params)
+    adjacency = inputs["A"].transpose(2, 1, 0)
+    assert not config["remove_self_loops"]
+    model = GraphTransformer(config["w_out"], config["channels"], config["layers"], GTN_2022)
+    variables = {"selection": chosen, "convolution": {"kernel": params["gcn.weight"]}, "bias": params["gcn.bias"]}
+    x = model.apply({"params": variables}, adjacency, inputs["X"])
+    outs, before = {}, None
+    for i in range(config["layers"]):
+        graphs = meta_path_graphs(adjacency, chosen[: i + 2], GTN_2022)
+        raw = select(adjacency, chosen[0]) if before is None else before
+        product = raw @ select(adjacency, chosen[i + 1])
+        outs |= {f"H.{i}.{c}": product[c] for c in range(config["channels"])}
+        outs |= {f"Hnorm.{i}.{c}": graphs[c] for c in range(config["channels"])}
+        before = graphs
+    outs["gcn.0"] = convolve(before, inputs["X"] @ params["gcn.weight"], GTN_2022)[0] + params["gcn.bias"][None]
+    return outs | classified(params, "linear", x, case)
+
+
+def fast_model(case, params, inputs):
+    config = case.meta["config"]
+    adjacency = inputs["A"].transpose(2, 1, 0)
+    # The last relation is the identity.
+    adjacency = jnp.concatenate([normalise(adjacency[:-1], loops="lonely"), adjacency[-1:]])
+    outs = {f"Anorm.{e}": matrix for e, matrix in enumerate(adjacency)}
+    x, channels, aggregate = inputs["X"], config["channels"], config["channel_agg"]
+    for k in range(config["fast_layers"]):
+        block = FastGraphTransformer(config["node_dim"], channels, config["layers"], config["beta"], aggregate)
+        below = f"fastGTNs.{k}"
+        names = [f"{below}.layers.{i}.conv1" for i in range(config["layers"])]
+        kernel = jnp.concatenate([params[f"{below}.Ws.{c}"] for c in range(channels)], 1)
+        selection = jnp.stack([weight(params, name) for name in names])
+        ours = {"selection": selection, "projection": {"kernel": kernel}}
+        joined = {"kernel": params[f"{below}.linear1.weight"].T, "bias": params[f"{below}.linear1.bias"]}
+        ours |= {"joined": joined} if aggregate == "concat" else {}
+        x = block.apply({"params": ours}, adjacency, x)
+        outs |= {f"H{k}": x} | {f"W.{i}": shares(params, name) for i, name in enumerate(names)}
+    return outs | classified(params, "linear", x, case)
+
+
+RUNS = {
+    "GTConv": single_selection,
+    "GTLayer": {False: first_layer, True: next_layer},
+    "GTN": dense_model,
+    "GTN (2022 sparse version)": sparse_model,
+    "FastGTNs": fast_model,
+}
+
+
+def run_of(case):
+    """The program for a case, by the class that the file was made from."""
+    run = RUNS[case.meta["source"].split(".py ")[1]]
+    return run["H" in case.inputs] if isinstance(run, dict) else run
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("gtn_*"), ids=case_id)
+def test_matches_the_reference(path):
+    case = load_module_case(path)
+    run = run_of(case)
+    floats = {name: value for name, value in case.inputs.items() if value.dtype == np.float32}
+
+    def scalar(params, inputs):
+        outs = run(case, params, inputs)
+        return sum((case.weights[name] * outs[name]).sum() for name in case.weights), outs
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, outs), (by_param, by_input) = step(case.params, floats)
+    assert_outputs_close(outs | {"grad_scalar": total}, case.outputs)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+
+def random_graphs(seed, *shape, share=0.4):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray((rng.random(shape) * (rng.random(shape) < share)).astype(np.float32))
+
+
+def random_weights(seed, count, channels=2, types=3):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(count, channels, types)).astype(np.float32))
+
+
+def test_gradients_match_finite_differences():
+    with jax.enable_x64(True):
+        adjacency = random_graphs(0, 3, 5, 5).astype(jnp.float64)
+        weights = random_weights(1, 3).astype(jnp.float64)
+        x = random_graphs(2, 5, 4).astype(jnp.float64)
+        check_grads(jax.jit(lambda w: select(adjacency, w)), (weights[0],), 1, ["rev"], 1e-6, 1e-6)
+        for variant in VARIANTS.values():
+            run = jax.jit(lambda w, v=variant: convolve(meta_path_graphs(adjacency, w, v), x, v))
+            check_grads(run, (weights,), 1, ["rev"], 1e-6, 1e-6)
+
+
+@pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS)
+def test_nodes_that_nobody_speaks_to_have_finite_gradients(variant):
+    """The reference divides 0 by 0 there."""
+    adjacency = random_graphs(3, 3, 6, 6).at[:, 2].set(0.0).at[:, :, 2].set(0.0)
+    model = GraphTransformer(4, layers=3, variant=variant)
+    x = random_graphs(4, 6, 5)
+    variables = model.init(jax.random.key(0), adjacency, x)
+    gradients = jax.grad(lambda v, a: model.apply(v, a, x).sum(), argnums=(0, 1))(variables, adjacency)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+    assert any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradients))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from(["rows", "columns"]), st.sampled_from(["kept", "removed", "lonely"]))
+def test_edges_into_a_node_sum_to_one(seed, receivers, loops):
+    graphs = random_graphs(seed, 2, 4, 4, share=0.3)
+    out = np.asarray(normalise(graphs, receivers, loops))
+    seen = np.asarray(graphs) * (1 - np.eye(4) if loops == "removed" else 1)
+    axis = 2 if receivers == "rows" else 1
+    expected = (seen.sum(axis) > 0) | (loops == "lonely")
+    np.testing.assert_allclose(out.sum(axis), expected, atol=1e-6)
+    if loops == "removed":
+        np.testing.assert_array_equal(np.diagonal(out, axis1=1, axis2=2), np.zeros((2, 4)))
+
+
+def test_selection_mixes_between_the_edge_types():
+    adjacency = random_graphs(5, 3, 4, 4)
+    one_hot = jnp.asarray([[0.0, 100.0, 0.0], [0.0, 0.0, 0.0]])
+    first, second = select(adjacency, one_hot)
+    np.testing.assert_allclose(first, adjacency[1], rtol=1e-6)
+    np.testing.assert_allclose(second, adjacency.mean(0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("hops", [1, 2, 4])
+def test_hop_by_hop_equals_the_product_of_the_selections(hops):
+    """With rows that sum to 1, FastGTN's hops are the products of 2022, whose normalisation changes nothing."""
+    adjacency = normalise(random_graphs(6, 3, 7, 7), loops="lonely")
+    weights, x = random_weights(7, hops), random_graphs(8, 7, 6)
+    hopped = propagate(lambda _, shares, h: jnp.einsum("ed,enm,md->nd", shares, adjacency, h), weights, x)
+    graphs = meta_path_graphs(adjacency, weights[::-1], GTN_2022)
+    expected = jnp.concatenate([graphs[c] @ x[:, 3 * c : 3 * c + 3] for c in range(2)], 1)
+    np.testing.assert_allclose(hopped, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("nodes", [0, 1])
+@pytest.mark.parametrize("build", [partial(GraphTransformer, 3), partial(FastGraphTransformer, 3)])
+def test_small_graphs(nodes, build):
+    adjacency, x = jnp.ones((2, nodes, nodes)), jnp.ones((nodes, 4))
+    out, variables = build().init_with_output(jax.random.key(0), adjacency, x)
+    assert out.shape[0] == nodes
+    assert np.isfinite(out).all()
+    assert variables["params"]["selection"].shape[1:] == (2, 2)

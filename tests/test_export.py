@@ -1,0 +1,78 @@
+"""Exported programs: any batch size, no model code, damaged files."""
+
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from tests.models.images import HEIGHT, WIDTH, road_image, tiny_task
+from tflane_jax.errors import UserError
+from tflane_jax.export import export_model, image_program, latencies, load_program
+
+
+@pytest.fixture(scope="module")
+def model():
+    task = tiny_task()
+    return task, jax.jit(task.init)(jax.random.key(0), road_image(0))
+
+
+@pytest.fixture(scope="module")
+def exported(model, tmp_path_factory):
+    return export_model(*model, tmp_path_factory.mktemp("export") / "sub" / "m.stablehlo", height=HEIGHT, width=WIDTH)
+
+
+def images(count):
+    return np.random.default_rng(count).integers(0, 256, (count, HEIGHT, WIDTH, 3), np.uint8)
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_gives_the_models_numbers_for_any_batch(model, exported, batch):
+    expected = jax.jit(image_program(*model))(images(batch))
+    answer = load_program(exported).call(images(batch))
+    for name in ("logits", "curves"):
+        np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
+
+
+def test_runs_in_a_process_that_does_not_know_this_package(model, exported, tmp_path):
+    np.save(tmp_path / "images.npy", images(2))
+    code = (
+        "import sys, numpy as np; from jax import export\n"
+        f"program = export.deserialize(bytearray(open({str(exported)!r}, 'rb').read()))\n"
+        "answer = program.call(np.load('images.npy'))\n"
+        "np.savez('answer.npz', **answer)\n"
+        "assert not any(name.startswith(('tflane_jax', 'flax')) for name in sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
+    expected = jax.jit(image_program(*model))(images(2))
+    with np.load(tmp_path / "answer.npz") as answer:
+        for name in ("logits", "curves"):
+            np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
+
+
+def test_is_made_for_accelerators_too(exported):
+    assert load_program(exported).platforms == ("cpu", "cuda")
+
+
+def test_latencies_name_every_batch_size(exported):
+    rows = latencies(load_program(exported), height=HEIGHT, width=WIDTH, batches=(1, 2), runs=3)
+    assert [row["batch"] for row in rows] == [1, 2]
+    assert all(row["ms"] > 0 for row in rows)
+
+
+def test_bad_files_are_named(exported, tmp_path):
+    with pytest.raises(UserError, match=r"nothing\.stablehlo: No such file"):
+        load_program(tmp_path / "nothing.stablehlo")
+    damaged = tmp_path / "damaged.stablehlo"
+    for content in (b"", b"no program", exported.read_bytes()[:500]):
+        damaged.write_bytes(content)
+        with pytest.raises(UserError, match=r"damaged\.stablehlo is no exported program"):
+            load_program(damaged)
+
+
+def test_nothing_half_written_where_writing_fails(model, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write"):
+        export_model(*model, tmp_path / "file" / "m.stablehlo", height=HEIGHT, width=WIDTH)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

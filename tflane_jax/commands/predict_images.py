@@ -1,0 +1,108 @@
+"""`tflane predict` for lane lines in one image.
+
+Photos: predictions.json, and one picture for each photo:
+    {"model", "step", "photos": [{"file", "width", "height", "picture",
+     "lanes": [{"score", "points": [[column, row], ...]}, ...]}, ...]}
+    with points in pixels of the photo, from the lane's upper end to its lower one, lanes from left to right.
+
+Examples of a split: pictures.png, and predictions.json and truth.json in TuSimple's form (one record a line), which
+`tflane score tusimple` takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from tqdm import tqdm
+
+from tflane_jax.commands.sources import lane_curve_source, make_folder
+from tflane_jax.errors import UserError
+from tflane_jax.images import PhotoCamera, fit_photo, list_photos, read_image
+from tflane_jax.metrics import image_lanes
+from tflane_jax.metrics.tusimple import RowLanes
+from tflane_jax.plots.images import predicted_lines, save_photo, save_road_images
+from tflane_jax.runs import Run
+from tflane_jax.scene import LaneLines, RoadImage, stack_examples
+from tflane_jax.systems import spread
+from tflane_jax.systems.lane_curve import found_lanes, name_of, open_images, predict, truth_of
+from tflane_jax.training.run_folder import write_json, write_text
+
+
+def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
+    """Find the lanes in photos of any size; write a picture of each and the points of all."""
+    photos = list_photos(paths)
+    camera = PhotoCamera(options.focal, options.horizon)
+    make_folder(options.out)
+    records, names = [], _picture_names(photos)
+    for path, name in tqdm(list(zip(photos, names, strict=True)), desc="predict", unit="photo"):
+        photo = read_image(path)
+        fitted = fit_photo(photo, camera)
+        example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
+        stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
+        answer = jax.tree.map(lambda leaf: leaf[0], predict(trained.config.task, trained.params[0], stacked))
+        lanes = fitted.placement.to_photo(predicted_lines(answer))
+        # A lane goes on beyond the picture's edge; what lies outside it is neither drawn nor written.
+        inside = [_inside(lane, photo.shape) for lane in lanes]
+        scores = image_lanes.lane_scores(answer)[image_lanes.left_to_right(answer)]
+        found = [{"score": float(s), "points": np.round(lane, 2).tolist()}
+                 for s, lane in zip(scores, inside, strict=True) if len(lane) > 1]  # fmt: skip
+        height, width = photo.shape[:2]
+        records.append({"file": str(path), "width": width, "height": height, "picture": name, "lanes": found})
+        title = f"{path.name}: {len(found)} lane line{'' if len(found) == 1 else 's'}"
+        save_photo(options.out / name, photo, [lane for lane in inside if len(lane) > 1], title)
+    head = {"model": trained.name, "step": trained.step}
+    write_json(options.out / "predictions.json", head | {"photos": records})
+    lanes = sum(len(record["lanes"]) for record in records)
+    print(f"{lanes} lane lines in {len(photos)} photos; pictures and predictions.json written to {options.out}")
+    return 0
+
+
+def predict_split(trained: Run, options: argparse.Namespace) -> int:
+    """Find the lanes in images of a dataset, beside their truth."""
+    dataset = open_images(lane_curve_source(trained.config, options))
+    if options.count < 1 or len(dataset) == 0:
+        raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
+    indices = spread(len(dataset), options.count)
+    examples = stack_examples([dataset.example(index) for index in indices])
+    answers = predict(trained.config.task, trained.params[0], examples)
+    make_folder(options.out)
+    predictions, truths = [], []
+    for i, index in enumerate(indices):
+        truth = truth_of(dataset, index)
+        found = found_lanes(jax.tree.map(lambda leaf, i=i: leaf[i], answers), truth)
+        name = name_of(dataset, index)
+        truths.append({"raw_file": name, "lanes": _plain(truth), "h_samples": np.asarray(truth.rows).tolist()})
+        predictions.append({"raw_file": name, "lanes": _plain(found), "run_time": 0.0})
+    for name, rows in (("predictions.json", predictions), ("truth.json", truths)):
+        write_text(options.out / name, "".join(json.dumps(row) + "\n" for row in rows))
+    title = f"{Path(trained.name).name}, step {trained.step}"
+    names = [name_of(dataset, index) for index in indices]
+    save_road_images(options.out / "pictures.png", examples, {title: answers}, titles=names)
+    print(f"{len(indices)} images written to {options.out}: predictions.json, truth.json, pictures.png")
+    return 0
+
+
+def _plain(lanes: RowLanes) -> list[list[float]]:
+    return np.round(lanes.x, 3).tolist()
+
+
+def _inside(lane: Float[np.ndarray, "p 2"], shape: tuple[int, ...]) -> Float[np.ndarray, "k 2"]:
+    height, width = shape[:2]
+    u, v = lane.T
+    return lane[(u >= 0) & (u < width) & (v >= 0) & (v < height)]
+
+
+def _picture_names(photos: list[Path]) -> list[str]:
+    """Return a name for each photo's picture; photos of one name in different folders get numbers."""
+    seen: dict[str, int] = {}
+    names: list[Any] = []
+    for photo in photos:
+        count = seen[photo.stem] = seen.get(photo.stem, 0) + 1
+        names.append(f"{photo.stem}-lanes.png" if count == 1 else f"{photo.stem}-{count}-lanes.png")
+    return names

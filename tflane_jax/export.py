@@ -1,0 +1,96 @@
+"""A trained monocular model as one StableHLO file: any batch size, weights inside, runs without this package.
+
+    from jax import export
+    program = export.deserialize(open("lstr.stablehlo", "rb").read())
+    answer = program.call(images)    # (b, 360, 640, 3) uint8 RGB -> {"logits": (b, q, 2), "curves": (b, q, 8)}
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jaxtyping import Array, Float, UInt8
+
+from tflane_jax.errors import UserError
+from tflane_jax.scene import LaneLines, RoadImage
+from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.training.task import Params
+
+PLATFORMS = ("cpu", "cuda")
+Answer = dict[str, Float[Array, "b q c"]]
+
+
+def image_program(task: LaneCurveTask, params: Params) -> Callable[[UInt8[Array, "b h w 3"]], Answer]:
+    """Return the model as a function of RGB images alone, with its weights inside."""
+
+    def predict(images: UInt8[Array, "b h w 3"]) -> Answer:
+        no_lines = LaneLines(jnp.zeros((0, 1, 2)), jnp.zeros((0, 1), bool), jnp.zeros(0, bool))
+
+        def one(image):
+            return task.predict(params, RoadImage(image, jnp.ones(image.shape[:2], bool), no_lines))
+
+        answer = jax.vmap(one)(images)
+        return {"logits": answer.logits, "curves": answer.curves}
+
+    return predict
+
+
+def export_model(
+    task: LaneCurveTask, params: Params, path: Path, *, height: int, width: int, platforms: Sequence[str] = PLATFORMS
+) -> Path:
+    """Write the model for images of one size and batches of any size; return the path.
+
+    Raises UserError where the file cannot be written.
+    """
+    (batch,) = export.symbolic_shape("b")
+    images = jax.ShapeDtypeStruct((batch, height, width, 3), jnp.uint8)
+    content = export.export(jax.jit(image_program(task, params)), platforms=platforms)(images).serialize()
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+    return path
+
+
+def load_program(path: Path) -> export.Exported:
+    """Return an exported program; raises UserError where there is none or it is damaged."""
+    try:
+        return export.deserialize(bytearray(path.read_bytes()))
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from error
+    except Exception as error:  # flatbuffers complain in many ways
+        raise UserError(f"{path} is no exported program, or damaged: write it again with tflane export") from error
+
+
+def latencies(
+    program: export.Exported, *, height: int, width: int, batches: Sequence[int] = (1, 4, 16), runs: int = 20
+) -> list[dict[str, Any]]:
+    """Return a row for each batch size: seconds to compile, median milliseconds a call, images a second."""
+    rows = []
+    for batch in batches:
+        images = jnp.asarray(np.random.default_rng(0).integers(0, 256, (batch, height, width, 3), np.uint8))
+        began = time.perf_counter()
+        call = jax.jit(program.call).lower(images).compile()
+        compiled = time.perf_counter() - began
+        seconds = []
+        for _ in range(runs):
+            began = time.perf_counter()
+            jax.block_until_ready(call(images))
+            seconds.append(time.perf_counter() - began)
+        median = float(np.median(seconds[1:]))
+        rows.append({"batch": batch, "ms": 1e3 * median, "images/s": batch / median, "compile s": compiled})
+    return rows

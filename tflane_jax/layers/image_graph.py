@@ -1,0 +1,208 @@
+"""Edge types between the cells of a feature map, applied without their matrices.
+
+A cell hears (rows of the adjacency) from other cells. Edge types are scaled such that the edges into each valid cell
+sum to 1: D^-1 A, known in closed form from which cells are valid. Then so do the edges of every product of edge types,
+and meta-paths need no normalisation. A cell that nobody of an edge type speaks to hears itself, as in FastGTN.
+
+* `self`: the cell itself.
+* `up`, `down`, `left`, `right` and the four diagonals: the neighbour on that side, a shift of the map.
+* `row`, `column`: all valid cells of the same row or column, itself included; a mean along an axis.
+
+Cells that are not valid influence no valid cell if they hold finite values; what is returned for them means nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+Relation = Literal[
+    "self", "up", "down", "left", "right", "up_left", "up_right", "down_left", "down_right", "row", "column"
+]
+Side = tuple[int, int]
+
+# Where the neighbour stands: cells down and to the right.
+SIDES: Mapping[str, Side] = {
+    "up": (-1, 0),
+    "down": (1, 0),
+    "left": (0, -1),
+    "right": (0, 1),
+    "up_left": (-1, -1),
+    "up_right": (-1, 1),
+    "down_left": (1, -1),
+    "down_right": (1, 1),
+}
+AXES: Mapping[str, int] = {"row": 1, "column": 0}
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def mix_relations(
+    relations: tuple[Relation, ...], shares: Float[Array, "e c"], x: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+) -> Float[Array, "h w c"]:
+    """Return sum_e share_e A_e x, Eq. (1) of the GTN lane paper applied to features.
+
+    The gradient is written out: it is a mixture of shifts and means as well, where JAX's is a dozen arrays.
+    """
+    x, near = _near(relations, jnp.where(valid[..., None], x, 0.0))
+    out = _itself(relations, valid, x.dtype) @ shares * x
+    for relation, share in zip(relations, shares[:, None, None], strict=True):
+        if relation in SIDES:
+            out = out + share * near[SIDES[relation]]
+        if relation in AXES:
+            out = out + share * _line_mean(x, valid, AXES[relation])
+    return out
+
+
+def _mix_backward(relations, residuals, gradient):
+    shares, x, valid = residuals
+    x, near = _near(relations, jnp.where(valid[..., None], x, 0.0))
+    # Who hears a cell on one side stands on its other side.
+    gradient, back = _near(relations, gradient, -1)
+    itself = _itself(relations, valid, x.dtype)
+    to_x = itself @ shares * gradient
+    to_shares = list(jnp.einsum("hwe,hwc->ec", itself, gradient * x))
+    for i, (relation, share) in enumerate(zip(relations, shares[:, None, None], strict=True)):
+        if relation in SIDES:
+            to_x = to_x + share * back[SIDES[relation]]
+            to_shares[i] += (gradient * near[SIDES[relation]]).sum((0, 1))
+        if relation in AXES:
+            axis = AXES[relation]
+            of_line = gradient.sum(axis, keepdims=True)
+            to_x = to_x + _line_weights(valid, axis, x.dtype)[..., None] * (share * of_line)
+            to_shares[i] += (of_line * _line_mean(x, valid, axis)).sum((0, 1))
+    return jnp.stack(to_shares), jnp.where(valid[..., None], to_x, 0.0), None
+
+
+mix_relations.defvjp(lambda relations, *arrays: (mix_relations(relations, *arrays), arrays), _mix_backward)
+
+
+def _near(relations, x, sign=1):
+    """Return x, and x shifted by each side among the relations, or the other way with sign -1."""
+    sides = tuple(SIDES[relation] for relation in relations if relation in SIDES)
+    if not sides:
+        return x, {}
+    # x itself is read from the array with a border too: what only that reads, XLA computes once, not in every reader.
+    here, *near = neighbours(((0, 0), *((sign * down, sign * right) for down, right in sides)), x)
+    return here, dict(zip(sides, near, strict=True))
+
+
+def _itself(relations, valid, dtype) -> Float[Array, "h w e"]:
+    """Return the diagonals of the edge types but for rows and columns: who hears nobody hears itself."""
+
+    def one(relation):
+        if relation in SIDES:
+            return ~shifted(valid, SIDES[relation])
+        return jnp.full(valid.shape, relation not in AXES)
+
+    return jnp.stack([one(relation) for relation in relations], -1).astype(dtype)
+
+
+def _line_mean(x, valid, axis):
+    # A product takes less than half the time of a sum over the axis.
+    along = "hw,hwc->hc" if axis == 1 else "hw,hwc->wc"
+    return jnp.expand_dims(jnp.einsum(along, _line_weights(valid, axis, x.dtype), x), axis)
+
+
+def _line_weights(valid, axis, dtype):
+    """Return one over the number of valid cells along the axis, 0 where a cell is not valid."""
+    return valid / jnp.maximum(valid.sum(axis, keepdims=True), 1).astype(dtype)
+
+
+def shifted(x: Array, side: Side) -> Array:
+    """Return for each cell the value of its neighbour `side` = (down, right) cells away; 0 beyond the border."""
+    config = [(-side[0], side[0], 0), (-side[1], side[1], 0), *[(0, 0, 0)] * (x.ndim - 2)]
+    return x if 0 in x.shape[:2] else lax.pad(x, jnp.zeros((), x.dtype), config)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def neighbours(sides: tuple[Side, ...], x: Float[Array, "h w *c"]) -> tuple[Float[Array, "h w *c"], ...]:
+    """Return `shifted(x, side)` for each side, at most one cell away, several times as fast as one by one."""
+    height, width = x.shape[:2]
+    # The barrier has the border made once; XLA would test for it in every element of what uses the shifts.
+    bordered = lax.optimization_barrier(jnp.pad(x, [(1, 1), (1, 1), *[(0, 0)] * (x.ndim - 2)]))
+    return tuple(bordered[1 + down : 1 + down + height, 1 + right : 1 + right + width] for down, right in sides)
+
+
+def _neighbours_backward(sides, _, gradients):
+    # The gradient that JAX writes for a slice of `bordered` costs more than everything else here together.
+    back = [shifted(gradient, (-down, -right)) for gradient, (down, right) in zip(gradients, sides, strict=True)]
+    return (sum(back[1:], back[0]),)
+
+
+neighbours.defvjp(lambda sides, x: (neighbours(sides, x), None), _neighbours_backward)
+
+
+def smooth(x: Float[Array, "h w c"], valid: Bool[Array, "h w"]) -> Float[Array, "h w c"]:
+    """Return D^-1/2 (A + I) D^-1/2 x over the 8 neighbours of each cell (Kipf & Welling 2017, Eq. 2)."""
+    degree = _box(valid[..., None].astype(x.dtype))
+    scale = jnp.where(valid[..., None], lax.rsqrt(jnp.maximum(degree, 1.0)), 0.0)
+    return scale * _box(scale * x)
+
+
+def _box(x):
+    """Return the sum over the 3 x 3 cells around each: down, then across."""
+    for sides in (((-1, 0), (0, 0), (1, 0)), ((0, -1), (0, 0), (0, 1))):
+        before, here, behind = neighbours(sides, x)
+        x = before + here + behind
+    return x
+
+
+def attend_near(
+    listen: Float[Array, "h w heads"],
+    speak: Float[Array, "h w heads"],
+    value: Float[Array, "h w heads d"],
+    valid: Bool[Array, "h w"],
+) -> tuple[Float[Array, "h w heads d"], Float[Array, "9 h w heads"]]:
+    """Attend to the cell and its 8 neighbours; see `attend_along`. Weights: the cell itself first, then `SIDES`."""
+    sides = [(0, 0), *SIDES.values()]
+    speaks = jnp.stack([shifted(valid, side) for side in sides])[..., None]
+    scores = jnp.stack([_score(listen, spoken) for spoken in neighbours(tuple(sides), speak)])
+    weights = _softmax(scores, speaks, 0)
+    near = neighbours(tuple(sides), value)
+    parts = (w[..., None] * v for w, v in zip(weights, near, strict=True))
+    return sum(parts, jnp.zeros_like(value)), weights
+
+
+def attend_along(
+    axis: int,
+    listen: Float[Array, "h w heads"],
+    speak: Float[Array, "h w heads"],
+    value: Float[Array, "h w heads d"],
+    valid: Bool[Array, "h w"],
+) -> tuple[Float[Array, "h w heads d"], Float[Array, "lines n n heads"]]:
+    """Attend to the valid cells of the same row (axis 1) or column (axis 0), GAT's way (Wang et al. 2019, Eq. 3).
+
+    Args:
+        axis: along which the cells of a neighbourhood lie.
+        listen, speak: the two halves of a^T [h_i || h_j].
+        value: finite everywhere.
+        valid: cells that may be heard.
+
+    Returns:
+        What each cell hears, and the weights: line, listening cell, speaking cell, head.
+    """
+    if axis == 0:
+        listen, speak, value, valid = (x.swapaxes(0, 1) for x in (listen, speak, value, valid))
+    weights = _softmax(_score(listen[:, :, None], speak[:, None]), valid[:, None, :, None], 2)
+    out = jnp.einsum("lijh,ljhd->lihd", weights, value)
+    return (out.swapaxes(0, 1) if axis == 0 else out), weights
+
+
+def _score(listen, speak):
+    return nn.leaky_relu(listen + speak, 0.2)
+
+
+def _softmax(scores, speaks, axis):
+    """Return the softmax over the cells that speak; 0 where none does."""
+    scores = jnp.where(speaks, scores, -jnp.inf)
+    top = lax.stop_gradient(scores.max(axis, keepdims=True, initial=jnp.finfo(scores.dtype).min))
+    weights = jnp.exp(scores - top)
+    total = weights.sum(axis, keepdims=True)
+    return weights / jnp.where(total > 0, total, 1.0)

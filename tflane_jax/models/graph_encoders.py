@@ -1,0 +1,292 @@
+"""Graph encoders in the place of LSTR's transformer encoder (GTN lane paper, section 2.1): GTN, GCN and HAN.
+
+The paper puts Graph Transformer Networks into the encoding layer, compares GCN and HAN, and shares parameters between
+GNN and transformer; it does not say how. Our reading: an encoder layer keeps the transformer's frame (residual, norm,
+feed-forward, residual, norm), and graph convolution on learned meta-paths stands where self-attention stood. The nodes
+are the cells of the feature map, the edge types those of `layers.image_graph`.
+
+Self-attention is one of the GTN's edge types, similarity: its adjacency comes from the query and key projections of
+features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.
+One set of parameters thus serves both; the GTN adds the selection weights, hops * channels * edge types. A layer that
+selects similarity in one hop and `self` in the others is exactly the transformer's encoder layer.
+
+A layer costs about what the transformer's does: products of adjacencies are never formed (FastGTN), the other edge
+types are shifts and means, and similarity, with one head for all channels, is offered to one hop of the meta-path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.errors import UserError
+from tflane_jax.layers.attention import attention_probabilities, masked_attention
+from tflane_jax.layers.graph_transformer import propagate
+from tflane_jax.layers.image_graph import AXES, Relation, attend_along, attend_near, mix_relations, smooth
+from tflane_jax.layers.masks import key_mask
+
+
+@dataclass(frozen=True)
+class GtnEncoderConfig:
+    """Graph Transformer Network encoder.
+
+    Attributes:
+        layers: encoder layers.
+        hops: edges of a meta-path.
+        channels: meta-paths side by side, each with its share of the features.
+        relations: structural edge types to choose from.
+        similarity: attention over all cells as a further edge type, the last: offered to the last hop only, to every
+            hop (an attention product each), or to none, for a purely structural graph.
+        heads: of similarity; 1 is shared by all channels and costs least.
+        hidden: channels inside the feed-forward part.
+        dropout: of hidden channels and everything that is added to a residual.
+    """
+
+    layers: int = 2
+    hops: int = 2
+    channels: int = 2
+    relations: tuple[Relation, ...] = ("self", "up", "down", "left", "right", "row", "column")
+    similarity: Literal["last_hop", "every_hop"] | None = "last_hop"
+    heads: int = 1
+    hidden: int = 128
+    dropout: float = 0.1
+
+    def build(self, dim: int, name: str) -> GraphEncoder:
+        """Return the Linen module for `dim` channels; raises UserError where they do not split."""
+        if not self.relations and not self.offers_similarity(0):
+            raise UserError("a GTN encoder needs edge types: name relations, or set similarity to 'every_hop'")
+        _check_split(dim, "channels", self.channels)
+        _check_split(dim, "heads", self.heads)
+        return GraphEncoder(self, name=name)
+
+    def offers_similarity(self, hop: int) -> bool:
+        """Return whether a hop may choose similarity."""
+        return self.similarity == "every_hop" or (self.similarity == "last_hop" and hop == self.hops - 1)
+
+    def mixing(self, name: str) -> MetaPathConvolution:
+        """Return what stands for self-attention in a layer."""
+        return MetaPathConvolution(self, name=name)
+
+
+@dataclass(frozen=True)
+class GcnEncoderConfig:
+    """Graph convolution over the 8 neighbours (Kipf & Welling 2017).
+
+    Attributes:
+        layers: encoder layers.
+        hidden: channels inside the feed-forward part.
+        dropout: of hidden channels and everything that is added to a residual.
+    """
+
+    layers: int = 2
+    hidden: int = 128
+    dropout: float = 0.1
+
+    def build(self, dim: int, name: str) -> GraphEncoder:
+        """Return the Linen module; `dim` is what its input has."""
+        del dim
+        return GraphEncoder(self, name=name)
+
+    def mixing(self, name: str) -> NeighbourConvolution:
+        """Return what stands for self-attention in a layer."""
+        return NeighbourConvolution(name=name)
+
+
+@dataclass(frozen=True)
+class HanEncoderConfig:
+    """Heterogeneous graph attention network (Wang et al. 2019).
+
+    Attributes:
+        layers: encoder layers.
+        heads: of node-level attention.
+        relations: edge types: `near` is the cell and its 8 neighbours, `row` and `column` lie along an axis.
+        semantic: channels of semantic-level attention.
+        hidden: channels inside the feed-forward part.
+        dropout: of hidden channels and everything that is added to a residual.
+    """
+
+    layers: int = 2
+    heads: int = 2
+    relations: tuple[Literal["near", "row", "column"], ...] = ("near", "row", "column")
+    semantic: int = 32
+    hidden: int = 128
+    dropout: float = 0.1
+
+    def build(self, dim: int, name: str) -> GraphEncoder:
+        """Return the Linen module for `dim` channels; raises UserError where they do not split."""
+        if not self.relations:
+            raise UserError("a HAN encoder needs edge types: name relations")
+        _check_split(dim, "heads", self.heads)
+        return GraphEncoder(self, name=name)
+
+    def mixing(self, name: str) -> HeterogeneousAttention:
+        """Return what stands for self-attention in a layer."""
+        return HeterogeneousAttention(self, name=name)
+
+
+GraphEncoderConfig = GtnEncoderConfig | GcnEncoderConfig | HanEncoderConfig
+
+
+class GraphEncoder(nn.Module):
+    """Encoder layers over the graph of a feature map."""
+
+    config: GraphEncoderConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        features: Float[Array, "h w c"],
+        position: Float[Array, "h w c"],
+        valid: Bool[Array, "h w"],
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "h w c"]:
+        """Return the memory; cells that are not valid influence nothing and are 0.
+
+        Stores of each layer, where a caller asks for it with `mutable="intermediates"`, `relations`: the weights of the
+        edge types, by hop and channel (1 and 1 but for the GTN), and the weights of attention.
+
+        Args:
+            features, position: of each cell; position tells who is looking for whom, and is not passed on.
+            valid: cells that show something.
+            deterministic: no dropout.
+        """
+        shown = valid[..., None]
+        x, position = jnp.where(shown, features, 0.0), jnp.where(shown, position, 0.0)
+        for i in range(self.config.layers):
+            layer = GraphEncoderLayer(self.config, name=f"layer_{i}")
+            x = layer(x, position, valid, deterministic=deterministic)
+        return jnp.where(shown, x, 0.0)
+
+
+class GraphEncoderLayer(nn.Module):
+    """The transformer's encoder layer with a graph in the place of self-attention."""
+
+    config: GraphEncoderConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        x: Float[Array, "h w c"],
+        position: Float[Array, "h w c"],
+        valid: Bool[Array, "h w"],
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "h w c"]:
+        """Return the features after the layer."""
+        config = self.config
+
+        def drop(name, x):
+            return nn.Dropout(config.dropout, name=name)(x, deterministic=deterministic)
+
+        mixed = config.mixing("graph")(x, position, valid)
+        x = nn.LayerNorm(epsilon=1e-5, name="graph_norm")(x + drop("graph_dropout", mixed))
+        hidden = drop("hidden_dropout", nn.relu(nn.Dense(config.hidden, name="expand")(x)))
+        fed = nn.Dense(x.shape[-1], name="contract")(hidden)
+        return nn.LayerNorm(epsilon=1e-5, name="fed_norm")(x + drop("fed_dropout", fed))
+
+
+class MetaPathConvolution(nn.Module):
+    """Graph convolution on learned meta-paths, attention being one of the edge types."""
+
+    config: GtnEncoderConfig
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+    ) -> Float[Array, "h w c"]:
+        """Return what is added to x."""
+        config, dim = self.config, x.shape[-1]
+        offered = [config.offers_similarity(hop) for hop in range(config.hops)]
+        structural = len(config.relations)
+        shape = (config.hops, config.channels, structural + any(offered))
+        weights = self.param("selection", nn.initializers.normal(0.01), shape)
+        if any(offered):
+            weights = jnp.where(_choices(offered, structural), weights, -jnp.inf)
+        mask, asking = key_mask(valid.reshape(-1)), x + position
+        asked = nn.Dense(2 * dim, name="query_key")(asking)
+        query, key = (_by_head(half, config.heads) for half in jnp.split(asked, 2, axis=-1))
+
+        def mix(hop, shares, h):
+            heard = mix_relations(config.relations, shares[:structural], h, valid) if structural else 0.0
+            if not offered[hop]:
+                return heard
+            similar = masked_attention(query, key, _by_head(h, config.heads), mask).swapaxes(0, 1).reshape(h.shape)
+            return heard + shares[structural][None, None] * similar
+
+        if self.is_mutable_collection("intermediates"):
+            self.sow("intermediates", "relations", nn.softmax(weights, -1))
+            if any(offered):
+                self.sow("intermediates", "probabilities", attention_probabilities(query, key, mask))
+        heard = propagate(mix, weights, nn.Dense(dim, name="value")(x))
+        return nn.Dense(dim, name="output")(heard)
+
+
+class NeighbourConvolution(nn.Module):
+    """ReLU(D^-1/2 (A + I) D^-1/2 x W), Kipf & Welling 2017, Eq. (2). Without queries there is no use for positions."""
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+    ) -> Float[Array, "h w c"]:
+        """Return what is added to x."""
+        del position
+        if self.is_mutable_collection("intermediates"):
+            self.sow("intermediates", "relations", jnp.ones((1, 1, 1), x.dtype))
+        return nn.relu(smooth(nn.Dense(x.shape[-1], name="value")(x), valid))
+
+
+class HeterogeneousAttention(nn.Module):
+    """Attention within the neighbourhoods of each edge type, and attention over the edge types."""
+
+    config: HanEncoderConfig
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+    ) -> Float[Array, "h w c"]:
+        """Return what is added to x."""
+        config, (height, width, dim) = self.config, x.shape
+        # All cells are nodes of one type, hence one transformation (Wang et al. 2019, Eq. 1).
+        transform = nn.Dense(dim, name="value")
+        value = transform(x).reshape(height, width, config.heads, dim // config.heads)
+        asking = (x + position).reshape(height * width, dim)
+        # a^T [W h_i || W h_j] of every edge type and head in one product (Eq. 2-3).
+        halves = nn.Dense(2 * len(config.relations) * config.heads, use_bias=False, name="scores")(asking)
+        halves = halves.reshape(height, width, len(config.relations), 2, config.heads)
+        heard = []
+        for i, relation in enumerate(config.relations):
+            listen, speak = halves[:, :, i, 0], halves[:, :, i, 1]
+            if relation == "near":
+                out, weights = attend_near(listen, speak, value, valid)
+            else:
+                out, weights = attend_along(AXES[relation], listen, speak, value, valid)
+            heard.append(nn.elu(out.reshape(height, width, dim)))  # Eq. (4)
+            if self.is_mutable_collection("intermediates"):
+                self.sow("intermediates", f"{relation}_probabilities", weights)
+        # beta = softmax of mean_i q^T tanh(W z_i + b) (Eq. 7-9), over valid cells.
+        summary, question = nn.Dense(config.semantic, name="semantic"), nn.Dense(1, use_bias=False, name="question")
+        count = jnp.maximum(valid.sum(), 1).astype(x.dtype)
+        asked = jnp.stack([jnp.where(valid, question(jnp.tanh(summary(z)))[..., 0], 0.0).sum() for z in heard])
+        shares = nn.softmax(asked / count)
+        if self.is_mutable_collection("intermediates"):
+            self.sow("intermediates", "relations", shares[None, None])
+        return sum((shares[i] * z for i, z in enumerate(heard)), jnp.zeros_like(x))
+
+
+def _choices(offered: list[bool], structural: int) -> Bool[Array, "hops 1 e"]:
+    """Return which edge types a hop may choose: all structural ones, and similarity where it is offered."""
+    return jnp.asarray([[[True] * structural + [similar]] for similar in offered])
+
+
+def _by_head(x: Float[Array, "h w c"], heads: int) -> Float[Array, "heads n d"]:
+    return x.reshape(x.shape[0] * x.shape[1], heads, x.shape[-1] // heads).swapaxes(0, 1)
+
+
+def _check_split(dim: int, what: str, count: int) -> None:
+    if dim % count:
+        raise UserError(f"{dim} features do not split over {count} {what}: choose a divisor of {dim}")

@@ -1,0 +1,112 @@
+"""Lane lines drawn over front-view images: truth and predictions on pages, and one picture for one photo."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tflane_jax.geometry.lane_curves import curve_columns
+from tflane_jax.metrics.image_lanes import left_to_right
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.scene import LaneCurvePrediction, LaneLines, RoadImage
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Neighbouring lanes differ; all stand out on asphalt.
+LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#7ae582", "#c792ea", "#ff9d3c", "#f5f5f5")
+TRUTH = "#8be28b"
+_POINTS = 100
+
+
+def save_road_images(
+    path: Path,
+    examples: RoadImage,
+    predictions: Mapping[str, LaneCurvePrediction] | None = None,
+    *,
+    titles: Sequence[str] = (),
+) -> Path:
+    """Write one row per image: truth, then one column per model with the truth as thin dashes; return the path.
+
+    Args:
+        path: .png, .pdf or .svg.
+        examples: B of them, stacked along a leading axis.
+        predictions: by the name of the model, stacked in the same way.
+        titles: one per row; default their numbers.
+
+    Raises:
+        ValueError: the numbers of examples, predictions and titles differ.
+    """
+    predictions, count = predictions or {}, len(examples.image)
+    titles = titles or [f"image {row}" for row in range(count)]
+    sizes = {"titles": len(titles)} | {name: len(stacked.logits) for name, stacked in predictions.items()}
+    if any(size != count for size in sizes.values()):
+        raise ValueError(f"{count} images, but {sizes}")
+    height, width = examples.image.shape[1:3]
+    figure, axes = new_figure(count, 1 + len(predictions), panel=(4.8, 4.8 * height / width + 0.25))
+    for row, title in enumerate(titles):
+        example, (truth, *columns) = _pick(examples, row), axes[row]
+        draw_image(truth, example.image, f"{title}: truth")
+        draw_lines(truth, example.lines, (height, width), width=1.6)
+        for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
+            draw_image(ax, example.image, name)
+            draw_lines(ax, example.lines, (height, width), width=0.9, style="--")
+            draw_lanes(ax, predicted_lines(_pick(stacked, row)) * [width, height])
+    return save_figure(figure, path)
+
+
+def save_photo(
+    path: Path, photo: UInt8[np.ndarray, "h w 3"], lanes: Sequence[Float[np.ndarray, "p 2"]], title: str
+) -> Path:
+    """Write one photo with the lanes found in it, columns and rows in pixels, and return the path."""
+    height, width = photo.shape[:2]
+    figure, axes = new_figure(1, 1, panel=(9.6, 9.6 * height / width + 0.3))
+    draw_image(axes[0, 0], photo, title)
+    draw_lanes(axes[0, 0], lanes)
+    return save_figure(figure, path)
+
+
+def predicted_lines(prediction: LaneCurvePrediction, count: int = _POINTS) -> Float[np.ndarray, "l p 2"]:
+    """Return (u, v) of the detected lanes, left to right at their lower ends, as shares of the image.
+
+    Args:
+        prediction: one example, one layer.
+        count: rows of each lane's extent.
+    """
+    curves = np.asarray(prediction.curves, np.float64)[left_to_right(prediction)]
+    rows = np.linspace(curves[:, 0], curves[:, 1], count, axis=-1)
+    return np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
+
+
+def draw_image(ax: Axes, image: UInt8[np.ndarray, "h w 3"], title: str = "") -> None:
+    """Show an image, its pixels from 0 to width and height, without axes."""
+    height, width = image.shape[:2]
+    ax.imshow(image, extent=(0, width, height, 0))
+    ax.set(xlim=(0, width), ylim=(height, 0))
+    ax.set_axis_off()
+    ax.set_title(title, fontsize=8, loc="left")
+
+
+def draw_lines(ax: Axes, lines: LaneLines, size: tuple[int, int], *, width: float, style: str = "-") -> None:
+    """Draw true lane lines; `size` is the image's height and width."""
+    scale = np.array([size[1], size[0]])
+    for points, point_valid, valid in zip(lines.points, lines.point_valid, lines.valid, strict=True):
+        if valid:
+            u, v = (np.asarray(points)[np.asarray(point_valid)] * scale).T
+            ax.plot(u, v, style, color=TRUTH, linewidth=width)
+
+
+def draw_lanes(ax: Axes, lanes: Iterable[Float[np.ndarray, "p 2"]]) -> None:
+    """Draw lanes, pixels, each in a colour of its own."""
+    for lane, colour in zip(lanes, itertools.cycle(LANE_COLOURS), strict=False):
+        ax.plot(lane[:, 0], lane[:, 1], color=colour, linewidth=2.2, solid_capstyle="round")
+
+
+def _pick(stacked, row: int):
+    return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

@@ -1,0 +1,21 @@
+"""The kinds of task and what the program around the training loop knows of each."""
+
+from __future__ import annotations
+
+from tflane_jax.config import RunConfig
+from tflane_jax.systems.base import Evaluation, Model, System, spread
+from tflane_jax.training.lane_curve import LaneCurveTask
+
+__all__ = ["Evaluation", "Model", "System", "spread", "system_of"]
+
+
+def system_of(config: RunConfig) -> System:
+    """Return the system that a configuration's task belongs to."""
+    # Imported here, because each brings its own data and metrics along.
+    if isinstance(config.task, LaneCurveTask):
+        from tflane_jax.systems.lane_curve import LaneCurveSystem
+
+        return LaneCurveSystem()
+    from tflane_jax.systems.lane_graph import LaneGraphSystem
+
+    return LaneGraphSystem()

@@ -1,0 +1,144 @@
+"""Lane graphs around the vehicle: the systems of TF-Lane."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tflane_jax.config import LaneGraphSource, RunConfig
+from tflane_jax.datasets.argoverse2 import Argoverse2Dataset
+from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.cache import cached
+from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Example, LanePrediction, stack_examples
+from tflane_jax.systems.base import Evaluation, Model, spread
+from tflane_jax.training.evaluate import evaluate_lanes, predictions
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import Draw
+from tflane_jax.training.records import Record
+from tflane_jax.training.task import Params
+
+_GROUPS = ("all", "occluded", "clear")
+_COMPARED_EXAMPLES = 6
+
+
+class LaneGraphSystem:
+    """See `systems.base.System`."""
+
+    columns: tuple[str, ...] = (
+        "lanes of", "seed", "DET_l", "TOP_ll", "DET_l@1.0", "DET_l@2.0", "DET_l@3.0", "lanes", "frames"
+    )  # fmt: skip
+    compared: tuple[str, ...] = tuple(f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in _GROUPS)
+
+    def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example:
+        """Return the examples of a source, stacked."""
+        return load_arrays(open_dataset(source, progress=progress), parts=TRAINING_PARTS, progress=progress)
+
+    def examples(self, data: Example) -> Example:
+        """Return the examples themselves."""
+        return data
+
+    def prepare(self, config: RunConfig) -> None:
+        """Return None: examples are used as they are."""
+
+    def evaluate(self, task: Any, params: Params, data: Example, batch_size: int) -> Evaluation:
+        """Return OpenLane-V2's centerline metrics for all, occluded and clear lanes."""
+        metrics = evaluate_lanes(task, params, data, batch_size)
+        return Evaluation(metrics.protocol, metrics.compute())
+
+    def drawing(self, config: RunConfig) -> Draw:
+        """Return the function that draws a few validation examples from above."""
+        from tflane_jax.plots import save_examples
+
+        source = _source(config, "val")
+        dataset = open_dataset(source)
+        indices = spread(len(dataset), config.evaluation.pictures)
+
+        def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
+            if indices:
+                examples, lanes = predict_examples(config.task, params, dataset, indices)
+                save_examples(
+                    folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": lanes},
+                    titles=titles(dataset, indices), ground=source.example.sensor.grid.range,
+                    view=source.example.range,
+                )  # fmt: skip
+
+        return draw
+
+    def inference_variants(self, task: Any) -> dict[str, Any]:
+        """Return a model with traffic flow once more without any (TF-Lane, Table 7)."""
+        if task.model.traffic_flow is None:
+            return {}
+        return {"no traffic flow at inference": limit_instances(task, 0)}
+
+    def remarks(self, model: Model) -> dict[str, str]:
+        """Return nothing."""
+        return {}
+
+    def quoted(self) -> list[dict[str, str]]:
+        """Return nothing: the papers' numbers are of real data."""
+        return []
+
+    def draw_comparison(
+        self, models: Mapping[str, Model], source: LaneGraphSource, data: Example, path: Path
+    ) -> Path:
+        """Draw the test frames with the most hidden lanes, every model beside the truth."""
+        from tflane_jax.plots import save_examples
+
+        dataset = open_dataset(source)
+        hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
+        indices = np.argsort(-hidden, kind="stable")[:_COMPARED_EXAMPLES].tolist()
+        examples = stack_examples([dataset.example(index) for index in indices])
+        lanes = {
+            name: predict_examples(model.task, model.params, dataset, indices)[1] for name, model in models.items()
+        }
+        return save_examples(
+            path, examples, lanes, titles=titles(dataset, indices),
+            ground=source.example.sensor.grid.range, view=source.example.range,
+        )  # fmt: skip
+
+
+def open_dataset(source: LaneGraphSource, *, progress: bool = True) -> Dataset:
+    """Return the dataset of a source; the built-in world is built once and then read from its cache."""
+    if isinstance(source, ProceduralConfig):
+        return cached(ProceduralDataset(source), progress=progress)
+    return Argoverse2Dataset(source)
+
+
+def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
+    """Return the task with at most `count` instances of traffic flow, the heaviest; 0 is inference without.
+
+    The parameters stay the same. Raises UserError where the model takes no traffic flow or has fewer slots.
+    """
+    traffic = task.model.traffic_flow
+    if traffic is None:
+        raise UserError("this run is a baseline without traffic flow: --max-instances has nothing to limit")
+    if not 0 <= count <= traffic.prior.max_instances:
+        raise UserError(f"--max-instances {count} is outside 0 to {traffic.prior.max_instances}, the model's slots")
+    prior = replace(traffic.prior, top_instances=count)
+    return replace(task, model=replace(task.model, traffic_flow=replace(traffic, prior=prior)))
+
+
+def predict_examples(
+    task: Any, params: Params, dataset: Dataset, indices: Sequence[int]
+) -> tuple[Example, LanePrediction]:
+    """Return some examples whole, with truth and all, and the lanes predicted for them; both stacked, numpy."""
+    examples = stack_examples([dataset.example(index) for index in indices])
+    (_, answer), = predictions(task, params, examples, len(indices))  # fmt: skip
+    return examples, answer.lanes
+
+
+def titles(dataset: Dataset, indices: Sequence[int]) -> list[str]:
+    """Return a title for the picture of each example."""
+    infos = [dataset.info(index) for index in indices]
+    return [f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]
+
+
+def _source(config: RunConfig, split) -> LaneGraphSource:
+    return config.data.source(split)  # pyright: ignore[reportReturnType]

@@ -35,12 +35,13 @@ BATCH = 8
 SEEDS = 3
 
 
+CONFIG_FILES = {"baseline": "toponet.py", "+TFM": "toponet_tfm.py"}
+
+
 def tasks() -> dict[str, LaneGraphTask]:
     """Return the shipped baseline and the same with the TFM."""
-    return {
-        "baseline": load_config(str(CONFIGS / "toponet.py")).task,
-        "+TFM": load_config(str(CONFIGS / "toponet_tfm.py")).task,
-    }
+    shipped = {name: load_config(str(CONFIGS / file)).task for name, file in CONFIG_FILES.items()}
+    return {name: task for name, task in shipped.items() if isinstance(task, LaneGraphTask)}
 
 
 def paper_size_tasks() -> dict[str, LaneGraphTask]:

@@ -42,72 +42,79 @@ SIDES: Mapping[str, Side] = {
 AXES: Mapping[str, int] = {"row": 1, "column": 0}
 
 
+def relate(
+    relations: tuple[Relation, ...], x: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+) -> tuple[Float[Array, "h w c"], ...]:
+    """Return A_e x for each of the edge types: what each cell hears."""
+    return tuple(jnp.broadcast_to(heard, x.shape) for heard in _heard(relations, x, valid))
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def mix_relations(
     relations: tuple[Relation, ...], shares: Float[Array, "e c"], x: Float[Array, "h w c"], valid: Bool[Array, "h w"]
 ) -> Float[Array, "h w c"]:
-    """Return sum_e share_e A_e x, Eq. (1) of the GTN lane paper applied to features.
+    """Return sum_e share_e A_e x, Eq. (1) applied to features.
 
     The gradient is written out: it is a mixture of shifts and means as well, where JAX's is a dozen arrays.
     """
-    x, near = _near(relations, jnp.where(valid[..., None], x, 0.0))
-    out = _itself(relations, valid, x.dtype) @ shares * x
-    for relation, share in zip(relations, shares[:, None, None], strict=True):
-        if relation in SIDES:
-            out = out + share * near[SIDES[relation]]
-        if relation in AXES:
-            out = out + share * _line_mean(x, valid, AXES[relation])
-    return out
+    heard = zip(shares, _heard(relations, x, valid), strict=True)
+    parts = [share[None, None] * of_type for share, of_type in heard]
+    return jnp.broadcast_to(sum(parts[1:], parts[0]), x.shape) if parts else jnp.zeros_like(x)
 
 
 def _mix_backward(relations, residuals, gradient):
     shares, x, valid = residuals
-    x, near = _near(relations, jnp.where(valid[..., None], x, 0.0))
-    # Who hears a cell on one side stands on its other side.
-    gradient, back = _near(relations, gradient, -1)
-    itself = _itself(relations, valid, x.dtype)
-    to_x = itself @ shares * gradient
-    to_shares = list(jnp.einsum("hwe,hwc->ec", itself, gradient * x))
-    for i, (relation, share) in enumerate(zip(relations, shares[:, None, None], strict=True)):
-        if relation in SIDES:
-            to_x = to_x + share * back[SIDES[relation]]
-            to_shares[i] += (gradient * near[SIDES[relation]]).sum((0, 1))
+    gradient, back = _sides(relations, gradient, valid, -1)
+    by_axis = {axis: gradient.sum(axis, keepdims=True) for axis in AXES.values()}
+    to_shares, own, to_speakers, to_x = [], jnp.zeros((1, 1, 1), x.dtype), jnp.zeros_like(x), jnp.zeros_like(x)
+    for relation, share, heard in zip(relations, shares[:, None, None], _heard(relations, x, valid), strict=True):
         if relation in AXES:
             axis = AXES[relation]
-            of_line = gradient.sum(axis, keepdims=True)
-            to_x = to_x + _line_weights(valid, axis, x.dtype)[..., None] * (share * of_line)
-            to_shares[i] += (of_line * _line_mean(x, valid, axis)).sum((0, 1))
-    return jnp.stack(to_shares), jnp.where(valid[..., None], to_x, 0.0), None
+            to_shares.append((by_axis[axis] * heard).sum((0, 1)))
+            to_x = to_x + _line_weights(valid, axis, x.dtype)[..., None] * (share * by_axis[axis])
+            continue
+        to_shares.append((gradient * heard).sum((0, 1)))
+        if relation in SIDES:
+            side = SIDES[relation]
+            # Who hears a cell stands on its other side; who has nobody to hear on this side hears itself.
+            to_speakers = to_speakers + share * back[side]
+            share = share * (1.0 - shifted(valid, side).astype(x.dtype))[..., None]
+        own = own + share
+    to_x = to_x + own * gradient + jnp.where(valid[..., None], to_speakers, 0.0)
+    return jnp.stack(to_shares), to_x, None
 
 
 mix_relations.defvjp(lambda relations, *arrays: (mix_relations(relations, *arrays), arrays), _mix_backward)
 
 
-def _near(relations, x, sign=1):
-    """Return x, and x shifted by each side among the relations, or the other way with sign -1."""
+def _sides(relations, x, valid, sign=1):
+    """Return x, and x shifted by each side of the relations (or the other way, sign -1)."""
     sides = tuple(SIDES[relation] for relation in relations if relation in SIDES)
+    x = jnp.where(valid[..., None], x, 0.0)
     if not sides:
         return x, {}
     # x itself is read from the array with a border too: what only that reads, XLA computes once, not in every reader.
     here, *near = neighbours(((0, 0), *((sign * down, sign * right) for down, right in sides)), x)
+    here = jnp.where(valid[..., None], here, 0.0)
     return here, dict(zip(sides, near, strict=True))
 
 
-def _itself(relations, valid, dtype) -> Float[Array, "h w e"]:
-    """Return the diagonals of the edge types but for rows and columns: who hears nobody hears itself."""
+def _heard(relations, x, valid):
+    """Return A_e x for each edge type; of rows and columns one value for all cells."""
+    x, near = _sides(relations, x, valid)
 
     def one(relation):
         if relation in SIDES:
-            return ~shifted(valid, SIDES[relation])
-        return jnp.full(valid.shape, relation not in AXES)
+            side = SIDES[relation]
+            return jnp.where(shifted(valid, side)[..., None], near[side], x)
+        if relation in AXES:
+            axis = AXES[relation]
+            # A product takes less than half the time of a sum over the axis.
+            along = "hw,hwc->hc" if axis == 1 else "hw,hwc->wc"
+            return jnp.expand_dims(jnp.einsum(along, _line_weights(valid, axis, x.dtype), x), axis)
+        return x
 
-    return jnp.stack([one(relation) for relation in relations], -1).astype(dtype)
-
-
-def _line_mean(x, valid, axis):
-    # A product takes less than half the time of a sum over the axis.
-    along = "hw,hwc->hc" if axis == 1 else "hw,hwc->wc"
-    return jnp.expand_dims(jnp.einsum(along, _line_weights(valid, axis, x.dtype), x), axis)
+    return [one(relation) for relation in relations]
 
 
 def _line_weights(valid, axis, dtype):

@@ -212,7 +212,7 @@ class MetaPathConvolution(nn.Module):
         query, key = (_by_head(half, config.heads) for half in jnp.split(asked, 2, axis=-1))
 
         def mix(hop, shares, h):
-            heard = mix_relations(config.relations, shares[:structural], h, valid) if structural else 0.0
+            heard = mix_relations(config.relations, shares[:structural], h, valid)
             if not offered[hop]:
                 return heard
             similar = masked_attention(query, key, _by_head(h, config.heads), mask).swapaxes(0, 1).reshape(h.shape)

@@ -58,6 +58,8 @@ class LstrConfig:
         queries: most lanes that can be found.
         shrink: side of the blocks of pixels that are averaged before the network sees them; 2 takes a quarter of the
             time (the last stage's stride 1 then leaves as many cells as at full size).
+        located: add the position encoding to the features themselves, so that what is attended to says where it is.
+            In LSTR positions steer attention only, and where something is must be learned from the image's borders.
     """
 
     backbone: ResNetConfig = ResNetConfig()
@@ -67,6 +69,7 @@ class LstrConfig:
     decoder: TransformerConfig = TransformerConfig()
     queries: int = 7
     shrink: int = 1
+    located: bool = False
 
     def build(self) -> Lstr:
         """Return the Linen module."""
@@ -118,6 +121,8 @@ class Lstr(nn.Module):
         features = nn.Dense(config.dim, name="input_projection")(features)
         cells = nearest(valid, *features.shape[:2])
         position = image_sine_encoding(cells, config.dim // 2)
+        if config.located:
+            features = features + position
         encoder = config.encoder.build(config.dim, "encoder")
         memory = encoder(features, position, cells, deterministic=not train).reshape(-1, config.dim)
         position, seen = position.reshape(-1, config.dim), key_mask(cells.reshape(-1))

@@ -53,7 +53,8 @@ def batches(
         parts = []
         for seed in seeds:
             order = batch_indices(seed, step, examples, batch_size)
-            part = jax.tree.map(lambda leaf, order=order: np.take(leaf, order, axis=0), arrays)
+            # Not np.take: that copies the whole of a leaf that is a broadcast view.
+            part = jax.tree.map(lambda leaf, order=order: leaf[order], arrays)
             parts.append(part if prepare is None else prepare(part, (seed, step)))
         batch = parts[0] if len(seeds) == 1 else jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
         return jax.device_put(batch)

@@ -33,7 +33,7 @@ def predictions(task: Task, params: Params, arrays: Any, batch_size: int) -> Ite
     for start in range(0, examples, batch_size):
         indices = range(start, min(start + batch_size, examples))
         filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
-        batch = jax.tree.map(lambda leaf, rows=filled: np.take(leaf, rows, axis=0), arrays)
+        batch = jax.tree.map(lambda leaf, rows=filled: leaf[rows], arrays)
         answers, kept = jax.device_get(predict_batch(task, params, batch)), slice(len(indices))
         yield indices, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 

@@ -1,0 +1,159 @@
+"""LSTR at its full size against the same network in PyTorch, and the encoders against each other.
+
+    python -m benchmarks.lstr --out runs/bench
+
+Inference at batch 1 and 8 and a whole training step at batch 16 (normalisation apart: both sides start from normalised
+images), at 360 x 640. PyTorch, where it is installed, runs the network of `benchmarks.torch_lstr` on the same cores in
+the same rounds. Random weights: no number of this table depends on them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
+from tflane_jax.layers.resnet import ResNetConfig
+from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
+from tflane_jax.models.lstr import LstrConfig
+from tflane_jax.scene import LaneLines, RoadImage
+from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.training.runtime import configure_jax
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import init_state
+from tflane_jax.training.step import make_update_step
+
+HEIGHT, WIDTH, TRAINING_BATCH = 360, 640, 16
+OURS, TORCH = "ours", "PyTorch"
+MODEL = LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))
+ENCODERS = {
+    "transformer": MODEL.encoder,
+    "GTN": GtnEncoderConfig(),
+    "GCN": GcnEncoderConfig(),
+    "HAN": HanEncoderConfig(),
+}
+
+
+def images(batch: int) -> np.ndarray:
+    """Return random normalised images (B, H, W, 3)."""
+    return np.random.default_rng(0).normal(size=(batch, HEIGHT, WIDTH, 3)).astype(np.float32)
+
+
+def lines(batch: int) -> LaneLines:
+    """Return four straight lanes of 48 points for each image."""
+    rows = np.linspace(0.34, 0.98, 48, dtype=np.float32)
+    columns = 0.5 + np.linspace(-1.2, 1.2, 4, dtype=np.float32)[:, None] * (rows - 0.3)
+    points = np.stack([columns, np.broadcast_to(rows, columns.shape)], -1)
+    shape = (batch, *columns.shape)
+    return LaneLines(np.broadcast_to(points, (*shape, 2)), np.ones(shape, bool), np.ones(shape[:2], bool))
+
+
+def inference(config: LstrConfig, batch: int) -> Compiled:
+    """Return the network on normalised images."""
+    valid = jnp.ones((batch, HEIGHT, WIDTH), bool)
+    pixels = jnp.asarray(images(batch))
+    variables = jax.jit(config.build().init)(jax.random.key(0), pixels[0], valid[0])
+
+    def predict(variables, pixels, valid):
+        return jax.vmap(lambda image, v: config.build().apply(variables, image, v))(pixels, valid)
+
+    return compile_jax(predict, variables, pixels, valid)
+
+
+def training(config: LstrConfig, batch: int) -> Compiled:
+    """Return a whole update step from bytes: normalisation, loss, gradient, clipping, AdamW, average, guard."""
+    pixels = np.random.default_rng(0).integers(0, 256, (batch, HEIGHT, WIDTH, 3), np.uint8)
+    data = jax.device_put(RoadImage(pixels, np.ones(pixels.shape[:3], bool), lines(batch)))
+    task, optim = LaneCurveTask(config), OptimConfig(warmup_steps=0)
+    state = init_state(task, make_optimizer(optim, 1000), jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], data))
+    began = time.perf_counter()
+    step = make_update_step(task, optim, 1000).lower(state, data).compile()
+    seconds = time.perf_counter() - began
+    carried = [state]
+
+    def run() -> None:
+        carried[0], metrics = step(carried[0], data)
+        jax.block_until_ready(metrics)
+
+    return Compiled(run, seconds)
+
+
+def torch_programs(batch: int, *, train: bool) -> dict[str, Compiled]:
+    """Return PyTorch's side of a case, nothing where PyTorch is missing."""
+    if importlib.util.find_spec("torch") is None:
+        return {}
+    # Read when PyTorch is imported. Waiting threads that spin would slow down both sides, PyTorch more than ours.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("GOMP_SPINCOUNT", "0")
+    from benchmarks.torch_lstr import Batch, build, training_step
+    from benchmarks.torch_lstr import inference as torch_inference
+
+    pixels = np.ascontiguousarray(images(batch).transpose(0, 3, 1, 2))
+    if not train:
+        weights = {name: value.numpy() for name, value in build().state_dict().items()}
+        program = torch_inference(weights)
+        return {TORCH: Compiled(lambda: program(pixels), 0.0)}
+    truth = lines(batch)
+    rows = np.concatenate(
+        [np.ones((4, 1)), truth.points[0, :, [0, -1], 1].T, truth.points[0, ..., 0], truth.points[0, ..., 1]], 1
+    ).astype(np.float32)
+    masks = np.zeros((batch, 1, HEIGHT, WIDTH), np.float32)
+    return {TORCH: Compiled(training_step(Batch(pixels, masks, [rows] * batch)), 0.0)}
+
+
+def measure(seconds: float) -> dict[str, dict[str, Any]]:
+    """Return for each case what `timing.summarise` gives, and the seconds of compilation."""
+    cases: dict[str, dict[str, Compiled]] = {}
+    for batch in (1, 8):
+        cases[f"inference, batch {batch}"] = {OURS: inference(MODEL, batch)} | torch_programs(batch, train=False)
+    training_case = {OURS: training(MODEL, TRAINING_BATCH)} | torch_programs(TRAINING_BATCH, train=True)
+    cases[f"training step, batch {TRAINING_BATCH}"] = training_case
+    for batch in (1, TRAINING_BATCH):
+        encoders = {name: inference(replace(MODEL, encoder=encoder), batch) for name, encoder in ENCODERS.items()}
+        cases[f"encoders, inference, batch {batch}"] = encoders
+    cases[f"encoders, training step, batch {TRAINING_BATCH}"] = {
+        name: training(replace(MODEL, encoder=encoder), TRAINING_BATCH) for name, encoder in ENCODERS.items()
+    }
+    results = {}
+    for name, compiled in cases.items():
+        reference = next(iter(compiled))
+        timings = summarise(interleave({key: c.program for key, c in compiled.items()}, seconds), reference)
+        results[name] = {key: row | {"compile_s": compiled[key].seconds} for key, row in timings.items()}
+    return results
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Return one row for each program; the ratio is to the first of its case."""
+    header = ("case", "program", "median ms", "least ms", "times the first", "compile s")
+    rows = [
+        (case, name, f"{row['median_ms']:.1f}", f"{row['least_ms']:.1f}", f"{row['ratio']:.2f}",
+         f"{row['compile_s']:.1f}")
+        for case, programs in results.items() for name, row in programs.items()
+    ]  # fmt: skip
+    return markdown_table(header, rows)
+
+
+def run(out: Path, seconds: float = 20.0) -> None:
+    """Measure, print and save."""
+    configure_jax()
+    record = machine() | {"results": measure(seconds)}
+    text = table(record["results"])
+    print(text)
+    save(out, "lstr", record, text)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and table")
+    parser.add_argument("--seconds", type=float, default=20.0, help="time for each case (default 20)")
+    options = parser.parse_args()
+    run(options.out, options.seconds)

@@ -5,6 +5,7 @@
 """
 
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
+from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
 from tflane_jax.losses.lane_curve import LaneCurveLossConfig
@@ -20,12 +21,14 @@ def get_config() -> RunConfig:
     """Return the baseline."""
     # Half the resolution and as many cells as at the full one: four times as many steps in the same time.
     model = LstrConfig(
-        ResNetConfig(strides=(1, 2, 2, 1)), encoder=TransformerEncoderConfig(layer=LAYER), decoder=LAYER, shrink=2
-    )
+        ResNetConfig(strides=(1, 2, 2, 1)), encoder=TransformerEncoderConfig(layer=LAYER), decoder=LAYER,
+        shrink=2, anchors=(0.35, 1.0),
+    )  # fmt: skip
+    augmentation = AugmentationConfig(geometry=0.8, rotation=0.03, crop=0.95)
     return RunConfig(
         task=LaneCurveTask(model, LaneCurveLossConfig(least_depth=0.02)),
-        data=FrontViewData(train=4000, val=100, test=400),
+        data=FrontViewData(train=6000, val=100, test=400, augmentation=augmentation),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, weight_decay=1e-4, b2=0.99, clip_norm=5.0, ema_decay=0.99),
-        training=TrainingConfig(steps=8000, batch_size=4, eval_every=2000, best_metric="all/Accuracy"),
+        training=TrainingConfig(steps=16_000, batch_size=4, eval_every=2000, best_metric="all/Accuracy"),
         evaluation=EvaluationConfig(batch_size=20),
     )

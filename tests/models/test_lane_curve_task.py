@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_task
+from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
-from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, nearest, normalise
+from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneCurveHeads, nearest, normalise, shrink
+from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
@@ -118,3 +119,39 @@ def test_padding_is_sampled_at_the_first_pixel_of_a_cell():
     mask = jnp.asarray(np.random.default_rng(0).random((360, 640)) < 0.5)
     np.testing.assert_array_equal(nearest(mask, 12, 20), mask[::30, ::32])
     assert nearest(mask[:1, :1], 1, 1).shape == (1, 1)
+
+
+def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
+    anchors, rng = (0.4, 0.9), np.random.default_rng(0)
+    queries = jnp.asarray(rng.normal(size=(2, 3, 8)).astype(np.float32))
+    heads = LaneCurveHeads(8, anchors)
+    variables = heads.init(jax.random.key(0), queries)
+    plain = LaneCurveHeads(8).apply(variables, queries)
+    anchored = heads.apply(variables, queries)
+    np.testing.assert_array_equal(anchored.logits, plain.logits)
+    start = anchored.curves[..., :6] - plain.curves[..., :6]
+    np.testing.assert_allclose(start, np.broadcast_to([0.4, 0.95, 0.0, 0.2, 0.0, 0.5], start.shape), atol=1e-6)
+    b, offset = anchored.curves[..., 6], anchored.curves[..., 7]
+    for i, row in enumerate(anchors):
+        np.testing.assert_allclose(b * row - offset, plain.curves[..., 6 + i], rtol=1e-5, atol=1e-6)
+
+
+def test_shrunk_images_are_means_of_blocks_and_valid_where_all_of_a_block_is():
+    image = np.random.default_rng(0).normal(size=(4, 6, 3)).astype(np.float32)
+    valid = np.ones((4, 6), bool)
+    valid[1, 2] = False
+    small, small_valid = shrink(jnp.asarray(image), jnp.asarray(valid), 2)
+    np.testing.assert_allclose(small[1, 2], image[2:4, 4:6].mean((0, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(small_valid, [[True, False, True], [True, True, True]])
+    with pytest.raises(ValueError, match="4 x 6 does not shrink by blocks of 5 x 5"):
+        shrink(jnp.asarray(image), jnp.asarray(valid), 5)
+
+
+@pytest.mark.parametrize("changes", [{"shrink": 2}, {"located": True}, {"anchors": (0.4, 1.0)}])
+def test_options_predict_something_else(changes):
+    answers = []
+    for options in ({}, changes):
+        task = LaneCurveTask(tiny_model(**options))
+        params = jax.jit(task.init)(jax.random.key(0), road_image(0))
+        answers.append(jax.jit(task.predict)(params, road_image(0)))
+    assert not np.array_equal(answers[0].curves, answers[1].curves)

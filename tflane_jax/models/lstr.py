@@ -43,6 +43,9 @@ class TransformerEncoderConfig:
         return TransformerEncoder(self, name=name)
 
 
+# Where anchored heads start: alpha and beta; k'', f'' (above all lanes, away from the pole), m'', n'.
+_TYPICAL_EXTENT, _TYPICAL_SHARED = (0.4, 0.95), (0.0, 0.2, 0.0, 0.5)
+
 EncoderConfig = TransformerEncoderConfig | GtnEncoderConfig | GcnEncoderConfig | HanEncoderConfig
 
 
@@ -60,6 +63,9 @@ class LstrConfig:
             time (the last stage's stride 1 then leaves as many cells as at full size).
         located: add the position encoding to the features themselves, so that what is attended to says where it is.
             In LSTR positions steer attention only, and where something is must be learned from the image's borders.
+        anchors: two rows (shares of the image); the network then says where a lane's straight part crosses them, and
+            b'' and b''' follow. The same curves, but an error in one number no longer needs the other to make up for
+            it. All numbers start from those of a typical road. None predicts b'' and b''' from nothing, as LSTR.
     """
 
     backbone: ResNetConfig = ResNetConfig()
@@ -70,6 +76,7 @@ class LstrConfig:
     queries: int = 7
     shrink: int = 1
     located: bool = False
+    anchors: tuple[float, float] | None = None
 
     def build(self) -> Lstr:
         """Return the Linen module."""
@@ -134,7 +141,7 @@ class Lstr(nn.Module):
             layer = DecoderLayer(config.decoder, name=f"decoder_{i}")
             x = layer(x, memory, query, position, None, seen, deterministic=not train)
             outputs.append(norm(x))
-        return LaneCurveHeads(config.dim, name="heads")(jnp.stack(outputs))
+        return LaneCurveHeads(config.dim, config.anchors, name="heads")(jnp.stack(outputs))
 
 
 class LaneCurveHeads(nn.Module):
@@ -142,9 +149,11 @@ class LaneCurveHeads(nn.Module):
 
     Attributes:
         dim: channels inside the heads.
+        anchors: see `LstrConfig`.
     """
 
     dim: int
+    anchors: tuple[float, float] | None = None
 
     @nn.compact
     def __call__(self, queries: Float[Array, "layers q c"]) -> LaneCurvePrediction:
@@ -154,8 +163,18 @@ class LaneCurveHeads(nn.Module):
         shared = Mlp((self.dim, self.dim, 4), name="shared")(queries)  # k'', f'', m'', n'
         # Lanes of one image share these four (GTN paper, section 2.4); the mean runs over all queries, as in LSTR.
         shared = jnp.broadcast_to(shared.mean(-2, keepdims=True), shared.shape)
-        curves = jnp.concatenate([specific[..., :2], shared, specific[..., 2:]], -1)
+        extent, straight = specific[..., :2], specific[..., 2:]
+        if self.anchors is not None:
+            upper, lower = self.anchors
+            slope = (straight[..., 1] - straight[..., 0]) / (lower - upper)
+            straight = jnp.stack([slope, slope * upper - straight[..., 0]], -1)
+            extent, shared = extent + _like(_TYPICAL_EXTENT, extent), shared + _like(_TYPICAL_SHARED, shared)
+        curves = jnp.concatenate([extent, shared, straight], -1)
         return LaneCurvePrediction(logits, curves)
+
+
+def _like(values: tuple[float, ...], x: Array) -> Array:
+    return jnp.asarray(values, x.dtype).reshape((1,) * (x.ndim - 1) + (-1,))
 
 
 def normalise(image: UInt8[Array, "*b h w 3"], valid: Bool[Array, "*b h w"]) -> Float[Array, "*b h w 3"]:

@@ -193,17 +193,20 @@ def test_nodes_that_nobody_speaks_to_have_finite_gradients(variant):
     adjacency = random_graphs(3, 3, 6, 6).at[:, 2].set(0.0).at[:, :, 2].set(0.0)
     model = GraphTransformer(4, layers=3, variant=variant)
     x = random_graphs(4, 6, 5)
-    variables = model.init(jax.random.key(0), adjacency, x)
-    gradients = jax.grad(lambda v, a: model.apply(v, a, x).sum(), argnums=(0, 1))(variables, adjacency)
+    variables = jax.jit(model.init)(jax.random.key(0), adjacency, x)
+    gradients = jax.jit(jax.grad(lambda v, a: model.apply(v, a, x).sum(), argnums=(0, 1)))(variables, adjacency)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     assert any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradients))
+
+
+_normalise = jax.jit(normalise, static_argnums=(1, 2))
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from(["rows", "columns"]), st.sampled_from(["kept", "removed", "lonely"]))
 def test_edges_into_a_node_sum_to_one(seed, receivers, loops):
     graphs = random_graphs(seed, 2, 4, 4, share=0.3)
-    out = np.asarray(normalise(graphs, receivers, loops))
+    out = np.asarray(_normalise(graphs, receivers, loops))
     seen = np.asarray(graphs) * (1 - np.eye(4) if loops == "removed" else 1)
     axis = 2 if receivers == "rows" else 1
     expected = (seen.sum(axis) > 0) | (loops == "lonely")
@@ -226,7 +229,7 @@ def test_hop_by_hop_equals_the_product_of_the_selections(hops):
     adjacency = normalise(random_graphs(6, 3, 7, 7), loops="lonely")
     weights, x = random_weights(7, hops), random_graphs(8, 7, 6)
     hopped = propagate(lambda _, shares, h: jnp.einsum("ed,enm,md->nd", shares, adjacency, h), weights, x)
-    graphs = meta_path_graphs(adjacency, weights[::-1], GTN_2022)
+    graphs = jax.jit(meta_path_graphs)(adjacency, weights[::-1])
     expected = jnp.concatenate([graphs[c] @ x[:, 3 * c : 3 * c + 3] for c in range(2)], 1)
     np.testing.assert_allclose(hopped, expected, rtol=1e-5, atol=1e-6)
 
@@ -235,7 +238,7 @@ def test_hop_by_hop_equals_the_product_of_the_selections(hops):
 @pytest.mark.parametrize("build", [partial(GraphTransformer, 3), partial(FastGraphTransformer, 3)])
 def test_small_graphs(nodes, build):
     adjacency, x = jnp.ones((2, nodes, nodes)), jnp.ones((nodes, 4))
-    out, variables = build().init_with_output(jax.random.key(0), adjacency, x)
+    out, variables = jax.jit(build().init_with_output)(jax.random.key(0), adjacency, x)
     assert out.shape[0] == nodes
     assert np.isfinite(out).all()
     assert variables["params"]["selection"].shape[1:] == (2, 2)

@@ -24,6 +24,7 @@ class LaneCurveLossConfig:
         class_weight: omega_1.
         curve_weight: omega_2; columns are shares of the image, summed over the points of a lane.
         extent_weight: omega_3, of the rows where a lane begins and ends.
+        cell_weight: of the auxiliary loss on cells, for networks that have it; LSTR does not.
         shared_horizon: every lane of an image is to begin at the highest row of any of them, as in LSTR's training.
         least_depth: rows nearer to a predicted horizon than this share of the image count as this far below it. The
             curve has a pole there, and LSTR, which goes without (1e-6), can leave it only by luck.
@@ -33,6 +34,7 @@ class LaneCurveLossConfig:
     class_weight: float = 3.0
     curve_weight: float = 5.0
     extent_weight: float = 2.0
+    cell_weight: float = 10.0
     shared_horizon: bool = True
     least_depth: float = 1e-6
     matcher: Literal["scipy", "jax"] = "scipy"
@@ -89,6 +91,17 @@ def curve_errors(
     columns = curve_columns(_shape(curves), rows.reshape(*(1,) * len(lead), -1), least_depth)
     errors = jnp.abs(columns.reshape(*lead, *rows.shape) - _lead(targets.columns, len(lead)))
     return jnp.where(_lead(targets.point_valid, len(lead)), errors, 0.0).sum(-1)
+
+
+def cell_loss(logits: Float[Array, "h w"], targets: LaneCurveTargets) -> Float[Array, ""]:
+    """Return the mean cross-entropy of one example's cells: does a point of a lane line lie in each?"""
+    height, width = logits.shape
+    inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1) & (targets.rows < 1)
+    # Index `height` lies outside, so other points write nowhere.
+    row = jnp.where(inside, (targets.rows * height).astype(jnp.int32), height)
+    column = jnp.where(inside, (targets.columns * width).astype(jnp.int32), 0)
+    taken = jnp.zeros((height, width)).at[row, column].set(1.0, mode="drop")
+    return optax.sigmoid_binary_cross_entropy(logits, taken).mean()
 
 
 def matching_cost(

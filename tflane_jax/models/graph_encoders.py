@@ -7,11 +7,11 @@ are the cells of the feature map, the edge types those of `layers.image_graph`.
 
 Self-attention is one of the GTN's edge types, similarity: its adjacency comes from the query and key projections of
 features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.
-One set of parameters thus serves both; the GTN adds the selection weights, hops * channels * edge types. A layer that
-selects similarity in one hop and `self` in the others is exactly the transformer's encoder layer.
+One set of parameters thus serves both; the GTN adds the selection weights, hops * channels * edge types. With as many
+heads, a layer that selects similarity in one hop and `self` in the others is exactly the transformer's encoder layer.
 
 A layer costs about what the transformer's does: products of adjacencies are never formed (FastGTN), the other edge
-types are shifts and means, and similarity, with one head for all channels, is offered to one hop of the meta-path.
+types are shifts and means, and similarity, one of LSTR's heads for all channels, is offered to the last hop only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,15 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import attention_probabilities, masked_attention
 from tflane_jax.layers.graph_transformer import propagate
-from tflane_jax.layers.image_graph import AXES, Relation, attend_along, attend_near, mix_relations, smooth
+from tflane_jax.layers.image_graph import (
+    AXES,
+    Relation,
+    attend_along,
+    attend_near,
+    bordered_sides,
+    mix_relations,
+    smooth,
+)
 from tflane_jax.layers.masks import key_mask
 
 
@@ -41,7 +49,8 @@ class GtnEncoderConfig:
         relations: structural edge types to choose from.
         similarity: attention over all cells as a further edge type, the last: offered to the last hop only, to every
             hop (an attention product each), or to none, for a purely structural graph.
-        heads: of similarity; 1 is shared by all channels and costs least.
+        heads: of similarity; one head is shared by all channels and costs least.
+        head_dim: channels of query and key of a head, as in LSTR's attention.
         hidden: channels inside the feed-forward part.
         dropout: of hidden channels and everything that is added to a residual.
     """
@@ -52,6 +61,7 @@ class GtnEncoderConfig:
     relations: tuple[Relation, ...] = ("self", "up", "down", "left", "right", "row", "column")
     similarity: Literal["last_hop", "every_hop"] | None = "last_hop"
     heads: int = 1
+    head_dim: int = 16
     hidden: int = 128
     dropout: float = 0.1
 
@@ -207,22 +217,28 @@ class MetaPathConvolution(nn.Module):
         weights = self.param("selection", nn.initializers.normal(0.01), shape)
         if any(offered):
             weights = jnp.where(_choices(offered, structural), weights, -jnp.inf)
-        mask, asking = key_mask(valid.reshape(-1)), x + position
-        asked = nn.Dense(2 * dim, name="query_key")(asking)
-        query, key = (_by_head(half, config.heads) for half in jnp.split(asked, 2, axis=-1))
+        mask, width = key_mask(valid.reshape(-1)), config.heads * config.head_dim
+        query = key = None
+        if any(offered):
+            asking = x + position
+            query, key = (_by_head(nn.Dense(width, name=name)(asking), config.heads) for name in ("query", "key"))
 
         def mix(hop, shares, h):
-            heard = mix_relations(config.relations, shares[:structural], h, valid)
-            if not offered[hop]:
+            structure = shares[:structural]
+            heard = mix_relations(config.relations, structure, h, valid) if structural else jnp.zeros_like(h)
+            if not offered[hop] or query is None or key is None:
                 return heard
-            similar = masked_attention(query, key, _by_head(h, config.heads), mask).swapaxes(0, 1).reshape(h.shape)
-            return heard + shares[structural][None, None] * similar
+            here, _ = bordered_sides(config.relations, h, valid)
+            similar = masked_attention(query, key, _by_head(here, config.heads), mask).swapaxes(0, 1).reshape(h.shape)
+            # Cells that are not valid ask too; what they hear must not become a further hop's input.
+            return heard + shares[structural][None, None] * jnp.where(valid[..., None], similar, 0.0)
 
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "relations", nn.softmax(weights, -1))
-            if any(offered):
+            if query is not None and key is not None:
                 self.sow("intermediates", "probabilities", attention_probabilities(query, key, mask))
-        heard = propagate(mix, weights, nn.Dense(dim, name="value")(x))
+        value = jnp.where(valid[..., None], nn.Dense(dim, name="value")(x), 0.0)
+        heard = propagate(mix, weights, value)
         return nn.Dense(dim, name="output")(heard)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from tflane_jax.layers.graph import Mlp
@@ -19,6 +20,9 @@ from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import LaneCurvePrediction
+
+AUXILIARY = "auxiliary"
+"""Collection in which the network stores what only training looks at: `cells`, logits (h, w)."""
 
 # Of TuSimple images in [0, 1], blue, green, red: the order in which the published weights read them.
 MEAN_BGR = (0.40789654, 0.44719302, 0.47026115)
@@ -43,8 +47,10 @@ class TransformerEncoderConfig:
         return TransformerEncoder(self, name=name)
 
 
-# Where anchored heads start: alpha and beta; k'', f'' (above all lanes, away from the pole), m'', n'.
-_TYPICAL_EXTENT, _TYPICAL_SHARED = (0.4, 0.95), (0.0, 0.2, 0.0, 0.5)
+# What anchored heads count in, orders of magnitude of a road: alpha, beta; k'', f'', m'', n'; columns at the two rows.
+# (A bend of 500 m is an m'' of about 1e-3; a change of 1e-5 in k'' moves a lane's far end by a fiftieth of the image.)
+_TYPICAL = np.array([0.38, 0.95, 0.0, 0.3, 0.0, 0.5, 0.0, 0.0], np.float32)
+_SPREAD = np.array([0.05, 0.1, 1e-5, 0.03, 2e-3, 0.05, 0.1, 1.0], np.float32)
 
 EncoderConfig = TransformerEncoderConfig | GtnEncoderConfig | GcnEncoderConfig | HanEncoderConfig
 
@@ -63,9 +69,11 @@ class LstrConfig:
             time (the last stage's stride 1 then leaves as many cells as at full size).
         located: add the position encoding to the features themselves, so that what is attended to says where it is.
             In LSTR positions steer attention only, and where something is must be learned from the image's borders.
+        cells: say of each cell of the encoder's memory whether a lane line passes through it, for an auxiliary loss.
+            Without it the first few thousand steps answer alike to every image.
         anchors: two rows (shares of the image); the network then says where a lane's straight part crosses them, and
-            b'' and b''' follow. The same curves, but an error in one number no longer needs the other to make up for
-            it. All numbers start from those of a typical road. None predicts b'' and b''' from nothing, as LSTR.
+            b'' and b''' follow; and all numbers are counted in what they typically are. The same curves, but LSTR's own
+            numbers (None) differ in size by five orders of magnitude, which takes it half a million small steps.
     """
 
     backbone: ResNetConfig = ResNetConfig()
@@ -77,6 +85,7 @@ class LstrConfig:
     shrink: int = 1
     located: bool = False
     anchors: tuple[float, float] | None = None
+    cells: bool = False
 
     def build(self) -> Lstr:
         """Return the Linen module."""
@@ -131,7 +140,10 @@ class Lstr(nn.Module):
         if config.located:
             features = features + position
         encoder = config.encoder.build(config.dim, "encoder")
-        memory = encoder(features, position, cells, deterministic=not train).reshape(-1, config.dim)
+        memory = encoder(features, position, cells, deterministic=not train)
+        if config.cells and self.is_mutable_collection(AUXILIARY):
+            self.sow(AUXILIARY, "cells", nn.Dense(1, name="cell_head")(memory)[..., 0])
+        memory = memory.reshape(-1, config.dim)
         position, seen = position.reshape(-1, config.dim), key_mask(cells.reshape(-1))
 
         query = self.param("queries", nn.initializers.normal(1.0), (config.queries, config.dim))
@@ -163,17 +175,21 @@ class LaneCurveHeads(nn.Module):
         shared = Mlp((self.dim, self.dim, 4), name="shared")(queries)  # k'', f'', m'', n'
         # Lanes of one image share these four (GTN paper, section 2.4); the mean runs over all queries, as in LSTR.
         shared = jnp.broadcast_to(shared.mean(-2, keepdims=True), shared.shape)
-        extent, straight = specific[..., :2], specific[..., 2:]
+        curves = jnp.concatenate([specific[..., :2], shared, specific[..., 2:]], -1)
         if self.anchors is not None:
-            upper, lower = self.anchors
-            slope = (straight[..., 1] - straight[..., 0]) / (lower - upper)
-            straight = jnp.stack([slope, slope * upper - straight[..., 0]], -1)
-            extent, shared = extent + _like(_TYPICAL_EXTENT, extent), shared + _like(_TYPICAL_SHARED, shared)
-        curves = jnp.concatenate([extent, shared, straight], -1)
+            curves = _from_columns(_like(_TYPICAL, curves) + _like(_SPREAD, curves) * curves, self.anchors)
         return LaneCurvePrediction(logits, curves)
 
 
-def _like(values: tuple[float, ...], x: Array) -> Array:
+def _from_columns(curves: Float[Array, "*b 8"], anchors: tuple[float, float]) -> Float[Array, "*b 8"]:
+    """Return curves whose last two numbers, columns of the straight part at two rows, have become b'' and b'''."""
+    upper, lower = anchors
+    slope = (curves[..., 7] - curves[..., 6]) / (lower - upper)
+    straight = jnp.stack([slope, slope * upper - curves[..., 6]], -1)
+    return jnp.concatenate([curves[..., :6], straight], -1)
+
+
+def _like(values: np.ndarray, x: Array) -> Array:
     return jnp.asarray(values, x.dtype).reshape((1,) * (x.ndim - 1) + (-1,))
 
 

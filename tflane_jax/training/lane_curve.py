@@ -9,8 +9,8 @@ import jax
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.batch_norm import BATCH_AXIS
-from tflane_jax.losses.lane_curve import LaneCurveLossConfig, lane_curve_loss, lane_curve_targets
-from tflane_jax.models.lstr import LstrConfig, normalise
+from tflane_jax.losses.lane_curve import LaneCurveLossConfig, cell_loss, lane_curve_loss, lane_curve_targets
+from tflane_jax.models.lstr import AUXILIARY, LstrConfig, normalise
 from tflane_jax.scene import LaneCurvePrediction, RoadImage
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
 
@@ -39,13 +39,20 @@ class LaneCurveTask:
 
         def one(image, valid, key):
             variables = {"params": learned} | statistics
-            return module.apply(variables, image, valid, train=True, mutable=[STATISTICS], rngs={"dropout": key})
+            prediction, state = module.apply(
+                variables, image, valid, train=True, mutable=[STATISTICS, AUXILIARY], rngs={"dropout": key}
+            )
+            return prediction, state.get(AUXILIARY, {}), state[STATISTICS]
 
         images = normalise(batch.image, batch.image_valid)
-        prediction, updated = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, None))(images, batch.image_valid, keys)
+        train = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
+        prediction, auxiliary, updated = train(images, batch.image_valid, keys)
         targets = lane_curve_targets(batch.lines, shared_horizon=self.losses.shared_horizon)
         loss, terms = lane_curve_loss(prediction, targets, self.losses)
-        return loss, terms | dict(updated)
+        if self.model.cells:
+            terms["cells"] = self.losses.cell_weight * jax.vmap(cell_loss)(auxiliary["cells"][0], targets).mean()
+            loss += terms["cells"]
+        return loss, terms | {STATISTICS: updated}
 
     def predict(self, params: Params, example: RoadImage) -> LaneCurvePrediction:
         """Return the last decoder layer's answer for one example; its lines are not looked at."""

@@ -1,0 +1,242 @@
+"""Graph encoders against explicit dense products, and what they promise about padding, sizes and looking inside."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.layers.test_image_graph import dense_stack
+from tflane_jax.errors import UserError
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.graph_transformer import GTN_2022, meta_path_graphs
+from tflane_jax.layers.masks import key_mask
+from tflane_jax.models.graph_encoders import (
+    GcnEncoderConfig,
+    GtnEncoderConfig,
+    HanEncoderConfig,
+    MetaPathConvolution,
+)
+
+DIM, SHAPE, BLOCK = 8, (5, 6), (3, 4)
+GTN = GtnEncoderConfig(head_dim=4, hidden=16)
+CONFIGS = {
+    "gtn": GTN,
+    "gtn every hop": dataclasses.replace(GTN, similarity="every_hop", hops=3, heads=2, channels=4),
+    "gtn structural": dataclasses.replace(GTN, similarity=None),
+    "gtn similarity alone": dataclasses.replace(GTN, similarity="every_hop", relations=()),
+    "gcn": GcnEncoderConfig(hidden=16),
+    "han": HanEncoderConfig(hidden=16, semantic=8),
+}
+PARAMETERS = {"gtn": 23_360, "gcn": 19_072, "han": 22_016}
+
+every_config = pytest.mark.parametrize("name", CONFIGS)
+
+
+def random_array(seed, *shape):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape).astype(np.float32))
+
+
+def scene(seed=0, shape=SHAPE):
+    """Features, positions, and validity with some padding."""
+    valid = np.random.default_rng(seed).random(shape) < 0.7
+    return random_array(seed + 1, *shape, DIM), random_array(seed + 2, *shape, DIM), jnp.asarray(valid)
+
+
+@cache
+def built(config):
+    """The module, and variables in which no weight is at a special value."""
+    module, zeros = config.build(DIM, "encoder"), jnp.zeros((1, 1, DIM))
+    variables = jax.eval_shape(module.init, jax.random.key(0), zeros, zeros, jnp.ones((1, 1), bool))
+    rng = np.random.default_rng(7)
+    weight = lambda leaf: jnp.asarray(0.4 * rng.normal(size=leaf.shape).astype(np.float32))  # noqa: E731
+    return module, jax.tree.map(weight, variables)
+
+
+@cache
+def compiled(name):
+    """Return a program: features, position, valid -> memory, intermediates, and gradients of all but `valid`.
+
+    The scalar weights each cell by its features.
+    """
+    module, variables = built(CONFIGS[name])
+
+    def scalar(variables, features, position, valid):
+        weight = jax.lax.stop_gradient(jnp.where(valid[..., None], features, 0.0))
+        out, state = module.apply(variables, features, position, valid, mutable="intermediates")
+        return (weight * out).sum(), (out, state["intermediates"])
+
+    step = jax.value_and_grad(scalar, argnums=(0, 1, 2), has_aux=True)
+
+    @jax.jit
+    def run(features, position, valid):
+        (_, (out, seen)), gradients = step(variables, features, position, valid)
+        return out, seen, gradients
+
+    return run
+
+
+@pytest.mark.parametrize("similarity", ["last_hop", "every_hop", None])
+def test_gtn_equals_dense_meta_path_products(similarity):
+    """Shifts, means and attention, hop by hop, are graph convolution on the product of soft adjacencies."""
+    config = dataclasses.replace(GTN, similarity=similarity, hops=3)
+    x, position, valid = scene()
+    x, position = jnp.where(valid[..., None], x, 0.0), jnp.where(valid[..., None], position, 0.0)
+    module = MetaPathConvolution(config)
+    params = jax.jit(module.init)(jax.random.key(0), x, position, valid)["params"]
+    selection = random_array(3, *params["selection"].shape)
+    out, state = module.apply(
+        {"params": params | {"selection": selection}}, x, position, valid, mutable="intermediates"
+    )
+
+    stack = dense_stack(config.relations, np.asarray(valid))
+    if similarity is not None:
+        (similar,) = state["intermediates"]["probabilities"]
+        stack = jnp.concatenate([stack, similar * valid.reshape(1, -1, 1)])
+        offered = np.array([similarity == "every_hop", similarity == "every_hop", True])
+        structural = jnp.arange(len(stack)) < len(config.relations)
+        selection = jnp.where(structural[None, None] | offered[:, None, None], selection, -jnp.inf)
+    (shares,) = state["intermediates"]["relations"]
+    np.testing.assert_allclose(shares, jax.nn.softmax(selection, -1), rtol=1e-6)
+    # The hop that acts first stands last in the product; normalising changes nothing, since rows sum to 1.
+    graphs = meta_path_graphs(stack, selection[::-1], GTN_2022)
+    np.testing.assert_allclose(graphs.sum(-1), np.broadcast_to(valid.reshape(1, -1), graphs.shape[:2]), atol=1e-5)
+    value = (x @ params["value"]["kernel"]).reshape(-1, DIM)
+    heard = jnp.concatenate([graph @ half for graph, half in zip(graphs, jnp.split(value, 2, axis=1), strict=True)], 1)
+    expected = (heard @ params["output"]["kernel"]).reshape(x.shape)
+    np.testing.assert_allclose(out[valid], expected[valid], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("heads", [1, 2])
+def test_a_gtn_that_selects_similarity_is_the_transformers_attention(heads):
+    config = dataclasses.replace(GTN, heads=heads, head_dim=DIM // heads)
+    x, position, valid = scene()
+    x, position = jnp.where(valid[..., None], x, 0.0), jnp.where(valid[..., None], position, 0.0)
+    module = MetaPathConvolution(config)
+    params = jax.jit(module.init)(jax.random.key(0), x, position, valid)["params"]
+    selection = jnp.full_like(params["selection"], -1e9).at[0, :, 0].set(0.0).at[1, :, -1].set(0.0)
+    out = jax.jit(module.apply)({"params": params | {"selection": selection}}, x, position, valid)
+    attention = MultiHeadAttention(DIM, heads)
+    shared = {name: params[name] for name in ("query", "key", "value", "output")}
+    asking, mask = (x + position).reshape(-1, DIM), key_mask(valid.reshape(-1))
+    expected = attention.apply({"params": shared}, asking, asking, x.reshape(-1, DIM), mask).reshape(x.shape)
+    np.testing.assert_allclose(out[valid], expected[valid], rtol=1e-4, atol=1e-5)
+
+
+@every_config
+def test_padding_changes_nothing(name):
+    """What stands in padded cells, NaN included, reaches neither outputs nor gradients."""
+    run, (features, position, valid) = compiled(name), scene()
+    fill = lambda value: [jnp.where(valid[..., None], x, value) for x in (features, position)]  # noqa: E731
+    clean, dirty = run(*fill(0.0), valid), run(*fill(jnp.nan), valid)
+    jax.tree.map(np.testing.assert_array_equal, clean, dirty)
+    out, _, (by_param, by_feature, _) = dirty
+    np.testing.assert_array_equal(out[~valid], 0.0)
+    assert float(jnp.abs(by_feature[valid]).min()) > 0
+    np.testing.assert_array_equal(by_feature[~valid], 0.0)
+    # A constant added to all keys changes no softmax, and one edge type leaves nothing to select.
+    idle = ("['key']['bias']", "['selection']") if name == "gtn similarity alone" else ("['key']['bias']",)
+    for path, leaf in jax.tree.leaves_with_path(by_param):
+        assert np.isfinite(leaf).all(), path
+        assert jax.tree_util.keystr(path).endswith(idle) or float(jnp.abs(leaf).max()) > 0, path
+
+
+@every_config
+def test_nothing_valid_gives_nothing(name):
+    nothing = jnp.full((*SHAPE, DIM), jnp.nan, jnp.float32)
+    out, _, gradients = compiled(name)(nothing, nothing, jnp.zeros(SHAPE, bool))
+    for leaf in jax.tree.leaves((out, gradients)):
+        np.testing.assert_array_equal(leaf, jnp.zeros_like(leaf))
+
+
+@every_config
+def test_it_does_not_matter_where_the_padding_is(name):
+    """A small map, and the same map anywhere within a padded one: the same memory and the same gradients."""
+    features, position, _ = scene(shape=BLOCK)
+    expected, _, (by_param, by_feature, _) = compiled(name)(features, position, jnp.ones(BLOCK, bool))
+    for down, right in ((0, 0), (2, 1), (1, 2)):
+        place = (slice(down, down + BLOCK[0]), slice(right, right + BLOCK[1]))
+        large, valid = jnp.full((*SHAPE, DIM), jnp.nan, jnp.float32), jnp.zeros(SHAPE, bool).at[place].set(True)
+        padded = compiled(name)(large.at[place].set(features), large.at[place].set(position), valid)
+        out, _, (to_params, to_features, _) = padded
+        np.testing.assert_allclose(out[place], expected, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(to_features[place], by_feature, rtol=1e-3, atol=1e-4)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), to_params, by_param)
+
+
+@every_config
+def test_looking_inside(name):
+    config, (_, seen, _) = CONFIGS[name], compiled(name)(*scene())
+    for i in range(config.layers):
+        layer = seen[f"layer_{i}"]["graph"]
+        (shares,) = layer["relations"]
+        np.testing.assert_allclose(shares.sum(-1), np.ones(shares.shape[:2]), rtol=1e-5)
+        if isinstance(config, GtnEncoderConfig):
+            assert shares.shape[:2] == (config.hops, config.channels)
+            assert ("probabilities" in layer) == (config.similarity is not None)
+        if isinstance(config, HanEncoderConfig):
+            assert {f"{relation}_probabilities" for relation in config.relations} <= set(layer)
+
+
+@pytest.mark.parametrize("name", ["gtn structural", "gcn"])
+def test_flipped_maps_give_flipped_memories(name):
+    """Structure knows no left and right but by its selection weights; here those of both sides are equal."""
+    config = dataclasses.replace(CONFIGS[name], layers=1)
+    module, variables = built(config)
+    variables = jax.tree.map(lambda leaf: leaf, variables)
+    features, position, valid = scene()
+    if isinstance(config, GtnEncoderConfig):
+        left, right = (config.relations.index(side) for side in ("left", "right"))
+        graph = variables["params"]["layer_0"]["graph"]
+        graph["selection"] = graph["selection"].at[..., left].set(graph["selection"][..., right])
+    apply = jax.jit(module.apply)
+    out = apply(variables, features, position, valid)
+    flipped = apply(variables, features[:, ::-1], position[:, ::-1], valid[:, ::-1])
+    np.testing.assert_allclose(out[:, ::-1], flipped, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["gtn", "gtn similarity alone", "gcn", "han"])
+@pytest.mark.parametrize("shape", [(1, 1), (0, 4)])
+def test_small_maps(name, shape):
+    module, variables = built(dataclasses.replace(CONFIGS[name], layers=1))
+    x = random_array(5, *shape, DIM)
+    out = jax.jit(module.apply)(variables, x, x, jnp.ones(shape, bool))
+    assert out.shape == x.shape
+    assert np.isfinite(out).all()
+
+
+def test_dropout_is_seeded():
+    """In the frame that all graphs share."""
+    module, variables = built(dataclasses.replace(CONFIGS["gcn"], layers=1))
+    apply = jax.jit(module.apply, static_argnames="deterministic")
+    run = lambda seed: apply(variables, *scene(), deterministic=False, rngs={"dropout": jax.random.key(seed)})  # noqa: E731
+    np.testing.assert_array_equal(run(0), run(0))
+    assert float(jnp.abs(run(0) - run(1)).max()) > 0
+    assert float(jnp.abs(run(0) - apply(variables, *scene(), deterministic=True)).max()) > 0
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_number_of_parameters_at_lstrs_size(name):
+    """Beside LSTR's transformer encoder: 25,408."""
+    config = {"gtn": GtnEncoderConfig(), "gcn": GcnEncoderConfig(), "han": HanEncoderConfig()}[name]
+    module, x = config.build(32, "encoder"), jnp.zeros((12, 20, 32))
+    variables = jax.eval_shape(module.init, jax.random.key(0), x, x, jnp.ones((12, 20), bool))
+    assert sum(leaf.size for leaf in jax.tree.leaves(variables)) == PARAMETERS[name]
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (GtnEncoderConfig(channels=3), "8 features do not split over 3 channels"),
+        (GtnEncoderConfig(heads=5), "8 features do not split over 5 heads"),
+        (HanEncoderConfig(heads=3), "8 features do not split over 3 heads"),
+        (GtnEncoderConfig(relations=(), similarity=None), "needs edge types"),
+        (GtnEncoderConfig(relations=()), "needs edge types"),
+        (HanEncoderConfig(relations=()), "needs edge types"),
+    ],
+)
+def test_impossible_configs_are_named(config, message):
+    with pytest.raises(UserError, match=message):
+        config.build(DIM, "encoder")

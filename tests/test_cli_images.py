@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import jax
 import numpy as np
 import pytest
 
@@ -77,14 +78,8 @@ def test_resume_is_bit_identical(trained, config, tmp_path):
     assert main(["train", "--config", str(config), "--out", str(part)]) == 0
     shutil.rmtree(part / "checkpoints" / "step_00000004")
     assert main(["train", "--resume", "--out", str(part)]) == 0
-    for ours, expected in zip(*(_leaves(open_run(folder, "last").params[0]) for folder in (part, trained)), strict=True):
-        np.testing.assert_array_equal(ours, expected)
-
-
-def _leaves(tree):
-    import jax
-
-    return jax.tree.leaves(tree)
+    again, whole = (open_run(folder, "last").params[0] for folder in (part, trained))
+    jax.tree.map(np.testing.assert_array_equal, again, whole)
 
 
 def test_examples_come_out_in_tusimples_form(trained, tmp_path):

@@ -22,7 +22,7 @@ def get_config() -> RunConfig:
     # Half the resolution and as many cells as at the full one: four times as many steps in the same time.
     model = LstrConfig(
         ResNetConfig(strides=(1, 2, 2, 1)), encoder=TransformerEncoderConfig(layer=LAYER), decoder=LAYER,
-        shrink=2, anchors=(0.35, 1.0),
+        shrink=2, located=True, cells=True, anchors=(0.35, 1.0),
     )  # fmt: skip
     augmentation = AugmentationConfig(geometry=0.8, rotation=0.03, crop=0.95)
     return RunConfig(

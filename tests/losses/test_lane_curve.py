@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from tflane_jax.losses.lane_curve import LaneCurveLossConfig, lane_curve_loss, lane_curve_targets
+from tflane_jax.losses.lane_curve import LaneCurveLossConfig, cell_loss, lane_curve_loss, lane_curve_targets
 from tflane_jax.scene import LaneCurvePrediction, LaneLines
 
 LINES, POINTS, QUERIES, LAYERS = 4, 9, 7, 2
@@ -26,11 +26,13 @@ def lines(seed=0, batch=2, count=3):
 def predictions(seed=1, batch=2):
     rng = np.random.default_rng(seed)
     logits = rng.normal(size=(batch, LAYERS, QUERIES, 2))
-    curves = rng.normal(0, 0.1, (batch, LAYERS, QUERIES, 8)) + [0.4, 0.9, 0.0, 0.2, 0.0, 0.5, 0.0, 0.0]
+    curves = rng.normal([0.4, 0.9, 0.0, 0.2, 0.0, 0.5, 0.0, 0.0], 0.1, (batch, LAYERS, QUERIES, 8))
     return LaneCurvePrediction(jnp.asarray(logits, jnp.float32), jnp.asarray(curves, jnp.float32))
 
 
-def value_and_gradient(prediction, truth, config=LaneCurveLossConfig()):
+def value_and_gradient(prediction, truth):
+    config = LaneCurveLossConfig()
+
     def loss(prediction, truth):
         return lane_curve_loss(prediction, lane_curve_targets(truth, shared_horizon=config.shared_horizon), config)
 
@@ -107,3 +109,18 @@ def test_lines_share_the_highest_row_where_asked():
     assert (np.ptp(shared[:, :3, 0], axis=1) == 0).all()
     np.testing.assert_array_equal(shared[:, :3, 0].min(1), own[:, :3, 0].min(1))
     assert not np.array_equal(shared, own)
+
+
+def test_cells_are_those_with_a_point():
+    points = np.zeros((1, 2, 3, 2), np.float32)
+    points[0, 0] = [[0.1, 0.1], [0.6, 0.3], [1.2, 0.6]]  # the last lies outside
+    points[0, 1] = np.nan
+    truth = LaneLines(points, np.ones((1, 2, 3), bool), np.array([[True, False]]))
+    targets = jax.tree.map(lambda leaf: leaf[0], lane_curve_targets(truth))
+    taken = np.zeros((2, 4))
+    taken[0, 0] = taken[0, 2] = 1
+    logits = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
+    expected = np.log1p(np.exp(np.where(taken == 1, -logits, logits))).mean()
+    np.testing.assert_allclose(cell_loss(jnp.asarray(logits), targets), expected, rtol=1e-6)
+    nothing = jax.tree.map(jnp.zeros_like, targets)
+    np.testing.assert_allclose(cell_loss(jnp.asarray(logits), nothing), np.log1p(np.exp(logits)).mean(), rtol=1e-6)

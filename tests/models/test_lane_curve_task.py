@@ -1,11 +1,14 @@
 """Networks of the LSTR family as tasks: padding, statistics, dropout, every encoder."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
+from tflane_jax.losses.lane_curve import LaneCurveLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneCurveHeads, nearest, normalise, shrink
 from tflane_jax.training.lane_curve import LaneCurveTask
@@ -129,11 +132,28 @@ def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
     plain = LaneCurveHeads(8).apply(variables, queries)
     anchored = heads.apply(variables, queries)
     np.testing.assert_array_equal(anchored.logits, plain.logits)
-    start = anchored.curves[..., :6] - plain.curves[..., :6]
-    np.testing.assert_allclose(start, np.broadcast_to([0.4, 0.95, 0.0, 0.2, 0.0, 0.5], start.shape), atol=1e-6)
+    # alpha of a typical road is 0.38, give or take 0.05.
+    np.testing.assert_allclose(anchored.curves[..., 0], 0.38 + 0.05 * plain.curves[..., 0], rtol=1e-5)
     b, offset = anchored.curves[..., 6], anchored.curves[..., 7]
-    for i, row in enumerate(anchors):
-        np.testing.assert_allclose(b * row - offset, plain.curves[..., 6 + i], rtol=1e-5, atol=1e-6)
+    for i, (row, spread) in enumerate(zip(anchors, (0.1, 1.0), strict=True)):
+        np.testing.assert_allclose(b * row - offset, spread * plain.curves[..., 6 + i], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("encoder", [None, GtnEncoderConfig(layers=1, hidden=16)])
+def test_cells_are_learned_beside_the_curves(encoder):
+    task = LaneCurveTask(tiny_model(encoder, cells=True))
+    params = jax.jit(task.init)(jax.random.key(0), road_image(0))
+    batch = road_images(2)
+    (loss, terms), gradient = jax.jit(jax.value_and_grad(task.loss, has_aux=True))(params, batch, jax.random.key(0))
+    assert terms["cells"] > 0
+    assert np.abs(gradient["cell_head"]["kernel"]).max() > 0
+    silent = dataclasses.replace(task, losses=LaneCurveLossConfig(cell_weight=0.0))
+    rest, _ = jax.jit(silent.loss)(params, batch, jax.random.key(0))
+    np.testing.assert_allclose(loss - terms["cells"], rest, rtol=1e-5)
+    without = {name: value for name, value in params.items() if name != "cell_head"}
+    answer, same = (jax.jit(LaneCurveTask(tiny_model(encoder, cells=flag)).predict)(p, road_image(0))
+                    for flag, p in ((True, params), (False, without)))  # fmt: skip
+    jax.tree.map(np.testing.assert_array_equal, answer, same)
 
 
 def test_shrunk_images_are_means_of_blocks_and_valid_where_all_of_a_block_is():

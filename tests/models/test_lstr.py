@@ -16,8 +16,9 @@ from tests.golden import (
     load_module_case,
     named_gradients,
 )
-from tests.shared import shared_root
+from tests.shared import shared_path, shared_root
 from tflane_jax.convert.lstr import convert_lstr
+from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
@@ -30,8 +31,9 @@ from tflane_jax.losses.lane_curve import (
 )
 from tflane_jax.matching import match
 from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig, normalise
-from tflane_jax.scene import LaneCurvePrediction
+from tflane_jax.scene import LaneCurvePrediction, stack_examples
 
 PUBLISHED = LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))
 pytestmark = pytest.mark.golden
@@ -197,3 +199,30 @@ def test_every_published_tensor_is_accounted_for():
     assert shapes(converted.variables) == shapes(fresh)
     assert sum(leaf.size for leaf in jax.tree.leaves(fresh["params"])) == 765_754
     assert json.dumps(converted.table)
+
+
+def test_the_ten_real_frames_give_the_originals_points():
+    """Photo to points, through our own decoding, resizing, weights and network."""
+    pytest.importorskip("cv2")
+    with np.load(shared_path("data/lstr/reference_outputs_train.npz")) as file:
+        reference = {name: file[name] for name in file.files}
+    dataset = TuSimpleDataset(TuSimpleConfig(str(shared_path("data/tusimple/LaneDetection"))))
+    assert [dataset.raw_file(i) for i in range(len(dataset))] == reference["raw_file"].tolist()
+    examples = stack_examples([dataset.example(i) for i in range(len(dataset))])
+    images = normalise(examples.image, examples.image_valid)
+    first = np.asarray(images[0]).transpose(2, 0, 1)
+    np.testing.assert_allclose(first, reference["input_first_image"], rtol=1e-6, atol=1e-6)
+    prediction = jax.device_get(predict(PUBLISHED, published_weights(), images, jnp.asarray(examples.image_valid)))
+    metrics = TuSimpleMetrics()
+    for i in range(len(dataset)):
+        ours = jax.tree.map(lambda leaf, i=i: leaf[i, -1], prediction)
+        theirs = LaneCurvePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
+        truth = dataset.truth(i)
+        found, expected = (row_lanes(one, truth.rows, height=720, width=1280) for one in (ours, theirs))
+        np.testing.assert_array_equal(found.x == -2, expected.x == -2)
+        np.testing.assert_allclose(found.x, expected.x, atol=0.5)  # pixels
+        metrics.update(found, truth)
+    expected = dict(zip(("Accuracy", "FP", "FN"), reference["metric"].mean(0), strict=True))
+    computed = metrics.compute()
+    for name, value in expected.items():
+        np.testing.assert_allclose(computed[name], value, atol=1e-9, err_msg=name)

@@ -39,9 +39,10 @@ class LaneCurveTask:
 
         def one(image, valid, key):
             variables = {"params": learned} | statistics
-            prediction, state = module.apply(
+            prediction, updated = module.apply(
                 variables, image, valid, train=True, mutable=[STATISTICS, AUXILIARY], rngs={"dropout": key}
             )
+            state: dict[str, Any] = dict(updated)
             return prediction, state.get(AUXILIARY, {}), state[STATISTICS]
 
         images = normalise(batch.image, batch.image_valid)

@@ -1,4 +1,4 @@
-"""The GTN network learns ten real TuSimple frames by heart: a check that network, loss and optimiser can fit real lanes.
+"""The GTN network learns ten real TuSimple frames by heart: network, loss and optimiser can fit real lanes.
 
     tflane train --config configs/gtn_lane/overfit.py
     tflane eval runs/overfit

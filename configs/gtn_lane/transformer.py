@@ -29,6 +29,6 @@ def get_config() -> RunConfig:
         task=LaneCurveTask(model, LaneCurveLossConfig(least_depth=0.02)),
         data=FrontViewData(train=6000, val=100, test=400, augmentation=augmentation),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, weight_decay=1e-4, b2=0.99, clip_norm=5.0, ema_decay=0.99),
-        training=TrainingConfig(steps=16_000, batch_size=4, eval_every=2000, best_metric="all/Accuracy"),
+        training=TrainingConfig(steps=4000, batch_size=4, eval_every=1000, best_metric="all/Accuracy"),
         evaluation=EvaluationConfig(batch_size=20),
     )

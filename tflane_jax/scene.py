@@ -274,6 +274,36 @@ class TrafficElements:
 
 
 @struct.dataclass
+class CameraViews:
+    """What V calibrated pinhole cameras see in one frame; camera 0 looks ahead, and traffic elements are labelled in it.
+
+    All images have one size; a smaller one lies in the top-left corner of its array and the rest is padding.
+
+    Attributes:
+        image: (V, H, W, 3) uint8, RGB, without lens distortion.
+        size: (V, 2) width and height of each image, pixels.
+        intrinsics: (V, 3, 3), pixels from the top-left corner of the image (see `geometry.cameras`).
+        camera_from_ego: (V, 4, 4).
+        valid: (V,) the camera delivered an image.
+    """
+
+    image: UInt8[Array, "v h w 3"]
+    size: Int[Array, "v 2"]
+    intrinsics: Float[Array, "v 3 3"]
+    camera_from_ego: Float[Array, "v 4 4"]
+    valid: Bool[Array, " v"]
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        v, h, w = self.image.shape[:3]
+        chex.assert_shape(self.image, (v, h, w, 3))
+        chex.assert_shape(self.size, (v, 2))
+        chex.assert_shape(self.intrinsics, (v, 3, 3))
+        chex.assert_shape(self.camera_from_ego, (v, 4, 4))
+        chex.assert_shape(self.valid, (v,))
+
+
+@struct.dataclass
 class Example:
     """One frame: what the sensors and the priors say, and the truth.
 
@@ -293,6 +323,7 @@ class Example:
         traffic_elements: truth.
         previous_from_ego: (4, 4) pose of this ego frame in the previous frame's ego frame.
         has_previous: () the previous frame belongs to the same scene.
+        cameras: what the cameras see.
     """
 
     bev: UInt8[Array, "h w c"] | None
@@ -306,11 +337,12 @@ class Example:
     traffic_elements: TrafficElements | None
     previous_from_ego: Float[Array, "4 4"]
     has_previous: Bool[Array, ""]
+    cameras: CameraViews | None = None
 
     def validate(self) -> None:
         """Validate every part; raise AssertionError naming the first field that does not fit."""
         parts = (self.traffic_flow, self.markers, self.sd_map, self.lanes, self.segments, self.areas,
-                 self.traffic_elements)  # fmt: skip
+                 self.traffic_elements, self.cameras)  # fmt: skip
         for part in parts:
             if part is not None:
                 part.validate()
@@ -338,10 +370,26 @@ class LanePrediction:
 
 
 @struct.dataclass
+class ElementPrediction:
+    """Traffic lights and signs predicted by E queries in the front image.
+
+    Attributes:
+        box: (E, 2, 2) top-left and bottom-right corners, pixels of camera 0.
+        logits: (E, 13) by OpenLane-V2 attribute (sigmoid).
+        lane_logits: (Q, E) [i, e]: element e governs lane i of the `LanePrediction` beside it.
+    """
+
+    box: Float[Array, "*layers e 2 2"]
+    logits: Float[Array, "*layers e a"]
+    lane_logits: Float[Array, "*layers q e"]
+
+
+@struct.dataclass
 class Prediction:
     """What a model says about one frame; a part that the model does not predict is None."""
 
     lanes: LanePrediction | None = None
+    elements: ElementPrediction | None = None
 
 
 def stack_examples(examples: list[Any]) -> Any:

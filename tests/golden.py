@@ -31,6 +31,7 @@ CLAIMS = {
     "modules/mmdet_losses*": "tests/losses/test_costs.py",
     "modules/mmdet_match_costs*": "tests/losses/test_costs.py",
     "modules/msda_func*": "tests/layers/test_deformable.py",
+    "modules/msda_module*": "tests/layers/test_deformable.py",
     "modules/pe_sine2d*": "tests/layers/test_positions.py",
     "modules/resnet*": "tests/layers/test_resnet.py",
     "modules/torch_encoder_layer*": "tests/layers/test_transformer.py",

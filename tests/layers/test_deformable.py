@@ -20,6 +20,7 @@ from tflane_jax.layers.deformable import (
     compass_offsets,
     deformable_attention,
     sample_bilinear,
+    sampling_locations,
 )
 
 
@@ -40,10 +41,11 @@ def test_core_matches_the_reference(path):
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("custom_msda_decoder*"), ids=case_id)
-def test_decoder_attention_matches_the_reference(path):
+@pytest.mark.parametrize("path", golden_modules("custom_msda_decoder*") + golden_modules("msda_module*"), ids=case_id)
+def test_module_matches_the_reference(path):
     case = load_module_case(path)
     shapes = [tuple(int(n) for n in row) for row in case.inputs.pop("spatial_shapes")]
+    padded = case.inputs.pop("key_padding_mask", np.zeros(case.inputs["value"].shape[1::-1], bool))
     sizes = case.meta["config"]
     module = DeformableAttention(sizes["embed_dims"], sizes["num_heads"], sizes["num_points"], sizes["num_levels"])
 
@@ -53,12 +55,13 @@ def test_decoder_attention_matches_the_reference(path):
             for name in ("sampling_offsets", "attention_weights", "value_proj", "output_proj")
         }
 
-        def one(query, position, value, reference):
-            return query + module.apply({"params": params}, query + position, value, shapes, reference)
+        def one(query, position, value, reference, padded):
+            attended = module.apply({"params": params}, query + position, value, shapes, reference[:, None], ~padded)
+            return query + attended
 
         # The reference puts the batch second, and adds the query back itself.
-        out = jax.vmap(one, in_axes=(1, 1, 1, 0), out_axes=1)(
-            arrays["query"], arrays["query_pos"], arrays["value"], arrays["reference_points"]
+        out = jax.vmap(one, in_axes=(1, 1, 1, 0, 0), out_axes=1)(
+            arrays["query"], arrays["query_pos"], arrays["value"], arrays["reference_points"], padded
         )
         return (out * case.weights["output"]).sum(), out
 
@@ -128,6 +131,41 @@ def test_heads_look_around_their_own_points():
     np.testing.assert_array_equal(out(centre, centre), together)
     with pytest.raises(ValueError, match="1 or 2 points"):
         out(centre, centre, centre)
+
+
+def test_offsets_count_in_cells_around_a_point_and_in_halves_of_a_box():
+    """Worked by hand: levels of 4 x 8 and 2 x 4 cells, two points, one head."""
+    offsets = jnp.ones((1, 1, 2, 2, 2))
+    shapes = ((4, 8), (2, 4))
+    point = sampling_locations(jnp.array([[[0.5, 0.25]]]), offsets, shapes)
+    np.testing.assert_allclose(point[0, 0, :, 0], [[0.625, 0.5], [0.75, 0.75]])
+    box = sampling_locations(jnp.array([[[0.5, 0.25, 0.4, 0.2]]]), offsets, shapes)
+    np.testing.assert_allclose(box[0, 0, :, 1], [[0.6, 0.3], [0.6, 0.3]], rtol=1e-6)
+    by_level = sampling_locations(jnp.array([[[[0.5, 0.25], [0.0, 0.0]]]]), offsets, shapes)
+    np.testing.assert_allclose(by_level[0, 0, :, 0], [[0.625, 0.5], [0.25, 0.5]])
+    for wrong in ((1, 1, 3), (1, 1, 3, 2)):
+        with pytest.raises(ValueError, match="reference must be"):
+            sampling_locations(jnp.zeros(wrong), offsets, shapes)
+
+
+def test_padding_of_the_value_reaches_nothing():
+    module = DeformableAttention(8, heads=2, points=2, levels=2)
+    rng = np.random.default_rng(2)
+    shapes, valid = ((3, 4), (2, 2)), np.ones(16, bool)
+    valid[[3, 7, 11, 13, 15]] = False
+    value, query = (jnp.asarray(rng.normal(size=(n, 8)).astype(np.float32)) for n in (16, 5))
+    reference = jnp.asarray(rng.uniform(size=(5, 1, 2)).astype(np.float32))
+    params = module.init(jax.random.key(0), query, value, shapes, reference)
+
+    @jax.jit
+    def both(value):
+        run = lambda params: module.apply(params, query, value, shapes, reference, jnp.asarray(valid))  # noqa: E731
+        out, pull = jax.vjp(run, params)
+        return out, pull(jnp.ones_like(out))
+
+    clean, garbage = both(value), both(jnp.where(valid[:, None], value, jnp.nan))
+    jax.tree.map(np.testing.assert_array_equal, clean, garbage)
+    np.testing.assert_array_less(0.01, np.abs(clean[0] - module.apply(params, query, value, shapes, reference)).max())
 
 
 def test_compass_points_outward():

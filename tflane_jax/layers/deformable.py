@@ -9,7 +9,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 def sample_bilinear(
@@ -94,31 +94,67 @@ class DeformableAttention(nn.Module):
         query: Float[Array, "q c"],
         value: Float[Array, "hw c"],
         shapes: Sequence[tuple[int, int]],
-        reference: Float[Array, "q r 2"],
+        reference: Float[Array, "q r *levels d"],
+        valid: Bool[Array, " hw"] | None = None,
     ) -> Float[Array, "q c"]:
         """Return the attended features, without residual.
 
         Args:
             query: content plus position; it decides where to look and how much to take.
-            value: BEV features, levels concatenated.
+            value: features to look at, levels concatenated.
             shapes: (h, w) of each level.
-            reference: (x, y) in [0, 1] around which to look: R = 1 for all heads together, or R = heads, one point
-                for each (LaneSegNet's heads-to-regions).
+            reference: where to look, in [0, 1]: (Q, R, D) for all levels together, or (Q, R, levels, D). R = 1 for all
+                heads together, or R = heads, one point for each (LaneSegNet's heads-to-regions). D = 2 is a point
+                (x, y), offsets then count in cells; D = 4 a box (cx, cy, w, h), offsets then count in halves of the
+                box, divided by the number of points (Deformable DETR's refined boxes).
+            valid: cells that hold something; the others give nothing, whatever stands in them.
+
+        Raises:
+            ValueError: a reference of another shape.
         """
         queries, (heads, levels, points) = query.shape[0], (self.heads, self.levels, self.points)
-        if reference.shape[1] not in (1, heads):
-            raise ValueError(f"reference needs 1 or {heads} points per query, got {reference.shape[1]}")
         bias = compass_offsets(heads, levels, points).reshape(-1)
         offsets = nn.Dense(
             heads * levels * points * 2, kernel_init=nn.initializers.zeros,
             bias_init=lambda *_: jnp.asarray(bias), name="sampling_offsets",
         )(query).reshape(queries, heads, levels, points, 2)  # fmt: skip
-        logits = nn.Dense(
-            heads * levels * points, kernel_init=nn.initializers.zeros, name="attention_weights"
-        )(query).reshape(queries, heads, levels * points)
+        logits = nn.Dense(heads * levels * points, kernel_init=nn.initializers.zeros, name="attention_weights")(
+            query
+        ).reshape(queries, heads, levels * points)
         weights = jax.nn.softmax(logits, -1).reshape(queries, heads, levels, points)
-        value = nn.Dense(self.dim, name="value_proj")(value).reshape(-1, heads, self.dim // heads)
-        size = jnp.array([(w, h) for h, w in shapes], offsets.dtype)
-        locations = reference[:, :, None, None] + offsets / size[None, None, :, None]
+        # Before the projection too: what stands in padding must not reach the projection's gradient.
+        value = nn.Dense(self.dim, name="value_proj")(_masked(value, valid))
+        value = _masked(value, valid).reshape(-1, heads, self.dim // heads)
+        locations = sampling_locations(reference, offsets, shapes)
         attended = deformable_attention(value, shapes, locations, weights)
         return nn.Dense(self.dim, name="output_proj")(attended)
+
+
+def sampling_locations(
+    reference: Float[Array, "q r *levels d"],
+    offsets: Float[Array, "q heads levels p 2"],
+    shapes: Sequence[tuple[int, int]],
+) -> Float[Array, "q heads levels p 2"]:
+    """Return the locations in [0, 1] that offsets from the references stand for (see `DeformableAttention`).
+
+    Raises:
+        ValueError: a reference of another shape.
+    """
+    heads, levels, points = offsets.shape[1:4]
+    if reference.shape[1] not in (1, heads):
+        raise ValueError(f"reference needs 1 or {heads} points per query, got {reference.shape[1]}")
+    if len(shapes) != levels:
+        raise ValueError(f"the attention has {levels} levels, the value {len(shapes)}")
+    if reference.ndim == 3:
+        reference = reference[:, :, None]
+    if reference.ndim != 4 or reference.shape[2] not in (1, levels) or reference.shape[3] not in (2, 4):
+        raise ValueError(f"reference must be (q, r, 2 or 4) or (q, r, {levels}, 2 or 4), got {reference.shape}")
+    if reference.shape[-1] == 2:
+        unit = jnp.array([(1.0 / w, 1.0 / h) for h, w in shapes], offsets.dtype)[None, None, :, None]
+    else:
+        unit = reference[:, :, :, None, 2:] * (0.5 / points)
+    return reference[:, :, :, None, :2] + offsets * unit
+
+
+def _masked(value: Float[Array, "hw c"], valid: Bool[Array, " hw"] | None) -> Float[Array, "hw c"]:
+    return value if valid is None else jnp.where(valid[:, None], value, 0.0)

@@ -71,6 +71,7 @@ def build_parser() -> argparse.ArgumentParser:
     _convert(commands)
     _export(commands)
     _data(commands)
+    _summary(commands)
     _compare(commands)
     _score(commands)
     _demo(commands)
@@ -191,6 +192,17 @@ def _data(commands) -> None:
                      function="build", epilog=_OVERRIDES)  # fmt: skip
     build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
     build.set_defaults(takes_overrides=True)
+
+
+def _summary(commands) -> None:
+    parser = _command(commands, "summary", "count a model's parameters, operations and memory",
+                      module="summary", function="run", epilog=_OVERRIDES)  # fmt: skip
+    parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the default configuration)")
+    parser.add_argument("--depth", type=int, default=1, help="levels of parameter names (default 1)")
+    parser.add_argument("--no-compile", action="store_true", help="count operations only, which takes seconds")
+    parser.add_argument("--no-training", action="store_true", help="leave the training step out")
+    parser.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
+    parser.set_defaults(takes_overrides=True)
 
 
 def _compare(commands) -> None:

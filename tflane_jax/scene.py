@@ -275,8 +275,9 @@ class TrafficElements:
 
 @struct.dataclass
 class CameraViews:
-    """What V calibrated pinhole cameras see in one frame; camera 0 looks ahead, and traffic elements are labelled in it.
+    """What V calibrated pinhole cameras see in one frame.
 
+    Camera 0 looks ahead, and traffic elements are labelled in its image.
     All images have one size; a smaller one lies in the top-left corner of its array and the rest is padding.
 
     Attributes:
@@ -395,6 +396,11 @@ class Prediction:
 def stack_examples(examples: list[Any]) -> Any:
     """Stack pytrees of equal structure into one batch with a leading axis (numpy, host)."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *examples)
+
+
+def shapes_of(example: Any, *leading: int) -> Any:
+    """Return shapes and types of the leaves of a pytree, with `leading` axes in front."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape), leaf.dtype), example)
 
 
 @struct.dataclass

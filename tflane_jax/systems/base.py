@@ -67,6 +67,10 @@ class System(Protocol):
         """Return the examples of a split: what training looks at, stacked along a leading axis."""
         ...
 
+    def shapes(self, config: Any) -> Any:
+        """Return shapes and types of one example of a configuration, as far as can be told without its data."""
+        ...
+
     def prepare(self, config: Any) -> Prepare | None:
         """Return the augmentation of training batches, None for none."""
         ...

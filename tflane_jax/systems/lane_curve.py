@@ -19,10 +19,12 @@ from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
 from tflane_jax.datasets.tusimple import TuSimpleDataset, row_lanes
 from tflane_jax.datasets.tusimple import load_road_images as load_tusimple
+from tflane_jax.images import HEIGHT as INPUT_HEIGHT
+from tflane_jax.images import WIDTH as INPUT_WIDTH
 from tflane_jax.losses.lane_curve import lane_curve_loss, lane_curve_targets
 from tflane_jax.metrics import image_lanes
 from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
-from tflane_jax.scene import LaneCurvePrediction, LaneLines, RoadImage, stack_examples
+from tflane_jax.scene import LaneCurvePrediction, LaneLines, RoadImage, shapes_of, stack_examples
 from tflane_jax.systems.base import Evaluation, Model, spread
 from tflane_jax.training.batches import Prepare
 from tflane_jax.training.evaluate import predict_batch, predictions
@@ -30,6 +32,7 @@ from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.loop import Draw
 from tflane_jax.training.records import Record
 from tflane_jax.training.task import Params
+from tflane_jax.world.front_view_lines import CAPACITY, ROWS
 
 # The metric's image: rows and columns of TuSimple.
 HEIGHT, WIDTH = 720, 1280
@@ -77,6 +80,12 @@ class LaneCurveSystem:
     def examples(self, data: LabelledImages) -> RoadImage:
         """Return the images with their lines."""
         return data.images
+
+    def shapes(self, config: RunConfig) -> RoadImage:
+        """Return shapes of images at the network's resolution."""
+        lines = LaneLines.empty(CAPACITY, len(ROWS))
+        size = (INPUT_HEIGHT, INPUT_WIDTH)
+        return shapes_of(RoadImage(np.zeros((*size, 3), np.uint8), np.zeros(size, bool), lines))
 
     def prepare(self, config: RunConfig) -> Prepare | None:
         """Return the augmentation of the configuration's data."""
@@ -172,7 +181,7 @@ def predict(task: Any, params: Params, examples: RoadImage) -> LaneCurvePredicti
     return answer
 
 
-def frames_per_second(model: Model, height: int = 360, width: int = 640) -> float:
+def frames_per_second(model: Model, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH) -> float:
     """Return how many images a second a model takes one at a time, from uint8 image to curves, compilation apart."""
     image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
     lines = jax.tree.map(lambda leaf: leaf[None], LaneLines.empty(1, 1))

@@ -7,16 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from tflane_jax.config import LaneGraphSource, RunConfig
 from tflane_jax.datasets.argoverse2 import Argoverse2Dataset
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.cache import cached
-from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
-from tflane_jax.scene import Example, LanePrediction, stack_examples
+from tflane_jax.scene import Example, LanePrediction, shapes_of, stack_examples
 from tflane_jax.systems.base import Evaluation, Model, spread
 from tflane_jax.training.evaluate import evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
@@ -43,6 +44,13 @@ class LaneGraphSystem:
     def examples(self, data: Example) -> Example:
         """Return the examples themselves."""
         return data
+
+    def shapes(self, config: RunConfig) -> Example:
+        """Return shapes of the training parts of an example."""
+        source = _source(config, "train")
+        dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else Argoverse2Dataset(source)
+        one = for_training(stack_examples([dataset.example(0)]))
+        return shapes_of(jax.tree.map(lambda leaf: leaf[0], one))
 
     def prepare(self, config: RunConfig) -> None:
         """Return None: examples are used as they are."""

@@ -1,0 +1,45 @@
+"""`tflane summary`: parameters, operations and memory of a configuration, from shapes alone."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
+from tflane_jax.systems import system_of
+from tflane_jax.training.runtime import configure_jax
+
+
+def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
+    """Print the two tables, and save them where --out says."""
+    configure_jax()
+    config = load_config(options.config) if options.config else RunConfig()
+    config = apply_overrides(config, overrides)
+    example = system_of(config).shapes(config)
+    params = shapes_of_params(config.task, example)
+    counts = parameter_counts(params, options.depth)
+    total = sum(counts.values())
+    parts = [{"part": name, "parameters": f"{count:,}", "share": f"{count / total:.1%}"}
+             for name, count in counts.items()]  # fmt: skip
+    parts.append({"part": "all", "parameters": f"{total:,}", "share": "100.0%"})
+    title = f"Parameters of {options.config or 'the default configuration'}"
+    print(format_table(parts, title=title), flush=True)
+
+    batch_size = config.training.batch_size
+    compiled = not options.no_compile
+    programs = [prediction_program(config.task, example, compiled=compiled)]
+    if not options.no_training:
+        programs.append(training_program(config.task, example, batch_size, config.optim, compiled=compiled))
+    rows = [
+        {"program": each.name, "batch": each.batch, "GFLOP": each.gflop, "memory, MiB": each.memory,
+         "of it intermediate": each.between, "compile, s": each.compile_s}
+        for each in programs
+    ]  # fmt: skip
+    title = "Operations as XLA counts them before fusion; memory as the compiler for this machine plans it"
+    print("\n" + format_table(rows, title=title, digits=1))
+    if options.out is not None:
+        meta = {"config": options.config, "parameters": counts}
+        print(f"\nwritten: {save_table(options.out, rows, meta, title=title, digits=1)[0]}")
+    return 0

@@ -152,13 +152,20 @@ def _grain() -> Float[np.ndarray, " n"]:
 
 
 def develop(
-    rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], weather: Weather
+    rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], weather: Weather, scale: float = 1.0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture that the camera makes: rain, blur, exposure, contrast, tint, noise."""
+    """Return the picture that the camera makes: rain, blur, exposure, contrast, tint, noise.
+
+    Args:
+        rng: stream of rain and noise.
+        image: what falls on the lens; rain is added to it in place.
+        weather: with the camera's tone.
+        scale: size of the raindrops' streaks; 1 suits images of 640 x 360.
+    """
     import cv2
 
     if weather.rain:
-        _streaks(rng, image, weather)
+        _streaks(rng, image, weather, scale)
     # A lens spreads a point over about a pixel at best.
     image = cv2.GaussianBlur(image, (0, 0), 0.45 + weather.blur)
     levels = np.arange(256, dtype=np.float32)[:, None] / 255.0 * (weather.exposure * weather.tint).astype(np.float32)
@@ -172,13 +179,13 @@ def develop(
     return image
 
 
-def _streaks(rng: np.random.Generator, image: np.ndarray, weather: Weather) -> None:
+def _streaks(rng: np.random.Generator, image: np.ndarray, weather: Weather, scale: float) -> None:
     import cv2
 
     h, w = image.shape[:2]
     count = int(260 * weather.rain)
     start = rng.uniform(0.0, 1.0, (count, 2)) * [w, h]
-    fall = rng.uniform(6.0, 22.0, (count, 1)) * [rng.uniform(-0.3, 0.3), 1.0]
+    fall = scale * rng.uniform(6.0, 22.0, (count, 1)) * [rng.uniform(-0.3, 0.3), 1.0]
     layer = image.copy()
     lines = np.round(np.stack([start, start + fall], 1) * 16).astype(np.int32)
     cv2.polylines(layer, list(lines), False, (200, 205, 210), 1, cv2.LINE_AA, SHIFT)

@@ -29,7 +29,7 @@ class Solid:
         light: 0 lit by the sun, 1 shines by itself, one for each.
     """
 
-    distance: float
+    distance: float = 0.0
     corners: list[np.ndarray] = field(default_factory=list)
     colours: list[tuple[float, float, float]] = field(default_factory=list)
     light: list[float] = field(default_factory=list)
@@ -72,7 +72,7 @@ def draw_solids(
         part = slice(starts[number], stops[number])
         ring = fixed[part]
         if nearest[number] <= NEAR:
-            ring = fixed_point(camera.image_of(_clipped(points[part], depth[part]))[0])
+            ring = fixed_point(camera.image_of(clipped(points[part], depth[part]))[0])
         cv2.fillPoly(image, [ring], colours[number], cv2.LINE_AA, SHIFT)
 
 
@@ -81,7 +81,7 @@ def fixed_point(pixels: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m 2"]:
     return np.round((np.clip(pixels, -_LIMIT, _LIMIT) - 0.5) * (1 << SHIFT)).astype(np.int32)
 
 
-def _clipped(points: Float[np.ndarray, "m 3"], depth: Float[np.ndarray, " m"]) -> Float[np.ndarray, "k 3"]:
+def clipped(points: Float[np.ndarray, "m 3"], depth: Float[np.ndarray, " m"]) -> Float[np.ndarray, "k 3"]:
     """Return the part of a polygon in front of the camera (Sutherland and Hodgman 1974)."""
     after, depth_after = np.roll(points, -1, 0), np.roll(depth, -1)
     inside = depth > NEAR

@@ -10,6 +10,7 @@ import numpy as np
 from tflane_jax.world.front_view_camera import lift
 from tflane_jax.world.front_view_polygons import Solid
 from tflane_jax.world.front_view_road import Beside, Highway
+from tflane_jax.world.solid_shapes import box
 
 # Long things are cut at these stations, so that each piece can be hidden by, and hide, what stands beside it.
 _CUTS = np.array([-9.0, -3.0, 3.0, 8.0, 14.0, 22.0, 34.0, 52.0, 80.0, 120.0, 180.0, 280.0])
@@ -56,20 +57,6 @@ def draw_roadside(rng: np.random.Generator, road: Highway) -> Roadside:
         solids += _bridge(rng, road, station, half, outer_left, outer_right)
         bridges.append((station, half))
     return Roadside(solids, crowns, bridges)
-
-
-def _box(solid: Solid, centre: np.ndarray, heading: float, size: tuple[float, float], z: tuple[float, float], colour):
-    """Add an upright box: length along the heading and width across it."""
-    u = np.array([np.cos(heading), np.sin(heading)])
-    v = np.array([-u[1], u[0]])
-    a, b = 0.5 * size[0] * u, 0.5 * size[1] * v
-    ring = np.array([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
-    low, high = lift(ring, z[0]), lift(ring, z[1])
-    for i in range(4):
-        j = (i + 1) % 4
-        solid.add(np.stack([low[i], low[j], high[j], high[i]]), colour)
-    solid.add(high, colour)
-    solid.add(low[::-1], tuple(0.6 * c for c in colour))
 
 
 def _sheet(road: Highway, s0: float, s1: float, offset: float, hand: float, z: tuple[float, float]) -> np.ndarray:
@@ -129,7 +116,7 @@ def _trees(rng: np.random.Generator, road: Highway, left: float, right: float) -
     for xy, radius in zip(road.at(s, offset), size, strict=True):
         distance, middle = float(np.hypot(*xy)), radius * rng.uniform(1.2, 2.2)
         solid = Solid(distance)
-        _box(solid, xy, 0.0, (0.35, 0.35), (0.0, middle), (0.2, 0.15, 0.1))
+        box(solid, xy, 0.0, (0.35, 0.35), (0.0, middle), (0.2, 0.15, 0.1))
         blobs = 7 if distance < 90 else 3
         for k in range(blobs):
             shift = radius * np.array([0.0, *rng.uniform(-0.55, 0.55, 2)])
@@ -151,8 +138,8 @@ def _lamps(rng: np.random.Generator, road: Highway, right: float) -> list[Solid]
     for s in np.arange(rng.uniform(5.0, spacing), 220.0, spacing):
         xy, arm = road.at(np.array([s, s]), np.array([offset, offset + hand * 1.3]))
         solid = Solid(float(np.hypot(*xy)))
-        _box(solid, xy, 0.0, (0.22, 0.22), (0.0, 9.0), _POST)
-        _box(solid, 0.5 * (xy + arm), float(np.arctan2(*(arm - xy)[::-1])), (2.6, 0.2), (8.9, 9.1), _POST)
+        box(solid, xy, 0.0, (0.22, 0.22), (0.0, 9.0), _POST)
+        box(solid, 0.5 * (xy + arm), float(np.arctan2(*(arm - xy)[::-1])), (2.6, 0.2), (8.9, 9.1), _POST)
         solids.append(solid)
     return solids
 
@@ -165,8 +152,8 @@ def _signs(rng: np.random.Generator, road: Highway, right: float) -> list[Solid]
         colour = [(0.05, 0.35, 0.2), (0.1, 0.25, 0.55), (0.85, 0.7, 0.1), (0.85, 0.85, 0.85)][rng.integers(4)]
         solid = Solid(float(np.hypot(*xy)))
         width = high * rng.uniform(0.7, 1.5)
-        _box(solid, xy, 0.0, (0.1, 0.1), (0.0, 2.2), _POST)
-        _box(solid, xy, 0.0, (0.06, width), (2.0, 2.0 + high), colour)
+        box(solid, xy, 0.0, (0.1, 0.1), (0.0, 2.2), _POST)
+        box(solid, xy, 0.0, (0.06, width), (2.0, 2.0 + high), colour)
         solids.append(solid)
     if rng.random() < 0.15:
         s = rng.uniform(40.0, 160.0)
@@ -175,12 +162,12 @@ def _signs(rng: np.random.Generator, road: Highway, right: float) -> list[Solid]
         solid = Solid(float(np.hypot(*posts.mean(0))))
         _, heading = road.axis.at(np.array([s]))
         for post in posts:
-            _box(solid, post, heading[0], (0.4, 0.4), (0.0, 7.2), _POST)
-        _box(solid, posts.mean(0), heading[0], (0.4, right_end - left_end), (6.4, 7.2), _POST)
+            box(solid, post, heading[0], (0.4, 0.4), (0.0, 7.2), _POST)
+        box(solid, posts.mean(0), heading[0], (0.4, right_end - left_end), (6.4, 7.2), _POST)
         for share in rng.uniform(0.15, 0.85, rng.integers(1, 4)):
             centre = posts[0] + share * (posts[1] - posts[0])
             solid_sign = Solid(solid.distance - 1.0)
-            _box(solid_sign, centre, heading[0], (0.2, rng.uniform(2.5, 5.0)), (5.6, 7.8), (0.05, 0.33, 0.2))
+            box(solid_sign, centre, heading[0], (0.2, rng.uniform(2.5, 5.0)), (5.6, 7.8), (0.05, 0.33, 0.2))
             solids.append(solid_sign)
         solids.append(solid)
     return solids
@@ -197,7 +184,7 @@ def _buildings(rng: np.random.Generator, road: Highway, left: float, right: floa
         tone = rng.uniform(0.4, 0.75) * np.array([1.0, rng.uniform(0.86, 1.0), rng.uniform(0.75, 1.0)])
         solid = Solid(float(np.hypot(*xy)))
         heading = rng.uniform(-0.3, 0.3)
-        _box(solid, xy, heading, (length, width), (0.0, height), tuple(tone))
+        box(solid, xy, heading, (length, width), (0.0, height), tuple(tone))
         u = np.array([np.cos(heading), np.sin(heading)])
         v = np.array([-u[1], u[0]])
         for z in np.arange(1.5, height - 1.5, 3.2):
@@ -217,13 +204,13 @@ def _bridge(
     (centre,) = road.at(np.array([station]), np.array([middle]))
     distance = station - half
     deck = Solid(distance)
-    _box(deck, centre, heading[0], (2.0 * half, 2.0 * reach), (low, high), _CONCRETE)
+    box(deck, centre, heading[0], (2.0 * half, 2.0 * reach), (low, high), _CONCRETE)
     solids = [deck]
     for offset in (left - 1.0, right + 2.0, road.left[1] - 0.6):
         if offset == road.left[1] - 0.6 and road.edges[1] >= road.edges[2]:
             continue
         (foot,) = road.at(np.array([station]), np.array([offset]))
         pier = Solid(distance + 0.5)
-        _box(pier, foot, heading[0], (1.2, 0.9), (0.0, low), (0.52, 0.51, 0.49))
+        box(pier, foot, heading[0], (1.2, 0.9), (0.0, low), (0.52, 0.51, 0.49))
         solids.append(pier)
     return solids

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tflane_jax.metrics import CenterlineMetrics, detections_from_prediction, truth_from_example
-from tflane_jax.scene import LaneGraph, LanePrediction, TrafficElements
+from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
 
 
 def make_graph(garbage):
@@ -70,6 +70,40 @@ def test_detections_come_best_first_with_their_topology():
     np.testing.assert_array_equal(detections.points, prediction.points[[1, 2, 0, 3]])
     expected = 1 / (1 + np.exp(-prediction.successor_logits[1, 3]))
     np.testing.assert_allclose(detections.successor[0, 3], expected, rtol=1e-6)
+
+
+def test_elements_come_best_first_and_know_their_lanes():
+    rng = np.random.default_rng(2)
+    logits = np.full((3, 13), -5.0, np.float32)
+    logits[[0, 1, 2], [4, 2, 12]] = -1.0, 2.0, 0.5
+    elements = ElementPrediction(
+        rng.uniform(0, 100, (3, 2, 2)).astype(np.float32), logits, rng.normal(size=(4, 3)).astype(np.float32)
+    )
+    found = detections_from_prediction(make_prediction(), elements).elements
+    assert found is not None
+    np.testing.assert_array_equal(found.attributes, [2, 12, 4])
+    np.testing.assert_array_equal(found.boxes, elements.box[[1, 2, 0]])
+    # Lanes are in the order of the detections too: best first, 1, 2, 0, 3.
+    np.testing.assert_allclose(found.lane[2, 1], 1 / (1 + np.exp(-elements.lane_logits[0, 2])), rtol=1e-6)
+
+
+def test_perfect_elements_get_the_full_score():
+    lanes, elements = make_graph(np.float32(0.0))
+    box = np.array([[[1, 2], [3, 4]], [[10, 20], [30, 45]], [[5, 6], [7, 8]]], np.float32)
+    elements = dataclasses.replace(elements, box=box, lane=np.eye(5, 3, dtype=bool)[:, [1, 0, 2]])
+    certain = np.full((5, 1), 9.0, np.float32)
+    predicted = LanePrediction(lanes.points, np.where(lanes.valid[:, None], certain, -9.0), _sure(lanes.successor))
+    attribute = np.where(np.arange(13) == 3, 9.0, -9.0)[None].astype(np.float32)
+    said = ElementPrediction(box[1:2], attribute, _sure(elements.lane[:, 1:2]))
+    metrics = CenterlineMetrics()
+    metrics.update(detections_from_prediction(predicted, said), truth_from_example(lanes, elements))
+    result = metrics.compute()
+    assert result["DET_t"] == 1.0
+    assert result["TOP_lt"] == 1.0
+
+
+def _sure(edges):
+    return np.where(edges, 9.0, -9.0).astype(np.float32)
 
 
 def test_device_arrays_are_taken_too():

@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.distances import pad_lines
-from tflane_jax.scene import LaneGraph, LanePrediction, TrafficElements
+from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
 
 Lines = Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"]
 
@@ -105,14 +105,33 @@ def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None
     )
 
 
-def detections_from_prediction(prediction: LanePrediction) -> LaneDetections:
-    """Return the lanes of all queries of ONE example's last layer, best score first (no score threshold)."""
+def detections_from_prediction(
+    prediction: LanePrediction, elements: ElementPrediction | None = None
+) -> LaneDetections:
+    """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
+
+    No score threshold; a traffic element is of the attribute that its query finds likeliest.
+    """
     scores = expit(np.asarray(prediction.logits)).max(-1)
     order = np.argsort(-scores, kind="stable")
     return LaneDetections(
         points=np.asarray(prediction.points)[order],
         scores=scores[order],
         successor=expit(np.asarray(prediction.successor_logits)[np.ix_(order, order)]),
+        elements=None if elements is None else _element_detections(elements, order),
+    )
+
+
+def _element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"]) -> ElementDetections:
+    """Return the elements, best score first, with the lanes in the given order."""
+    confidence = expit(np.asarray(elements.logits))
+    scores = confidence.max(-1)
+    order = np.argsort(-scores, kind="stable")
+    return ElementDetections(
+        boxes=np.asarray(elements.box)[order],
+        attributes=confidence.argmax(-1)[order],
+        scores=scores[order],
+        lane=expit(np.asarray(elements.lane_logits)[np.ix_(lanes, order)]),
     )
 
 

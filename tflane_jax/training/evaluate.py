@@ -11,7 +11,7 @@ import numpy as np
 
 from tflane_jax.metrics.frames import detections_from_prediction, truth_from_example
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
-from tflane_jax.scene import Example, LanePrediction, Prediction
+from tflane_jax.scene import Example
 from tflane_jax.training.task import Params, Task
 
 
@@ -41,6 +41,8 @@ def predictions(task: Task, params: Params, arrays: Any, batch_size: int) -> Ite
 def evaluate_lanes(task: Task, params: Params, arrays: Example, batch_size: int = 16) -> GroupedCenterlineMetrics:
     """Return the filled accumulator of OpenLane-V2's centerline metrics (groups all, occluded, clear) of a dataset.
 
+    Traffic elements are measured where the task predicts them and the examples have them.
+
     Args:
         task: predicts lanes.
         params: of the task.
@@ -52,15 +54,14 @@ def evaluate_lanes(task: Task, params: Params, arrays: Example, batch_size: int 
     """
     metrics = GroupedCenterlineMetrics()
     for indices, answer in predictions(task, params, arrays, batch_size):
-        lanes = _lanes(answer)
+        if answer.lanes is None:
+            raise ValueError("this task predicts no lanes, so there is nothing to measure")
+        both = answer.elements is not None and arrays.traffic_elements is not None
+        found = answer.lanes, answer.elements if both else None
+        true = arrays.lanes, arrays.traffic_elements if both else None
         for row, index in enumerate(indices):
-            truth = jax.tree.map(lambda leaf, i=index: leaf[i], arrays.lanes)
-            found = jax.tree.map(lambda leaf, i=row: leaf[i], lanes)
-            metrics.update(detections_from_prediction(found), truth_from_example(truth))
+            metrics.update(
+                detections_from_prediction(*jax.tree.map(lambda leaf, i=row: leaf[i], found)),
+                truth_from_example(*jax.tree.map(lambda leaf, i=index: leaf[i], true)),
+            )
     return metrics
-
-
-def _lanes(answer: Prediction) -> LanePrediction:
-    if answer.lanes is None:
-        raise ValueError("this task predicts no lanes, so there is nothing to measure")
-    return answer.lanes

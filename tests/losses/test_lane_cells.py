@@ -1,0 +1,65 @@
+"""Which BEV cells lanes run through, and the auxiliary loss on them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.losses.lane_cells import lane_cell_loss, lane_cells
+from tflane_jax.scene import LaneGraph
+
+RANGE = PerceptionRange((0.0, 8.0), (0.0, 4.0), (-1.0, 1.0))
+SHAPE = (4, 8)  # cells of one metre
+
+
+def graph(*lines, capacity=3, garbage=np.nan):
+    lanes = LaneGraph.empty(capacity, len(lines[0]) if lines else 2)
+    lanes.points[:] = garbage
+    for i, line in enumerate(lines):
+        lanes.points[i] = line
+        lanes.valid[i] = True
+    return lanes
+
+
+def test_a_lane_fills_the_cells_that_it_runs_through():
+    there, direction = lane_cells(graph([[0.2, 1.5, 0], [3.8, 1.5, 0]]), SHAPE, RANGE)
+    expected = np.zeros(SHAPE, bool)
+    expected[1, :4] = True
+    np.testing.assert_array_equal(there, expected)
+    np.testing.assert_allclose(np.asarray(direction)[expected], [[1.0, 0.0]] * 4, atol=1e-6)
+    np.testing.assert_array_equal(np.asarray(direction)[~expected], 0.0)
+
+
+def test_lanes_against_each_other_cancel_and_those_outside_write_nothing():
+    there, direction = lane_cells(
+        graph([[0.0, 0.5, 0], [8.0, 0.5, 0]], [[8.0, 0.5, 0], [0.0, 0.5, 0]], [[0.0, 4.5, 0], [-3.0, -1.0, 0]]),
+        SHAPE, RANGE,
+    )  # fmt: skip
+    np.testing.assert_array_equal(np.asarray(there)[0], True)
+    np.testing.assert_array_equal(np.asarray(there)[1:], False)
+    np.testing.assert_allclose(np.asarray(direction)[0], 0.0, atol=1e-6)
+
+
+def test_padding_changes_nothing():
+    line = [[0.0, 0.5, 0], [8.0, 3.5, 0]]
+    said = jax.random.normal(jax.random.key(0), (*SHAPE, 3))
+    gradient = jax.grad(lane_cell_loss)
+    clean, dirty = (gradient(said, graph(line, garbage=garbage), RANGE) for garbage in (0.0, np.nan))
+    np.testing.assert_array_equal(clean, dirty)
+    assert np.isfinite(clean).all()
+
+
+@pytest.mark.parametrize("lanes", [graph(), graph(capacity=0)], ids=["none valid", "no room"])
+def test_no_lane_is_learned_too(lanes):
+    said = jnp.zeros((*SHAPE, 3))
+    assert lane_cell_loss(said, lanes, RANGE) == pytest.approx(0.5 * np.log(2.0))
+    assert (jax.grad(lane_cell_loss)(said, lanes, RANGE)[..., 0] > 0).all()
+
+
+def test_the_truth_has_the_least_loss():
+    lanes = graph([[0.0, 0.5, 0], [8.0, 3.5, 0]])
+    there, direction = lane_cells(lanes, SHAPE, RANGE)
+    perfect = jnp.concatenate([jnp.where(there, 20.0, -20.0)[..., None], direction], -1)
+    assert lane_cell_loss(perfect, lanes, RANGE) < 1e-6
+    assert lane_cell_loss(perfect.at[..., 0].multiply(-1), lanes, RANGE) > 10.0

@@ -1,0 +1,155 @@
+"""State dicts renamed by rules, with an account of every tensor.
+
+A rule is (pattern of PyTorch's name, our path, kind of layer); the kind says how the layout changes. The functions are
+differentiable, so that gradients by our names can be compared with gradients by PyTorch's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.namespace import AnyArray
+
+Rule = tuple[str, str, str]
+Rules = Sequence[Rule]
+_SPLIT = ("query", "key", "value")
+
+
+@dataclass(frozen=True)
+class Converted:
+    """Variables made of a state dict.
+
+    Attributes:
+        variables: `params` and `batch_stats`.
+        table: one row per tensor of the file: its name and shape, and what became of it.
+    """
+
+    variables: dict[str, Any]
+    table: list[dict[str, str]]
+
+
+def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: str = "(?!)") -> Converted:
+    """Return variables by our names, and an account of every tensor.
+
+    Args:
+        state: tensors by PyTorch's names, with or without the prefix `module.`.
+        rules: the first that fits a name decides.
+        network: whose tensors these should be, for the message.
+        frozen: our paths of norms that never learn, whose scales and biases are statistics too.
+
+    Raises:
+        UserError: a tensor that no rule knows.
+    """
+    table: list[dict[str, str]] = []
+    variables: dict[str, Any] = {"params": {}, "batch_stats": {}}
+    for name, tensor in state.items():
+        plain, row = name.removeprefix("module."), {"tensor": name, "shape": size_text(tensor.shape)}
+        if why := _left_out(plain):
+            table.append(row | {"becomes": why})
+            continue
+        leaves = renamed(plain, tensor, rules)
+        if leaves is None:
+            raise UserError(f"{name} is no tensor of {network}: is this the checkpoint of another network?")
+        for path, value in leaves.items():
+            is_statistic = path.endswith(("/mean", "/var")) or re.fullmatch(frozen, path) is not None
+            put(variables["batch_stats" if is_statistic else "params"], path, value)
+        table.append(row | {"becomes": ", ".join(leaves)})
+    return Converted(variables, table)
+
+
+def _left_out(name: str) -> str | None:
+    """Return why a tensor that checkpoints hold beside their weights is not needed."""
+    last = name.rpartition(".")[-1]
+    if last in ("num_batches_tracked", "total_ops", "total_params"):
+        return "a counter, not needed"
+    # Weights of the coordinates in the loss of MMDetection's heads, all one.
+    return "a constant of the loss, not needed" if last == "code_weights" else None
+
+
+def check_fits(found: Any, expected: Any, path: Path | str) -> None:
+    """Raise UserError naming the first leaf that only one of two trees has, or that has another shape."""
+    here, there = _shapes(found), _shapes(expected)
+    for name in sorted(here.keys() | there.keys()):
+        if here.get(name) != there.get(name):
+            raise UserError(
+                f"{path} does not fit the model: {name} is {size_text(here.get(name))} in the file and "
+                f"{size_text(there.get(name))} in the model. Change task.model to the sizes of the file"
+            )
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf.shape
+            for path, leaf in jax.tree.leaves_with_path(tree)}  # fmt: skip
+
+
+def size_text(shape: tuple[int, ...] | None) -> str:
+    """Return a shape as "3x4"; None is absent."""
+    return "absent" if shape is None else "x".join(map(str, shape)) or "scalar"
+
+
+def below(prefix: str, name: str, rules: Rules) -> tuple[Rule, ...]:
+    """Return the rules of a part that stands below a name; groups of the prefix come first."""
+    shift = re.compile(prefix).groups
+    moved = [(p, re.sub(r"\\(\d)", lambda m: f"\\{int(m[1]) + shift}", ours), kind) for p, ours, kind in rules]
+    return tuple((prefix + pattern, f"{name}/{ours}", kind) for pattern, ours, kind in moved)
+
+
+def renamed_params(state: Mapping[str, AnyArray], rules: Rules) -> dict[str, Any]:
+    """Return the parameters that a module's tensors become; raises UserError where no rule knows one."""
+    params: dict[str, Any] = {}
+    for name, tensor in state.items():
+        leaves = renamed(name, tensor, rules)
+        if leaves is None:
+            raise UserError(f"{name} is no tensor of this module")
+        for path, value in leaves.items():
+            put(params, path, value)
+    return params
+
+
+def renamed(name: str, tensor: AnyArray, rules: Rules) -> dict[str, Any] | None:
+    """Return our leaves, by path, that a tensor becomes; None where no rule knows its name."""
+    for pattern, ours, kind in rules:
+        if found := re.fullmatch(pattern, name):
+            return _leaves(found.expand(ours), tensor, kind)
+    return None
+
+
+def _leaves(path: str, tensor: AnyArray, kind: str) -> dict[str, Any]:
+    """Return a tensor in our layout: kernels have their outputs last."""
+    parent, _, last = path.rpartition("/")
+    if kind == "conv":  # (O, I, h, w) -> (h, w, I, O)
+        return {path: tensor.transpose(2, 3, 1, 0)}
+    if kind == "pointwise":
+        return {path: tensor[:, :, 0, 0].T}
+    if kind == "linear":
+        return {f"{parent}/kernel": tensor.T} if last == "weight" else {path: tensor}
+    if kind == "norm":
+        names = {"weight": "scale", "running_mean": "mean", "running_var": "var"}
+        return {f"{parent}/{names.get(last, last)}": tensor}
+    if kind == "packed":  # rows are query, key, value
+        size = tensor.shape[0] // 3
+        parts = {part: tensor[i * size : (i + 1) * size] for i, part in enumerate(_SPLIT)}
+        if last == "weight":
+            return {f"{parent}/{part}/kernel": value.T for part, value in parts.items()}
+        return {f"{parent}/{part}/bias": value for part, value in parts.items()}
+    if kind == "pair":  # a linear layer on [a | b] as one layer for a, with the bias, and one for b
+        half = tensor.shape[-1] // 2
+        if last == "bias":
+            return {f"{parent}_first/bias": tensor}
+        return {f"{parent}_first/kernel": tensor[:, :half].T, f"{parent}_second/kernel": tensor[:, half:].T}
+    return {path: tensor}
+
+
+def put(tree: dict[str, Any], path: str, value: Any) -> None:
+    """Set the leaf of a nested dictionary at a path with slashes."""
+    *parents, name = path.split("/")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+    tree[name] = value

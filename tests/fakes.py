@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tflane_jax.datasets.base import FrameInfo
-from tflane_jax.scene import Areas, Example, LaneGraph, LanePrediction, TrafficElements, TrafficFlow
+from tflane_jax.scene import Areas, ElementPrediction, Example, LaneGraph, LanePrediction, TrafficElements, TrafficFlow
 
 LANES, POINTS, USERS, FRAMES = 5, 4, 3, 6
 
@@ -64,6 +64,18 @@ def fake_prediction(seed: int = 0, *, queries: int = 6) -> LanePrediction:
     links = np.full((queries, queries), -3.0, np.float32)
     links[:1, 1:2] = 3.0
     return LanePrediction(rng.uniform(-20, 20, (queries, POINTS, 3)).astype(np.float32), logits, links)
+
+
+def fake_elements(seed: int = 0, *, elements: int = 3, queries: int = 6) -> ElementPrediction:
+    """Return a green light that governs the first two lanes, and two elements that are hardly there."""
+    rng = np.random.default_rng([seed, 2])
+    corner = rng.uniform(0, 50, (elements, 1, 2))
+    box = np.concatenate([corner, corner + rng.uniform(5, 20, (elements, 1, 2))], 1).astype(np.float32)
+    logits = rng.uniform(-5, -4, (elements, 13)).astype(np.float32)
+    logits[1, 2] = 2.0
+    governs = np.full((queries, elements), -3.0, np.float32)
+    governs[:2, 1] = 3.0
+    return ElementPrediction(box, logits, governs)
 
 
 @dataclass(frozen=True)

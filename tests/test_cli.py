@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_prediction
+from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_elements, fake_prediction
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser, main
 from tflane_jax.scene import Prediction
@@ -61,7 +61,8 @@ def fakes():
 
     def predict(task, params, example):
         prediction = jax.tree.map(jnp.asarray, fake_prediction(0))
-        return Prediction(prediction.replace(points=prediction.points + params["shift"]["kernel"][None]))
+        lanes = prediction.replace(points=prediction.points + params["shift"]["kernel"][None])
+        return Prediction(lanes, jax.tree.map(jnp.asarray, fake_elements()))
 
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
@@ -156,6 +157,11 @@ def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
         for link in frame["successors"]:
             a, b = (frame["lanes"][link[end]]["query"] for end in ("from", "to"))
             assert link["score"] == arrays["successor"][i, a, b] >= 0.5
+        light = frame["elements"][0]
+        assert light["attribute"] == 2
+        np.testing.assert_array_equal(np.float32(light["box"]), arrays["box"][i, light["query"]])
+        governed = [frame["lanes"][pair["lane"]]["query"] for pair in frame["governs"] if pair["element"] == 0]
+        assert sorted(governed) == [0, 1]
 
 
 def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):

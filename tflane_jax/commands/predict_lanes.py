@@ -2,7 +2,9 @@
 
 predictions.npz, arrays over F frames and Q queries:
     points (F, Q, P, 3) metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1, [f, i, j] lane j
-    continues lane i; scene (F,) and timestamp_ns (F,), where the frame comes from.
+    continues lane i; scene (F,) and timestamp_ns (F,), where the frame comes from. A model of traffic elements adds,
+    over E queries, box (F, E, 2, 2) corners in pixels of the front image, attribute_score (F, E, 13) and element_lane
+    (F, Q, E), [f, i, e] element e governs lane i, 0 to 1.
 truth.npz, the true lanes of the same frames over G slots:
     points (F, G, P, 3), successor (F, G, G), valid (F, G), visibility (F, G), scene and timestamp_ns. `tflane score`
     takes the two.
@@ -10,8 +12,10 @@ truth.npz, the true lanes of the same frames over G slots:
 predictions.json, lanes from `threshold` on, best first:
     {"run", "step", "seed", "threshold", "frames": [{"source", "scene", "timestamp_ns",
      "lanes": [{"query", "score", "points": [[x, y, z], ...]}, ...],
-     "successors": [{"from": position in lanes, "to": position in lanes, "score"}, ...]}, ...]}
-    with the successors whose score is at least 0.5.
+     "successors": [{"from": position in lanes, "to": position in lanes, "score"}, ...],
+     "elements": [{"query", "score", "attribute", "box": [[left, top], [right, bottom]]}, ...],
+     "governs": [{"element": position in elements, "lane": position in lanes, "score"}, ...]}, ...]}
+    with the relations whose score is at least 0.5; the last two where the model predicts traffic elements.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import expit
 
 from tflane_jax.commands.sources import lane_graph_source, limited_task, make_folder
@@ -33,7 +37,7 @@ from tflane_jax.systems import spread
 from tflane_jax.systems.lane_graph import open_dataset, predict_examples, titles
 from tflane_jax.training.run_folder import write_json
 
-_SUCCESSOR_THRESHOLD = 0.5
+_RELATION_THRESHOLD = 0.5
 
 
 def predict(trained: Run, options: argparse.Namespace) -> int:
@@ -44,20 +48,25 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
     indices = spread(len(dataset), options.count)
-    examples, lanes = predict_examples(task, trained.params[0], dataset, indices)
+    examples, lanes, elements = predict_examples(task, trained.params[0], dataset, indices)
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
     successor = expit(lanes.successor_logits)
 
     make_folder(options.out)
     arrays = {"points": points, "scores": scores, "successor": successor}
+    if elements is not None:
+        arrays["box"] = np.asarray(elements.box)
+        arrays["attribute_score"] = expit(elements.logits)
+        arrays["element_lane"] = expit(elements.lane_logits)
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
     _save_arrays(options.out / "predictions.npz", arrays)
     truth = {name: np.asarray(getattr(examples.lanes, name)) for name in ("points", "successor", "valid", "visibility")}
     _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     frames = [
-        _frame(info, points[i], scores[i], successor[i], options.threshold) for i, info in enumerate(infos)
+        _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
+        for i, info in enumerate(infos)
     ]
     head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
@@ -71,23 +80,37 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     return 0
 
 
-def _frame(
-    info: FrameInfo, points: Float[np.ndarray, "q p 3"], scores: Float[np.ndarray, " q"],
-    successor: Float[np.ndarray, "q q"], threshold: float,
-) -> dict[str, Any]:  # fmt: skip
-    order = np.argsort(-scores, kind="stable")
-    kept = order[scores[order] >= threshold]
-    links = successor[np.ix_(kept, kept)]
-    return {
+def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> dict[str, Any]:
+    """Return one frame as plain values; `arrays` are those of predictions.npz for this frame."""
+    scores, points = arrays["scores"], arrays["points"]
+    kept = _best_first(scores, threshold)
+    frame: dict[str, Any] = {
         "source": info.source,
         "scene": info.scene,
         "timestamp_ns": int(info.timestamp_ns),
         "lanes": [{"query": int(q), "score": float(scores[q]), "points": points[q].tolist()} for q in kept],
-        "successors": [
-            {"from": i, "to": j, "score": float(links[i, j])}
-            for i, j in np.argwhere(links >= _SUCCESSOR_THRESHOLD).tolist()
-        ],
+        "successors": _relations(arrays["successor"][np.ix_(kept, kept)], "from", "to"),
     }
+    if "box" in arrays:
+        best = arrays["attribute_score"].max(-1)
+        shown = _best_first(best, threshold)
+        frame["elements"] = [
+            {"query": int(e), "score": float(best[e]), "attribute": int(arrays["attribute_score"][e].argmax()),
+             "box": arrays["box"][e].tolist()}
+            for e in shown
+        ]  # fmt: skip
+        frame["governs"] = _relations(arrays["element_lane"][np.ix_(kept, shown)].T, "element", "lane")
+    return frame
+
+
+def _best_first(scores: Float[np.ndarray, " q"], threshold: float) -> Int[np.ndarray, " k"]:
+    order = np.argsort(-scores, kind="stable")
+    return order[scores[order] >= threshold]
+
+
+def _relations(scores: Float[np.ndarray, "a b"], first: str, second: str) -> list[dict[str, Any]]:
+    pairs = np.argwhere(scores >= _RELATION_THRESHOLD).tolist()
+    return [{first: i, second: j, "score": float(scores[i, j])} for i, j in pairs]
 
 
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -17,7 +17,7 @@ from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.loading import TRAINING_PARTS, for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
-from tflane_jax.scene import Example, LanePrediction, shapes_of, stack_examples
+from tflane_jax.scene import ElementPrediction, Example, LanePrediction, shapes_of, stack_examples
 from tflane_jax.systems.base import Evaluation, Model, spread
 from tflane_jax.training.evaluate import evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
@@ -70,7 +70,7 @@ class LaneGraphSystem:
 
         def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
             if indices:
-                examples, lanes = predict_examples(config.task, params, dataset, indices)
+                examples, lanes, _ = predict_examples(config.task, params, dataset, indices)
                 save_examples(
                     folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": lanes},
                     titles=titles(dataset, indices), ground=source.example.sensor.grid.range,
@@ -135,11 +135,11 @@ def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
 
 def predict_examples(
     task: Any, params: Params, dataset: Dataset, indices: Sequence[int]
-) -> tuple[Example, LanePrediction]:
-    """Return some examples whole, with truth and all, and the lanes predicted for them; both stacked, numpy."""
+) -> tuple[Example, LanePrediction, ElementPrediction | None]:
+    """Return some examples whole, with truth and all, and what is predicted for them; all stacked, numpy."""
     examples = stack_examples([dataset.example(index) for index in indices])
     (_, answer), = predictions(task, params, examples, len(indices))  # fmt: skip
-    return examples, answer.lanes
+    return examples, answer.lanes, answer.elements
 
 
 def titles(dataset: Dataset, indices: Sequence[int]) -> list[str]:

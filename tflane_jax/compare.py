@@ -170,12 +170,14 @@ def _report(
 ) -> Path:  # fmt: skip
     """Print the tables and save them beside the pictures."""
     title = f"{protocol}, test split, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}, percent (mean ± std)"
-    rows = [row | remarks.get(row["model"], {}) for row in compact(variants, system.compared)] + system.quoted()
+    every = [scores for variant in variants for scores in variant.scores]
+    metrics = [name for name in system.compared if all(name in scores for scores in every)]
+    rows = [row | remarks.get(row["model"], {}) for row in compact(variants, metrics)] + system.quoted()
     print("\n" + format_table(rows, title=title))
     markdown, _ = save_table(out / "table", rows, {"protocol": protocol, "seeds": list(seeds)}, title=title)
     written = [markdown]
     if len(seeds) > 1:
-        rows = summarise(variants, system.compared)
+        rows = summarise(variants, metrics)
         title = f"{protocol}: paired differences to {variants[0].name}, two-sided t-test over {len(seeds)} seeds"
         print("\n" + format_table(rows, title=title, digits=4))
         written.append(save_table(out / "paired", rows, {"protocol": protocol}, title=title, digits=4)[0])

@@ -57,7 +57,7 @@ class System(Protocol):
     columns: tuple[str, ...]
     """Of the evaluation's table, as far as an evaluation has them."""
     compared: tuple[str, ...]
-    """Scores ("group/name") that a comparison tests."""
+    """Scores ("group/name") that a comparison tests, as far as all of its models have them."""
 
     def load(self, source: Any, *, progress: bool = True) -> Any:
         """Return a split in memory, as `evaluate` takes it."""

@@ -33,9 +33,11 @@ class LaneGraphSystem:
     """See `systems.base.System`."""
 
     columns: tuple[str, ...] = (
-        "lanes of", "seed", "DET_l", "TOP_ll", "DET_l@1.0", "DET_l@2.0", "DET_l@3.0", "lanes", "frames"
+        "lanes of", "seed", "OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt", "DET_l@1.0", "DET_l@2.0", "DET_l@3.0", "lanes", "frames"
     )  # fmt: skip
-    compared: tuple[str, ...] = tuple(f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in _GROUPS)
+    compared: tuple[str, ...] = ("all/OLS", "all/DET_t", "all/TOP_lt") + tuple(
+        f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in _GROUPS
+    )
 
     def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example:
         """Return the examples of a source, stacked."""

@@ -25,7 +25,6 @@ from tflane_jax.training.loop import Draw
 from tflane_jax.training.records import Record
 from tflane_jax.training.task import Params
 
-_GROUPS = ("all", "occluded", "clear")
 _COMPARED_EXAMPLES = 6
 
 
@@ -33,11 +32,13 @@ class LaneGraphSystem:
     """See `systems.base.System`."""
 
     columns: tuple[str, ...] = (
-        "lanes of", "seed", "OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt", "DET_l@1.0", "DET_l@2.0", "DET_l@3.0", "lanes", "frames"
+        "lanes of", "seed", "OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt", "DET_l@1.0", "DET_l@2.0", "DET_l@3.0",
+        "lanes", "frames",
     )  # fmt: skip
-    compared: tuple[str, ...] = ("all/OLS", "all/DET_t", "all/TOP_lt") + tuple(
-        f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in _GROUPS
-    )
+    compared: tuple[str, ...] = (
+        "all/OLS", "all/DET_t", "all/TOP_lt",
+        *(f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in ("all", "occluded", "clear")),
+    )  # fmt: skip
 
     def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example:
         """Return the examples of a source, stacked."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -96,8 +95,7 @@ def _taps(shape: tuple[int, int], location: Float[Array, "q heads p 2"]) -> _Tap
     )
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _attend(
+def _sum_of_samples(
     shape: tuple[int, int],
     value: Float[Array, "hw heads d"],
     location: Float[Array, "q heads p 2"],
@@ -120,8 +118,11 @@ def _attend(
     return total.astype(value.dtype).reshape(queries, heads, value.shape[-1])
 
 
+_attend: Any = jax.custom_vjp(_sum_of_samples, nondiff_argnums=(0,))
+
+
 def _attend_forward(shape, value, location, weight):
-    return _attend(shape, value, location, weight), (value, location, weight)
+    return _sum_of_samples(shape, value, location, weight), (value, location, weight)
 
 
 # Samples of one step of the backward pass on a CPU: 2 MiB of float32 stay in the cache of a core.

@@ -46,6 +46,30 @@ def fake_example(seed: int = 0, *, padding: float = 0.0) -> Example:
     )  # fmt: skip
 
 
+def fake_views(seed: int = 0, *, cameras: int = 6, width: int = 48, height: int = 32) -> CameraViews:
+    """Return smooth images all round, in an array 16 pixels larger; the first looks ahead, the last is half as high."""
+    rng = np.random.default_rng([seed, 2])
+    sizes = np.array([[width, height]] * (cameras - 1) + [[width, height // 2]], np.int32)
+    images = np.zeros((cameras, height + 16, width + 16, 3), np.uint8)
+    for image, (w, h) in zip(images, sizes, strict=True):
+        u, v = np.meshgrid(np.linspace(0, 1, w), np.linspace(0, 1, h))
+        colour = rng.uniform(40, 120, 3)
+        image[:h, :w] = np.stack([colour[0] + 100 * u, colour[1] + 100 * v, colour[2] + 50 * (u + v)], -1)
+    yaw = 2 * np.pi * np.arange(cameras) / cameras
+    axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # camera's x, y, z when it looks ahead
+    pose = np.tile(np.eye(4, dtype=np.float32), (cameras, 1, 1))
+    for i, angle in enumerate(yaw):
+        turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose[i, :3, :3] = axes @ turn
+        pose[i, :3, 3] = -pose[i, :3, :3] @ [1.5, 0.0, 1.6]
+    focal = rng.uniform(30, 40, cameras)
+    intrinsics = np.zeros((cameras, 3, 3), np.float32)
+    intrinsics[:, 0, 0] = intrinsics[:, 1, 1] = focal
+    intrinsics[:, :2, 2] = sizes / 2
+    intrinsics[:, 2, 2] = 1.0
+    return CameraViews(images, sizes, intrinsics, pose, np.ones(cameras, bool))
+
+
 def empty_example() -> Example:
     """Return an example of the same shapes in which nothing is valid."""
     example = fake_example()

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fakes import fake_example
+from tests.fakes import fake_example, fake_views
 from tflane_jax.datasets.leaves import PARTS, example_from_leaves, example_leaves
 from tflane_jax.scene import Example, MarkerObservations, SdMap
 
@@ -17,7 +17,7 @@ def full_example() -> Example:
         valid=np.ones(2, bool),
     )  # fmt: skip
     sd_map = SdMap(points=np.ones((1, 5, 2)), category=np.zeros(1, int), valid=np.ones(1, bool))
-    return fake_example().replace(markers=markers, sd_map=sd_map)
+    return fake_example().replace(markers=markers, sd_map=sd_map, cameras=fake_views())
 
 
 def test_every_container_of_an_example_is_known():

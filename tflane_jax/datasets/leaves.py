@@ -10,6 +10,7 @@ import numpy as np
 
 from tflane_jax.scene import (
     Areas,
+    CameraViews,
     Example,
     LaneGraph,
     LaneLines,
@@ -29,6 +30,7 @@ PARTS = {
     "segments": LaneGraph,
     "areas": Areas,
     "traffic_elements": TrafficElements,
+    "cameras": CameraViews,
 }
 
 

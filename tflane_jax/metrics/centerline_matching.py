@@ -22,10 +22,10 @@ from tflane_jax.metrics.frames import (
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 from tflane_jax.metrics.topology import FILL, Version, matchings, topology_precision
+from tflane_jax.openlane_files import ATTRIBUTES
 
 LANE_THRESHOLDS = (1.0, 2.0, 3.0)  # metres, discrete Frechet
 ELEMENT_THRESHOLD = 0.75  # IoU distance
-ATTRIBUTES = 13
 
 
 def relaxation(truth: Float[np.ndarray, "g n 3"]) -> Float[np.ndarray, " g"]:

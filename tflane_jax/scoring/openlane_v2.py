@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, line_points, load_file, load_json, member, numbers, scores, whole_number
+from tflane_jax.fields import items, load_file, load_json, member, scores
 from tflane_jax.geometry.polylines import resample
-from tflane_jax.metrics.centerline_matching import ATTRIBUTES
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.lane_segment import (
     CROSSING,
@@ -29,51 +28,33 @@ from tflane_jax.metrics.lane_segment import (
     SegmentDetections,
     SegmentTruth,
 )
+from tflane_jax.openlane_files import (
+    CENTERLINE,
+    DENSE_POINTS,
+    SEGMENT,
+    FieldNames,
+    FrameKey,
+    as_identifier,
+    read_areas,
+    read_elements,
+    read_lines,
+    read_matrix,
+)
 
-# Annotated centerlines have 201 points; the published numbers are measured on every 20th.
-_DENSE, _STRIDE = 201, 20
+# The published numbers are measured on every 20th of a centerline's points.
+_STRIDE = 20
 # Lines of segments and areas are measured on so many points, equally spaced.
 _LINE_POINTS, _AREA_POINTS = 10, 20
 
 
-class _Names(NamedTuple):
-    """What a task calls its fields; `suffix` ends the names of its annotation files."""
-
-    lanes: str
-    line: str
-    lane_lane: str
-    lane_element: str
-    suffix: str
-
-
-_CENTERLINE = _Names("lane_centerline", "points", "topology_lclc", "topology_lcte", "")
-_SEGMENT = _Names("lane_segment", "centerline", "topology_lsls", "topology_lste", "-ls")
-
-
-class FrameKey(NamedTuple):
-    """Which frame: OpenLane-V2's identifier."""
-
-    split: str
-    segment: str
-    timestamp: str
-
-    def __str__(self) -> str:
-        return "/".join(self)
-
-    @property
-    def scene(self) -> str:
-        """The drive that the frame comes from."""
-        return f"{self.split}/{self.segment}"
-
-
 def read_predictions(path: Path) -> dict[FrameKey, LaneDetections]:
     """Return the detections of a centerline submission; raises UserError that names file, frame and field."""
-    return _submission(path, lambda record, where: _detections(record, where, _CENTERLINE))
+    return _submission(path, lambda record, where: _detections(record, where, CENTERLINE))
 
 
 def read_truth(path: Path, *, progress: bool = True) -> dict[FrameKey, LaneTruth]:
     """Return centerline annotations, a collected file's or a folder's; raises UserError as `read_predictions`."""
-    return _annotations(path, _CENTERLINE, lambda record, where: _truth(record, where, _CENTERLINE), progress)
+    return _annotations(path, CENTERLINE, lambda record, where: _truth(record, where, CENTERLINE), progress)
 
 
 def read_segment_predictions(path: Path) -> dict[FrameKey, SegmentDetections]:
@@ -89,7 +70,7 @@ def read_segment_truth(
     Lines get 10 points and areas 20, unless they have as many already. In the flavour "LaneSegNet" a crossing of five
     corners becomes its two long sides, 10 points each, as LaneSegNet measures it.
     """
-    return _annotations(path, _SEGMENT, lambda record, where: _segment_truth(record, where, flavour), progress)
+    return _annotations(path, SEGMENT, lambda record, where: _segment_truth(record, where, flavour), progress)
 
 
 T = TypeVar("T")
@@ -103,7 +84,7 @@ def _submission(path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
     return _by_frame(results, "predictions", path, parse)
 
 
-def _annotations(path: Path, names: _Names, parse: _Parse[T], progress: bool) -> dict[FrameKey, T]:
+def _annotations(path: Path, names: FieldNames, parse: _Parse[T], progress: bool) -> dict[FrameKey, T]:
     if not path.is_dir():
         collected = load_file(path)
         if not isinstance(collected, Mapping):
@@ -126,62 +107,60 @@ def _annotations(path: Path, names: _Names, parse: _Parse[T], progress: bool) ->
 def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
     frames = {}
     for identifier, record in records.items():
-        if not isinstance(identifier, tuple) or len(identifier) != 3:
-            raise UserError(f"{path}: {identifier!r:.80} is no frame, expected (split, segment, timestamp)")
-        key = FrameKey(*map(str, identifier))
+        key = as_identifier(identifier, str(path))
         where = f"{path}, frame {key}"
         frames[key] = parse(member(record, field, where), where)
     return frames
 
 
-def _truth(record: Any, where: str, names: _Names) -> LaneTruth:
-    points = _lines(record, names.lanes, names.line, where)
+def _truth(record: Any, where: str, names: FieldNames) -> LaneTruth:
+    points = read_lines(record, names.lanes, names.line, where)
     lanes, elements = len(points), items(record, "traffic_element", where)
-    boxes, attributes = _elements(elements, where)
+    boxes, attributes = read_elements(record, where)
     return LaneTruth(
-        points=[line[::_STRIDE] if len(line) == _DENSE else line for line in points],
-        successor=_matrix(record, names.lane_lane, (lanes, lanes), where) > 0.5,
+        points=[line[::_STRIDE] if len(line) == DENSE_POINTS else line for line in points],
+        successor=read_matrix(record, names.lane_lane, (lanes, lanes), where) > 0.5,
         elements=ElementTruth(
-            boxes, attributes, _matrix(record, names.lane_element, (lanes, len(elements)), where) > 0.5
+            boxes, attributes, read_matrix(record, names.lane_element, (lanes, len(elements)), where) > 0.5
         ),
     )
 
 
-def _detections(record: Any, where: str, names: _Names) -> LaneDetections:
-    points = _lines(record, names.lanes, names.line, where)
+def _detections(record: Any, where: str, names: FieldNames) -> LaneDetections:
+    points = read_lines(record, names.lanes, names.line, where)
     lanes, elements = len(points), items(record, "traffic_element", where)
-    boxes, attributes = _elements(elements, where)
+    boxes, attributes = read_elements(record, where)
     return LaneDetections(
         points=points,
         scores=_confidences(record, names.lanes, where),
-        successor=_matrix(record, names.lane_lane, (lanes, lanes), where),
+        successor=read_matrix(record, names.lane_lane, (lanes, lanes), where),
         elements=ElementDetections(
             boxes,
             attributes,
             _confidences(record, "traffic_element", where),
-            _matrix(record, names.lane_element, (lanes, len(elements)), where),
+            read_matrix(record, names.lane_element, (lanes, len(elements)), where),
         ),
     )
 
 
 def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
-    lanes = _truth(record, where, _SEGMENT)
-    points, categories = _areas(record, where)
+    lanes = _truth(record, where, SEGMENT)
+    points, categories = read_areas(record, where)
     if flavour == "LaneSegNet":
         points = [_long_sides(line) if c == CROSSING and len(line) == 5 else line
                   for line, c in zip(points, categories, strict=True)]  # fmt: skip
     center, left, right = (
         [_with_points(line, _LINE_POINTS) for line in lines]
-        for lines in (lanes.points, *(_lines(record, _SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))
+        for lines in (lanes.points, *(read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))
     )
     areas = AreaTruth([_with_points(line, _AREA_POINTS) for line in points], categories)
     return SegmentTruth(replace(lanes, points=center), left, right, areas)
 
 
 def _segment_detections(record: Any, where: str) -> SegmentDetections:
-    left, right = (_lines(record, _SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES)
-    areas = AreaDetections(*_areas(record, where), _confidences(record, "area", where))
-    return SegmentDetections(_detections(record, where, _SEGMENT), left, right, areas)
+    left, right = (read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES)
+    areas = AreaDetections(*read_areas(record, where), _confidences(record, "area", where))
+    return SegmentDetections(_detections(record, where, SEGMENT), left, right, areas)
 
 
 _SIDES = ("left", "right")
@@ -196,38 +175,7 @@ def _long_sides(corners: np.ndarray) -> np.ndarray:
     return np.concatenate([resample(corners[:2], _AREA_POINTS // 2), resample(corners[2:4], _AREA_POINTS // 2)])
 
 
-def _areas(record: Any, where: str) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return lines and categories of crossings and boundaries."""
-    categories = [
-        whole_number(member(area, "category", f"{where}: area[{i}]"), 1, 2, f"{where}: area[{i}].category")
-        for i, area in enumerate(items(record, "area", where))
-    ]
-    return _lines(record, "area", "points", where), np.array(categories, np.int64)
-
-
-def _lines(record: Any, things: str, field: str, where: str) -> list[np.ndarray]:
-    lines = []
-    for i, thing in enumerate(items(record, things, where)):
-        at = f"{where}: {things}[{i}]"
-        lines.append(line_points(member(thing, field, at), f"{at}.{field}"))
-    return lines
-
-
-def _matrix(record: Any, field: str, shape: tuple[int, int], where: str) -> np.ndarray:
-    return numbers(member(record, field, where), shape, f"{where}: {field}")
-
-
 def _confidences(record: Any, things: str, where: str) -> np.ndarray:
     at = f"{where}: {things}"
     values = [member(thing, "confidence", f"{at}[{i}]") for i, thing in enumerate(items(record, things, where))]
     return scores(values, f"{at}: confidence")
-
-
-def _elements(elements: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return boxes (T, 2, 2) and attributes (T,)."""
-    boxes, attributes = [], []
-    for i, element in enumerate(elements):
-        at = f"{where}: traffic_element[{i}]"
-        boxes.append(numbers(member(element, "points", at), (2, 2), f"{at}.points"))
-        attributes.append(whole_number(member(element, "attribute", at), 0, ATTRIBUTES - 1, f"{at}.attribute"))
-    return np.array(boxes).reshape(-1, 2, 2), np.array(attributes, np.int64)

@@ -1,0 +1,93 @@
+"""The annotation of an OpenLane-V2 frame as arrays, checked, in whichever flavour it comes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.fields import items
+from tflane_jax.openlane_files import (
+    SEGMENT,
+    FieldNames,
+    read_areas,
+    read_elements,
+    read_labels,
+    read_lines,
+    read_matrix,
+)
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """Truth of one frame: N lanes, E traffic elements, A areas; ego frame, metres, and pixels of the front image.
+
+    Attributes:
+        lines: N centerlines (n, 3).
+        left, right: N boundaries; None in the centerline flavour.
+        left_type, right_type: (N,) `scene.LineType`.
+        is_connector: (N,); false where the file does not say.
+        successor: (N, N).
+        boxes: (E, 2, 2) top-left and bottom-right corners.
+        element_category, attribute: (E,).
+        lane_element: (N, E).
+        areas: A lines (n, 3); none in the centerline flavour.
+        area_category: (A,).
+    """
+
+    lines: list[Float[np.ndarray, "_ 3"]]
+    left: list[Float[np.ndarray, "_ 3"]] | None
+    right: list[Float[np.ndarray, "_ 3"]] | None
+    left_type: Int[np.ndarray, " n"]
+    right_type: Int[np.ndarray, " n"]
+    is_connector: Bool[np.ndarray, " n"]
+    successor: Bool[np.ndarray, "n n"]
+    boxes: Float[np.ndarray, "e 2 2"]
+    element_category: Int[np.ndarray, " e"]
+    attribute: Int[np.ndarray, " e"]
+    lane_element: Bool[np.ndarray, "n e"]
+    areas: list[Float[np.ndarray, "_ 3"]]
+    area_category: Int[np.ndarray, " a"]
+
+
+def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
+    """Return an annotation.
+
+    Raises:
+        UserError: names the entry that is missing, has another shape than the lanes and elements ask for, or is out of
+            range.
+    """
+    lines = read_lines(record, names.lanes, names.line, where)
+    boxes, attribute = read_elements(record, where)
+    lanes, elements = len(lines), len(boxes)
+    left = right = None
+    left_type = right_type = np.zeros(lanes, np.int64)
+    areas, area_category = [], np.zeros(0, np.int64)
+    if names is SEGMENT:
+        left, right = (read_lines(record, names.lanes, f"{side}_laneline", where) for side in ("left", "right"))
+        left_type, right_type = (
+            read_labels(record, names.lanes, f"{side}_laneline_type", 0, 2, where) for side in ("left", "right")
+        )
+        areas, area_category = read_areas(record, where)
+    return Annotation(
+        lines=lines, left=left, right=right, left_type=left_type, right_type=right_type,
+        is_connector=np.array(
+            [bool(lane.get("is_intersection_or_connector", False)) for lane in items(record, names.lanes, where)], bool
+        ),
+        successor=_binary(record, names.lane_lane, (lanes, lanes), where),
+        boxes=boxes,
+        element_category=read_labels(record, "traffic_element", "category", 1, 2, where),
+        attribute=attribute,
+        lane_element=_binary(record, names.lane_element, (lanes, elements), where),
+        areas=areas, area_category=area_category,
+    )  # fmt: skip
+
+
+def _binary(record: Any, field: str, shape: tuple[int, int], where: str) -> Bool[np.ndarray, "n m"]:
+    matrix = read_matrix(record, field, shape, where)
+    if not np.isin(matrix, (0, 1)).all():
+        raise UserError(f"{where}: {field} holds {matrix[~np.isin(matrix, (0, 1))][0]:g}, expected 0 and 1 only")
+    return matrix == 1

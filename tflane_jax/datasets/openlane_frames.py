@@ -1,0 +1,196 @@
+"""OpenLane-V2 on disk: which frames there are, and each frame's file with its cameras and poses.
+
+    <root>/data_dict_*.json                                    {split: {segment: ["<timestamp>.json", ...]}}
+    <root>/<split>/<segment>/info/<timestamp>.json, -ls.json   one frame, in the centerline and the lane-segment flavour
+    <root>/<split>/<segment>/image/<camera>/<timestamp>.jpg
+
+Subset A comes from Argoverse 2 (seven cameras, nanoseconds), subset B from nuScenes (six, microseconds). Source: shared
+specs/data_formats.md section 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.errors import UserError
+from tflane_jax.fields import items, load_json, member, numbers
+from tflane_jax.geometry import pose_matrix
+from tflane_jax.openlane_files import FrameKey
+
+SubsetName = Literal["A", "B"]
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+# A rotation matrix may differ from an orthonormal one by so much in any entry; the files have float32 digits.
+_ORTHONORMAL = 1e-4
+
+
+@dataclass(frozen=True)
+class Subset:
+    """What tells the two subsets apart.
+
+    Attributes:
+        cameras: names; the first looks ahead, and traffic elements are labelled in its image.
+        tick_ns: nanoseconds of one unit of the timestamps.
+        first_segment: number of the first segment of each split.
+        data_dict: name of the split file.
+    """
+
+    cameras: tuple[str, ...]
+    tick_ns: int
+    first_segment: Mapping[Split, int]
+    data_dict: str
+
+
+SUBSETS: Mapping[SubsetName, Subset] = {
+    "A": Subset(
+        cameras=("ring_front_center", "ring_front_left", "ring_front_right", "ring_rear_left", "ring_rear_right",
+                 "ring_side_left", "ring_side_right"),
+        tick_ns=1,
+        first_segment={"train": 0, "val": 10_000, "test": 20_000},
+        data_dict="data_dict_subset_A.json",
+    ),
+    "B": Subset(
+        cameras=("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"),
+        tick_ns=1000,
+        first_segment={"train": 1000, "val": 11_000, "test": 21_000},
+        data_dict="data_dict_subset_B.json",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FrameCamera:
+    """One camera of one frame.
+
+    Attributes:
+        name: as the dataset calls it.
+        image: file.
+        intrinsics: (3, 3), pixels of the file; the lens distortion that stands beside it is left out, as by TopoNet
+            and LaneSegNet.
+        ego_from_camera: (4, 4).
+    """
+
+    name: str
+    image: Path
+    intrinsics: Float[np.ndarray, "3 3"]
+    ego_from_camera: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """One frame's file.
+
+    Attributes:
+        path: of the file.
+        global_from_ego: (4, 4) float64.
+        cameras: in the order of the subset; None for one that the frame does not have.
+        annotation: untrusted, see `openlane_files`; None where the frame has none, as in the test split.
+    """
+
+    path: Path
+    global_from_ego: Float[np.ndarray, "4 4"]
+    cameras: tuple[FrameCamera | None, ...]
+    annotation: Any | None
+
+
+def info_path(root: Path, key: FrameKey, suffix: str = "") -> Path:
+    """Return the file of a frame; `suffix` is that of `openlane_files.FieldNames`."""
+    return root / key.split / key.segment / "info" / f"{key.timestamp}{suffix}.json"
+
+
+def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | None = None) -> list[FrameKey]:
+    """Return the frames of a split by segment, then time.
+
+    Args:
+        root: of the dataset.
+        split: train, val or test.
+        subset: whose split file is looked for.
+        data_dict: name of a split file under `root`; None takes the subset's where it is there, and otherwise lists the
+            folders, "folders" always lists them.
+
+    Raises:
+        UserError: a folder or split file that is missing, is damaged, or names no frame of this split.
+    """
+    if not root.is_dir():
+        raise UserError(f"there is no folder {root}: set `root` to OpenLane-V2's folder")
+    file = root / (data_dict or SUBSETS[subset].data_dict)
+    if data_dict == "folders" or (data_dict is None and not file.is_file()):
+        keys = [
+            FrameKey(split, path.parent.parent.name, path.stem.removesuffix("-ls"))
+            for path in (root / split).glob("*/info/*.json")
+        ]
+        if not keys:
+            raise UserError(f"{root} holds no {split}/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
+    else:
+        keys = frames_of(load_json(file), split, str(file))
+        if not keys:
+            raise UserError(f"{file} names no frame of split {split}: choose another split or split file (data_dict)")
+    return sorted(set(keys), key=lambda key: (key.segment, _time(key, root)))
+
+
+def frames_of(content: Any, split: str, where: str) -> list[FrameKey]:
+    """Return the frames of a split that a split file names, in its order; raises UserError where it is malformed."""
+    segments = member(content, split, where)
+    if not isinstance(segments, Mapping):
+        raise UserError(f"{where}: {split} is of type {type(segments).__name__}, expected a mapping from segments")
+    return [
+        FrameKey(split, str(segment), str(name).removesuffix(".json"))
+        for segment in segments
+        for name in items(segments, segment, f"{where}: {split}")
+    ]
+
+
+def _time(key: FrameKey, root: Path) -> int:
+    if not key.timestamp.isdecimal():
+        raise UserError(f"{root}: frame {key} has no whole number as its timestamp: leave the file out")
+    return int(key.timestamp)
+
+
+def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") -> FrameFile:
+    """Return one frame's file; the images are not looked at.
+
+    Raises:
+        UserError: it is missing or damaged, lacks an entry, has a camera that the subset does not know, or a rotation
+            that is none.
+    """
+    path = info_path(root, key, suffix)
+    content, where = load_json(path), str(path)
+    sensors = member(content, "sensor", where)
+    if not isinstance(sensors, Mapping):
+        raise UserError(f"{where}: sensor is of type {type(sensors).__name__}, expected a mapping from cameras")
+    names = SUBSETS[subset].cameras
+    unknown = [name for name in sensors if name not in names]
+    if unknown:
+        raise UserError(
+            f"{where}: camera {unknown[0]!r} is none of subset {subset} ({names[0]}, ...): "
+            f"set `subset` to {'B' if subset == 'A' else 'A'}?"
+        )
+    return FrameFile(
+        path=path,
+        global_from_ego=_pose(member(content, "pose", where), f"{where}: pose"),
+        cameras=tuple(_camera(sensors, name, root, where) if name in sensors else None for name in names),
+        annotation=content.get("annotation"),
+    )
+
+
+def _camera(sensors: Any, name: str, root: Path, where: str) -> FrameCamera:
+    sensor, where = sensors[name], f"{where}: sensor.{name}"
+    intrinsics = numbers(member(member(sensor, "intrinsic", where), "K", where), (3, 3), f"{where}.intrinsic.K")
+    if not (intrinsics[0, 0] > 0.0 and intrinsics[1, 1] > 0.0 and (intrinsics[2] == (0.0, 0.0, 1.0)).all()):
+        raise UserError(f"{where}.intrinsic.K is no camera matrix (positive focal lengths, last row 0 0 1)")
+    pose = _pose(member(sensor, "extrinsic", where), f"{where}.extrinsic")
+    return FrameCamera(name, root / str(member(sensor, "image_path", where)), intrinsics, pose)
+
+
+def _pose(record: Any, where: str) -> Float[np.ndarray, "4 4"]:
+    rotation = numbers(member(record, "rotation", where), (3, 3), f"{where}.rotation").astype(np.float64)
+    translation = numbers(member(record, "translation", where), (3,), f"{where}.translation").astype(np.float64)
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
+        raise UserError(f"{where}.rotation is no rotation: its rows are not orthonormal, or it mirrors")
+    return pose_matrix(rotation, translation)

@@ -23,6 +23,7 @@ CLAIMS = {
     "metrics/resample": "tests/geometry/test_polylines.py",
     "metrics/tusimple": "tests/metrics/test_tusimple.py",
     "modules/custom_msda_decoder*": "tests/layers/test_deformable.py",
+    "modules/fpn_*": "tests/layers/test_fpn.py",
     "modules/gtn_*": "tests/layers/test_graph_transformer.py",
     "modules/lr_schedules*": "tests/training/test_schedule.py",
     "modules/lstr_*": "tests/models/test_lstr.py",

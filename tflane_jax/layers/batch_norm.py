@@ -50,10 +50,12 @@ class BatchNorm(nn.Module):
                 mean.value += self.momentum * (used_mean - mean.value)
                 variance.value += self.momentum * (unbiased - variance.value)
         factor = scale * lax.rsqrt(used_variance + self.epsilon)
-        return x * _like(factor, x) + _like(bias - used_mean * factor, x)
+        # In float32, the answer in the precision of what came in.
+        return (x * _like(factor, x) + _like(bias - used_mean * factor, x)).astype(x.dtype)
 
     def _batch_statistics(self, x):
         """Return mean, biased variance and number of values per channel, over the batch axis where there is one."""
+        x = x.astype(jnp.float32)
         axes = tuple(range(x.ndim - 1))
         average = self._over_batch
         count = average(jnp.float32(x.size // x.shape[-1]), lax.psum)

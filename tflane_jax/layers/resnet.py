@@ -6,7 +6,8 @@ Strides stand on the 3x3 convolutions ("pytorch style"). Names follow torchvisio
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -44,25 +45,48 @@ class ResNetConfig:
     frozen_norms: bool = False
 
 
+RESNET_18 = ResNetConfig((2, 2, 2, 2), (64, 128, 256, 512), (1, 2, 2, 2), 64)
+RESNET_50 = ResNetConfig((3, 4, 6, 3), (64, 128, 256, 512), (1, 2, 2, 2), 64, "bottleneck")
+
+
 class ResNet(nn.Module):
-    """A stack of views in, the features of every stage out."""
+    """A stack of views in, the features of every stage out.
+
+    Attributes:
+        config: sizes.
+        frozen_stages: parts from the input on that never learn: 1 is the stem, 2 the first stage as well. Their
+            parameters get a gradient of zero, and no time is spent on it.
+        remat: keep only what goes from stage to stage, and compute the rest anew for the gradient.
+        dtype: of the computation; parameters and statistics are float32.
+    """
 
     config: ResNetConfig
+    frozen_stages: int = 0
+    remat: bool = False
+    dtype: Any = None
 
     @nn.compact
     def __call__(self, images: Float[Array, "v h w c"], *, train: bool) -> list[Float[Array, "v hs ws cs"]]:
         """Return the feature maps of the stages, finest first; the stem alone reduces height and width by 4."""
         config = self.config
-        x = StemConvolution(config.stem_channels, name="conv1")(images)
+        x = StemConvolution(config.stem_channels, self.dtype, name="conv1")(images)
         x = nn.relu(BatchNorm(config.frozen_stem_norm or config.frozen_norms, name="bn1")(x, train=train))
         x = max_pool(x)
+        x = lax.stop_gradient(x) if self.frozen_stages > 0 else x
         block = BasicBlock if config.block == "basic" else Bottleneck
+
+        def run_stage(self, x, stage):
+            for i in range(config.blocks[stage]):
+                stride, name = config.strides[stage] if i == 0 else 1, f"layer{stage + 1}_{i}"
+                part = block(config.channels[stage], stride, config.frozen_norms, self.dtype, name=name)
+                x = part(x, train=train)
+            return x
+
         outputs = []
-        stages = zip(config.blocks, config.channels, config.strides, strict=True)
-        for stage, (blocks, channels, stride) in enumerate(stages, 1):
-            for i in range(blocks):
-                name = f"layer{stage}_{i}"
-                x = block(channels, stride if i == 0 else 1, config.frozen_norms, name=name)(x, train=train)
+        for stage in range(len(config.blocks)):
+            run = partial(run_stage, stage=stage)
+            x = nn.remat(run)(self, x) if self.remat else run(self, x)
+            x = lax.stop_gradient(x) if self.frozen_stages > stage + 1 else x
             outputs.append(x)
         return outputs
 
@@ -75,15 +99,18 @@ class StemConvolution(nn.Module):
 
     Attributes:
         channels: out.
+        dtype: of the computation.
     """
 
     channels: int
+    dtype: Any = None
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v ho wo co"]:
         """Return the features."""
         v, h, w, c = x.shape
         kernel = self.param("kernel", _INIT, (7, 7, c, self.channels))
+        x, kernel = (a.astype(self.dtype or a.dtype) for a in (x, kernel))
         layout = ("NHWC", "HWIO", "NHWC")
         if h % 2 or w % 2:
             return lax.conv_general_dilated(x, kernel, (2, 2), [(3, 3), (3, 3)], dimension_numbers=layout)
@@ -121,15 +148,16 @@ class BasicBlock(nn.Module):
     channels: int
     stride: int
     frozen: bool
+    dtype: Any = None
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
         """Return the block's features."""
-        y = _conv(self.channels, 3, self.stride, "conv1")(x)
+        y = _conv(self.channels, 3, self.stride, "conv1", self.dtype)(x)
         y = nn.relu(BatchNorm(self.frozen, name="bn1")(y, train=train))
-        y = _conv(self.channels, 3, 1, "conv2")(y)
+        y = _conv(self.channels, 3, 1, "conv2", self.dtype)(y)
         y = BatchNorm(self.frozen, name="bn2")(y, train=train)
-        return nn.relu(y + _shortcut(x, self.channels, self.stride, self.frozen, train))
+        return nn.relu(y + _shortcut(x, self.channels, self.stride, self.frozen, train, self.dtype))
 
 
 class Bottleneck(nn.Module):
@@ -138,28 +166,29 @@ class Bottleneck(nn.Module):
     channels: int
     stride: int
     frozen: bool
+    dtype: Any = None
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
         """Return the block's features."""
-        y = nn.relu(BatchNorm(self.frozen, name="bn1")(_conv(self.channels, 1, 1, "conv1")(x), train=train))
-        y = _conv(self.channels, 3, self.stride, "conv2")(y)
+        y = nn.relu(BatchNorm(self.frozen, name="bn1")(_conv(self.channels, 1, 1, "conv1", self.dtype)(x), train=train))
+        y = _conv(self.channels, 3, self.stride, "conv2", self.dtype)(y)
         y = nn.relu(BatchNorm(self.frozen, name="bn2")(y, train=train))
-        y = BatchNorm(self.frozen, name="bn3")(_conv(4 * self.channels, 1, 1, "conv3")(y), train=train)
-        return nn.relu(y + _shortcut(x, 4 * self.channels, self.stride, self.frozen, train))
+        y = BatchNorm(self.frozen, name="bn3")(_conv(4 * self.channels, 1, 1, "conv3", self.dtype)(y), train=train)
+        return nn.relu(y + _shortcut(x, 4 * self.channels, self.stride, self.frozen, train, self.dtype))
 
 
-def _shortcut(x: jax.Array, channels: int, stride: int, frozen: bool, train: bool) -> jax.Array:
+def _shortcut(x: jax.Array, channels: int, stride: int, frozen: bool, train: bool, dtype: Any) -> jax.Array:
     """Return x, projected where the block changes its shape (inside the calling module's compact method)."""
     if stride == 1 and x.shape[-1] == channels:
         return x
-    projected = _conv(channels, 1, stride, "downsample_conv")(x)
+    projected = _conv(channels, 1, stride, "downsample_conv", dtype)(x)
     return BatchNorm(frozen, name="downsample_bn")(projected, train=train)
 
 
-def _conv(channels: int, size: int, stride: int, name: str) -> nn.Conv:
+def _conv(channels: int, size: int, stride: int, name: str, dtype: Any) -> nn.Conv:
     pad = size // 2
     return nn.Conv(
         channels, (size, size), (stride, stride), [(pad, pad), (pad, pad)],
-        use_bias=False, kernel_init=_INIT, name=name,
+        use_bias=False, kernel_init=_INIT, dtype=dtype, name=name,
     )  # fmt: skip

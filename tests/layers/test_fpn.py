@@ -1,0 +1,59 @@
+"""The feature pyramid against the reference's numbers, and its levels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tflane_jax.convert.bevformer import FEATURE_PYRAMID
+from tflane_jax.convert.renaming import renamed_params
+from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig, enlarge
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("fpn_*"), ids=case_id)
+def test_matches_the_reference(path):
+    case = load_module_case(path)
+    sizes = case.meta["config"]
+    pyramid = FeaturePyramid(FeaturePyramidConfig(sizes["out_channels"], sizes["num_outs"]))
+
+    def scalar(torch_params, arrays):
+        params = renamed_params(torch_params, FEATURE_PYRAMID)
+        features = [arrays[name].transpose(0, 2, 3, 1) for name in sorted(arrays)]
+        levels = pyramid.apply({"params": params}, features)
+        outs = {f"p{i}": level.transpose(0, 3, 1, 2) for i, level in enumerate(levels)}
+        return sum((case.weights[name] * out).sum() for name, out in outs.items()), outs
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, outs), (by_param, by_input) = step(case.params, case.inputs)
+    assert_outputs_close(outs | {"grad_scalar": total}, case.outputs)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+
+def test_only_further_extra_levels_are_rectified():
+    """Two levels beyond the given one: the first reads it as it is, the second what is positive of the first."""
+    pyramid = FeaturePyramid(FeaturePyramidConfig(1, 3))
+    identity = {"kernel": jnp.zeros((3, 3, 1, 1)).at[1, 1].set(1.0), "bias": jnp.zeros(1)}
+    params = {f"output_{i}": identity for i in range(3)}
+    params["lateral_0"] = {"kernel": jnp.ones((1, 1, 1, 1)), "bias": jnp.zeros(1)}
+    levels = pyramid.apply({"params": params}, [-jnp.ones((1, 4, 4, 1))])
+    assert isinstance(levels, list)
+    assert [level.shape[1:3] for level in levels] == [(4, 4), (2, 2), (1, 1)]
+    assert [float(level.mean()) for level in levels] == [-1.0, -1.0, 0.0]
+    with pytest.raises(ValueError, match="cannot hold"):
+        FeaturePyramid(FeaturePyramidConfig(1, 1)).apply({"params": params}, [jnp.ones((1, 2, 2, 1))] * 2)
+
+
+@pytest.mark.parametrize("size", [(3, 5), (6, 10), (7, 11), (5, 9)])
+def test_enlarging_takes_the_nearest_cell(size):
+    x = np.random.default_rng(0).normal(size=(2, 3, 5, 2)).astype(np.float32)
+    rows, columns = (np.arange(n) * m // n for n, m in zip(size, (3, 5), strict=True))
+    np.testing.assert_array_equal(enlarge(jnp.asarray(x), *size), x[:, rows][:, :, columns])

@@ -1,0 +1,81 @@
+"""From camera images to feature maps: ResNet and feature pyramid on a stack of views (specs/modules.md section 11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, UInt8
+
+from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig
+from tflane_jax.layers.resnet import RESNET_50, ResNet, ResNetConfig
+from tflane_jax.scene import CameraViews
+
+# Of ImageNet, RGB, in [0, 255].
+MEAN_RGB = (123.675, 116.28, 103.53)
+STD_RGB = (58.395, 57.12, 57.375)
+
+
+@dataclass(frozen=True)
+class ImageEncoderConfig:
+    """Sizes of the encoder; the defaults train on two CPU cores, `PAPER_IMAGE_ENCODER` holds the papers' sizes.
+
+    Attributes:
+        backbone: sizes of the ResNet.
+        stages: of the backbone whose features go on, from 0; 1, 2, 3 are C3 to C5.
+        pyramid: sizes of the feature pyramid.
+        frozen_stages: parts of the backbone that never learn: 1 the stem, 2 the first stage as well. Their gradient is
+            zero, but weight decay, where the optimiser has any, still shrinks them.
+        remat: compute each stage of the backbone anew for the gradient instead of keeping what lies in between.
+        precision: of the computation; parameters and what comes out are float32.
+    """
+
+    backbone: ResNetConfig = ResNetConfig((1, 1, 1, 1), (16, 32, 64, 128))
+    stages: tuple[int, ...] = (2, 3)
+    pyramid: FeaturePyramidConfig = FeaturePyramidConfig(64, 2)
+    frozen_stages: int = 0
+    remat: bool = False
+    precision: Literal["float32", "bfloat16"] = "float32"
+
+
+# TopoNet, LaneSegNet and OpenLane-V2's baseline: ResNet-50 from ImageNet with frozen norms, C3 to C5, four levels.
+PAPER_IMAGE_ENCODER = ImageEncoderConfig(
+    replace(RESNET_50, frozen_norms=True), (1, 2, 3), FeaturePyramidConfig(256, 4), frozen_stages=2
+)
+
+
+class ImageEncoder(nn.Module):
+    """Views in, feature maps of several sizes out."""
+
+    config: ImageEncoderConfig
+
+    @nn.compact
+    def __call__(self, cameras: CameraViews, *, train: bool = False) -> list[Float[Array, "v h w c"]]:
+        """Return the levels, finest first.
+
+        `train` lets the norms take the batch's own statistics, unless they are frozen.
+        """
+        config = self.config
+        dtype = jnp.bfloat16 if config.precision == "bfloat16" else None
+        shown = image_valid(cameras)
+        images = normalise(cameras.image, shown).astype(dtype or jnp.float32)
+        backbone = ResNet(config.backbone, config.frozen_stages, config.remat, dtype, name="backbone")
+        features = backbone(images, train=train)
+        pyramid = FeaturePyramid(config.pyramid, dtype, name="pyramid")
+        return [level.astype(jnp.float32) for level in pyramid([features[i] for i in config.stages])]
+
+
+def image_valid(cameras: CameraViews) -> Bool[Array, "v h w"]:
+    """Return which pixels show something: those inside the image of a camera that delivered one."""
+    height, width = cameras.image.shape[1:3]
+    rows = jnp.arange(height)[None, :, None] < cameras.size[:, 1, None, None]
+    columns = jnp.arange(width)[None, None] < cameras.size[:, 0, None, None]
+    return rows & columns & cameras.valid[:, None, None]
+
+
+def normalise(image: UInt8[Array, "v h w 3"], valid: Bool[Array, "v h w"]) -> Float[Array, "v h w 3"]:
+    """Return RGB images with zero mean and unit variance over ImageNet; padding is zero, the mean colour."""
+    mean, std = (jnp.asarray(values, jnp.float32)[None, None, None] for values in (MEAN_RGB, STD_RGB))
+    return jnp.where(valid[..., None], (image.astype(jnp.float32) - mean) / std, 0.0)

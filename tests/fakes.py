@@ -5,7 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from tflane_jax.datasets.base import FrameInfo
-from tflane_jax.scene import Areas, ElementPrediction, Example, LaneGraph, LanePrediction, TrafficElements, TrafficFlow
+from tflane_jax.scene import (
+    Areas,
+    CameraViews,
+    ElementPrediction,
+    Example,
+    LaneGraph,
+    LanePrediction,
+    TrafficElements,
+    TrafficFlow,
+)
 
 LANES, POINTS, USERS, FRAMES = 5, 4, 3, 6
 

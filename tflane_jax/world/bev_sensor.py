@@ -12,7 +12,7 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.special import ndtri
 
 from tflane_jax.geometry import BevGrid, PerceptionRange, transform_points
@@ -99,7 +99,7 @@ def render_bev(
     visible = _smooth((~hidden).astype(np.float32)[None])[0]
     error = config.far_error * severity * lattice.noise(rng, 1, _ERROR_PATCH)[0]
 
-    worn = _worn(samples, paint_wear, log_seed)
+    worn = paint_left(samples.paint_line, samples.paint_along, samples.lines, paint_wear, log_seed)
     crisp = _draw_ground(samples, ego_from_global, lattice, visible, error, worn)
     crisp[BevChannel.OBSTACLE] = _draw_obstacles(boxes, buildings, lattice, error)
     evidence = _soften(crisp, lattice, severity, config.far_blur)
@@ -172,16 +172,23 @@ def _upsampling(cells: int, patches: float) -> Float[np.ndarray, "cells knots"]:
     return (matrix / np.linalg.norm(matrix, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def _worn(samples: MapSamples, paint_wear: float, log_seed: int) -> Float[np.ndarray, " m"]:
-    """Return what wear leaves of each paint point, 0 to 1, varying smoothly along each line and from line to line."""
+def paint_left(
+    line: Int[np.ndarray, " m"], along: Float[np.ndarray, " m"], lines: int, paint_wear: float, log_seed: int
+) -> Float[np.ndarray, " m"]:
+    """Return what wear leaves of each paint point, 0 to 1, varying smoothly along each line and from line to line.
+
+    Args:
+        line, along: the painted line (as `map_samples.painted_lines` numbers it) and the distance along it, metres.
+        lines: how many there are.
+        paint_wear: 0 to 1, see `logs.Log`.
+        log_seed: root of the log's randomness; wear depends on nothing else.
+    """
     rng = np.random.default_rng([log_seed, _WEAR_STREAM])
-    phase = rng.uniform(0.0, 2 * np.pi, (samples.lines, len(_WEAR_WAVES)))
-    level = rng.standard_normal(samples.lines)
-    wave = np.sin(
-        samples.paint_along[:, None] * (2 * np.pi / _WEAR_WAVES) + phase[samples.paint_line]
-    ).sum(-1)
+    phase = rng.uniform(0.0, 2 * np.pi, (lines, len(_WEAR_WAVES)))
+    level = rng.standard_normal(lines)
+    wave = np.sin(along[:, None] * (2 * np.pi / _WEAR_WAVES) + phase[line]).sum(-1)
     spread = 0.8 * paint_wear * (1.0 - paint_wear)
-    return np.clip(1.0 - paint_wear + spread * (wave + level[samples.paint_line]), 0.0, 1.0)
+    return np.clip(1.0 - paint_wear + spread * (wave + level[line]), 0.0, 1.0)
 
 
 def _draw_ground(

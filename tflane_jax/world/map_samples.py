@@ -44,7 +44,7 @@ class MapSamples:
 
 def sample_map(vector_map: VectorMap) -> MapSamples:
     """Sample lane boundaries of every type but NONE (dashes only where dashed), road boundaries and crossings."""
-    lines = _painted_lines(vector_map)
+    lines = painted_lines(vector_map)
     points, along = [np.zeros((0, 3))], [np.zeros(0)]
     number = [np.zeros(0, int)]
     for i, (line, kind) in enumerate(lines):
@@ -63,15 +63,20 @@ def sample_map(vector_map: VectorMap) -> MapSamples:
     )  # fmt: skip
 
 
-def _painted_lines(vector_map: VectorMap) -> list[tuple[np.ndarray, int]]:
+def painted_lines(vector_map: VectorMap) -> list[tuple[np.ndarray, int]]:
     """Return every painted line once: the boundary that two neighbours share is in the map twice."""
     found: dict[tuple[float, ...], tuple[np.ndarray, int]] = {}
     for line, kind in _boundaries(vector_map):
         if kind != LineType.NONE and len(line) > 1:
-            ends = sorted(tuple(np.round(point[:2], 1)) for point in (line[0], line[-1]))
-            middle = np.round(sample_at(line, np.array([arc_length(line)[-1] / 2]))[0, :2], 0)
-            found.setdefault((*ends[0], *ends[1], *middle), (line, kind))
+            found.setdefault(line_key(line), (line, kind))
     return list(found.values())
+
+
+def line_key(line: np.ndarray) -> tuple[float, ...]:
+    """Return what two copies of one line have in common, whichever way they run."""
+    ends = sorted(tuple(np.round(point[:2], 1)) for point in (line[0], line[-1]))
+    middle = np.round(sample_at(line, np.array([arc_length(line)[-1] / 2]))[0, :2], 0)
+    return (*ends[0], *ends[1], *middle)
 
 
 def _boundaries(vector_map: VectorMap) -> Iterable[tuple[np.ndarray, int]]:

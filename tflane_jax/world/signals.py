@@ -10,10 +10,12 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.logs import MapElement
 from tflane_jax.world.lane_table import LaneTable
 from tflane_jax.world.roads import RoadNetwork
-from tflane_jax.world.traffic_control import GREEN, LIGHT, RED
+from tflane_jax.world.traffic_control import GREEN, LIGHT, RED, YELLOW
 
 # All lights are red for this long between two phases, seconds; drivers who can no longer stop clear the junction.
 _CLEARANCE = 3.5
+# The phase that was green shows yellow for the first part of that time, seconds.
+_YELLOW = 2.5
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,25 @@ class Signals:
 
     def green_phase(self, time: float) -> Int[np.ndarray, " i"]:
         """Return which phase is green at each intersection, -1 between phases."""
+        phase, left = self._phase(time)
+        return np.where(left > _CLEARANCE, phase, -1)
+
+    def shown(self, time: float) -> Int[np.ndarray, "i p"]:
+        """Return what the lights of each phase show at each intersection: red, green, or yellow after green."""
+        phase, left = self._phase(time)
+        state = np.full(self.green.shape, RED)
+        now = np.where(left > _CLEARANCE, GREEN, np.where(left > _CLEARANCE - _YELLOW, YELLOW, RED))
+        state[np.arange(len(phase)), phase] = now
+        return state
+
+    def _phase(self, time: float) -> tuple[Int[np.ndarray, " i"], Float[np.ndarray, " i"]]:
+        """Return the phase whose turn it is at each intersection, and for how long (seconds, clearance included)."""
         slot = np.where(self.green > 0.0, self.green + _CLEARANCE, 0.0)
         ends = np.cumsum(slot, 1)
         at = (time + self.offset) % np.maximum(ends[:, -1], 1e-9)
         phase = (ends <= at[:, None]).sum(1)
         phase = np.minimum(phase, self.green.shape[1] - 1)
-        row = np.arange(len(phase))
-        left = ends[row, phase] - at
-        return np.where(left > _CLEARANCE, phase, -1)
+        return phase, ends[np.arange(len(phase)), phase] - at
 
     def red(self, table: LaneTable, time: float) -> Bool[np.ndarray, " s"]:
         """Return the segments that must not be entered now."""
@@ -67,16 +80,22 @@ def turn_green(signals: Signals, intersection: int, phase: int, time: float) -> 
     return Signals(signals.green, offset)
 
 
-def show_signals(network: RoadNetwork, signals: Signals, time: float) -> tuple[MapElement, ...]:
-    """Return the map's elements with each light green or red as the signals are at `time`."""
-    green = signals.green_phase(time)
-
-    def state(element: MapElement) -> MapElement:
+def element_states(
+    network: RoadNetwork, signals: Signals, times: Float[np.ndarray, " f"]
+) -> Int[np.ndarray, "f e"]:
+    """Return the attribute of each of the map's elements at each time: a light shows red, yellow or green as its
+    signals are, every other element what it always shows."""
+    state = np.tile(np.array([element.attribute for element in network.map.elements], int), (len(times), 1))
+    shown = np.stack([signals.shown(float(time)) for time in times])
+    for number, element in enumerate(network.map.elements):
         onward = [j for i in element.lanes for j in (i, *network.map.segments[i].successors)]
         governed = [network.signal_phase[j] for j in onward if j in network.signal_phase]
-        if element.category != LIGHT or not governed:
-            return element
-        intersection, phase = governed[0]
-        return replace(element, attribute=GREEN if green[intersection] == phase else RED)
+        if element.category == LIGHT and governed:
+            state[:, number] = shown[:, governed[0][0], governed[0][1]]
+    return state
 
-    return tuple(state(element) for element in network.map.elements)
+
+def show_signals(network: RoadNetwork, state: Int[np.ndarray, " e"]) -> tuple[MapElement, ...]:
+    """Return the map's elements with the given attributes."""
+    pairs = zip(network.map.elements, state.tolist(), strict=True)
+    return tuple(replace(element, attribute=attribute) for element, attribute in pairs)

@@ -16,7 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
 from tflane_jax.logs import KeyFrame, Log, Tracks
 from tflane_jax.world.roads import RoadConfig, build_road_network
-from tflane_jax.world.signals import show_signals
+from tflane_jax.world.signals import element_states, show_signals
 from tflane_jax.world.tracker import TrackerConfig, track, wrap_angle
 from tflane_jax.world.traffic import Traffic, TrafficConfig, simulate_traffic
 
@@ -87,11 +87,12 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
         config.tracker.with_noise(0.7 + 0.6 * config.severity), rate_hz=config.rate_hz,
     )  # fmt: skip
     weather, paint_wear = np.clip(config.severity * _stream(scene_id, Stream.CONDITIONS).uniform(0.4, 1.6, 2), 0.0, 1.0)
+    attribute = element_states(network, traffic.signals, np.arange(frames) / config.rate_hz)
     timestamps = np.round(np.arange(frames) * (1e9 / config.rate_hz)).astype(np.int64)
     return Log(
         name=f"world-{scene_id:09d}",
         source="procedural",
-        map=replace(network.map, elements=show_signals(network, traffic.signals, 0.0)),
+        map=replace(network.map, elements=show_signals(network, attribute[0])),
         timestamps_ns=timestamps,
         global_from_ego=global_from_ego,
         tracks=tracks,
@@ -100,6 +101,7 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
             KeyFrame(int(timestamps[f]), global_from_ego[f], int(f))
             for f in np.linspace(HISTORY, frames - 1, config.keyframes).round().astype(int)
         ),
+        element_attribute=attribute,
         weather=float(weather),
         paint_wear=float(paint_wear),
         seed=scene_id,

@@ -50,9 +50,15 @@ def inset(
     face: Float[np.ndarray, "4 3"], across: tuple[float, float], up: tuple[float, float]
 ) -> Float[np.ndarray, "4 3"]:
     """Return the part of a face between shares (0 to 1) of its width, from the left, and of its height."""
+    return insets(face, np.array([across]), np.array([up]))[0]
+
+
+def insets(
+    face: Float[np.ndarray, "4 3"], across: Float[np.ndarray, "n 2"], up: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 4 3"]:
+    """Return `inset` for n pairs of shares."""
     lower_left, lower_right, upper_right, upper_left = face
-    u = np.array([across[0], across[1], across[1], across[0]])[:, None]
-    v = np.array([up[0], up[0], up[1], up[1]])[:, None]
+    u, v = across[:, [0, 1, 1, 0], None], up[:, [0, 0, 1, 1], None]
     return (1 - v) * ((1 - u) * lower_left + u * lower_right) + v * ((1 - u) * upper_left + u * upper_right)
 
 

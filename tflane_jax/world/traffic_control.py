@@ -14,7 +14,7 @@ from tflane_jax.world.right_of_way import phases
 
 LIGHT, SIGN = 1, 2
 # OpenLane-V2 attributes of traffic elements.
-RED, GREEN, GO_STRAIGHT, TURN_LEFT, TURN_RIGHT = 1, 2, 4, 5, 6
+RED, GREEN, YELLOW, GO_STRAIGHT, TURN_LEFT, TURN_RIGHT = 1, 2, 3, 4, 5, 6
 NO_LEFT_TURN, NO_RIGHT_TURN, NO_U_TURN = 7, 8, 10
 _LIGHT_HEIGHT, _SIGN_HEIGHT = 5.5, 2.5
 

@@ -1,0 +1,73 @@
+"""A small dataset with cameras, whose vehicle drives along lanes that stay where they are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.fakes import fake_views
+from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.geometry import invert_pose, relative_pose, transform_points, yaw_pose
+from tflane_jax.scene import Areas, Example, LaneGraph, TrafficElements
+
+FRAMES, STEP = 3, 2.5
+# Two lanes one after the other, and one beside them; global frame.
+CENTRELINES = [[(0.0, 0.0), (20.0, 0.0)], [(20.0, 0.0), (38.0, 6.0)], [(0.0, 3.5), (20.0, 3.5)]]
+
+
+@dataclass(frozen=True)
+class DriveConfig:
+    """How many scenes, how many cameras."""
+
+    scenes: int = 2
+    cameras: int = 6
+
+
+class DriveDataset:
+    """Frames of scenes; lanes stand in another order in every frame."""
+
+    name = "drive"
+
+    def __init__(self, config: DriveConfig = DriveConfig()):
+        self.config = config
+
+    def __len__(self) -> int:
+        return self.config.scenes * FRAMES
+
+    def info(self, index: int) -> FrameInfo:
+        scene, frame = divmod(index, FRAMES)
+        pose = yaw_pose(STEP * frame, 0.0, 0.02 * frame)
+        return FrameInfo("drive", f"scene {scene}", frame * 500_000_000, np.asarray(pose))
+
+    def example(self, index: int) -> Example:
+        frame, pose = index % FRAMES, self.info(index).global_from_ego
+        before = self.info(index - 1).global_from_ego if frame else pose
+        order = np.roll(np.arange(3), frame)
+        lanes, segments = LaneGraph.empty(5, 11), LaneGraph.empty(4, 10)
+        for graph in (lanes, segments):
+            count = graph.points.shape[1]
+            share = np.linspace(0, 1, count)[:, None]
+            for row, number in enumerate(order):
+                start, end = (np.array([*point, 0.3]) for point in CENTRELINES[number])
+                graph.points[row] = transform_points(invert_pose(pose), start + share * (end - start))
+                graph.is_connector[row] = number == 1
+            side = np.array([0.0, 1.7, 0.0])
+            graph.left[:3], graph.right[:3] = graph.points[:3] + side, graph.points[:3] - side
+            graph.valid[:3], graph.visibility[:3] = True, 1.0
+            graph.successor[:3, :3] = (order[:, None] == 0) & (order == 1)
+            graph.points[3:] = np.nan
+        segments.left_type[:3], segments.right_type[:3] = 2, 1
+        areas = Areas.empty(2, 20)
+        areas.points[0], areas.category[0], areas.valid[0] = np.linspace([5, -3, 0], [5, 3, 0], 20), 2, True
+        elements = TrafficElements.empty(3, 5)
+        place = transform_points(invert_pose(pose), np.array([[40.0, 3.0, 5.0], [41.0, -3.0, 5.0]]))
+        elements.position[1:] = place  # row 0 is padding
+        elements.box[1:] = [[[10, 4], [14, 12.5]], [[30, 5], [33, 9]]]
+        elements.category[1:], elements.attribute[1:] = (1, 2), (2, 4)
+        elements.lane[:3, 1:] = np.stack([order == 0, order == 2], -1)
+        elements.valid[1:] = True
+        return Example(
+            bev=None, hidden=None, traffic_flow=None, markers=None, sd_map=None, lanes=lanes, segments=segments,
+            areas=areas, traffic_elements=elements,
+            previous_from_ego=relative_pose(before, pose).astype(np.float32), has_previous=np.asarray(frame > 0),
+            cameras=fake_views(index, cameras=self.config.cameras),
+        )  # fmt: skip

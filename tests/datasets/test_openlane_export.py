@@ -1,0 +1,158 @@
+"""A dataset written as OpenLane-V2 and read again."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
+from tests.fakes import FakeConfig, FakeDataset
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.openlane_export import dense, export_openlane_v2
+from tflane_jax.datasets.openlane_frames import SUBSETS
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
+from tflane_jax.datasets.view_images import ImageConfig
+from tflane_jax.errors import UserError
+from tflane_jax.scoring.openlane_v2 import read_segment_truth, read_truth
+from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, NUSCENES_RING
+
+SIZES = ExampleConfig(lanes=5, segments=4, areas=2, elements=3)
+NATIVE = ImageConfig(divisor=16)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    out = tmp_path_factory.mktemp("openlane") / "made"
+    return export_openlane_v2({"train": DriveDataset(), "val": DriveDataset()}, out, images="png", progress=False)
+
+
+def opened(root, **other) -> OpenLaneV2Dataset:
+    config = {"subset": "B", "flavour": "both", "image": NATIVE, "example": SIZES} | other
+    return OpenLaneV2Dataset(OpenLaneV2Config(root, **config))
+
+
+def same_lanes(got, expected, *, boundaries: bool) -> None:
+    n = int(expected.valid.sum())
+    np.testing.assert_array_equal(got.valid, expected.valid)
+    np.testing.assert_array_equal(got.successor, expected.successor)
+    np.testing.assert_array_equal(got.is_connector[:n], expected.is_connector[:n])
+    for name in ("points", "left", "right")[: 3 if boundaries else 1]:
+        np.testing.assert_allclose(getattr(got, name)[:n], getattr(expected, name)[:n], atol=1e-4)
+    if boundaries:
+        np.testing.assert_array_equal(got.left_type, expected.left_type)
+        np.testing.assert_array_equal(got.right_type, expected.right_type)
+
+
+@pytest.mark.parametrize("index", [0, 4])
+def test_what_is_written_is_read_again(exported, index):
+    made, dataset = DriveDataset(), opened(exported)
+    assert len(dataset) == len(made)
+    expected, got = made.example(index), dataset.example(index)
+    got.validate()
+    same_lanes(got.lanes, expected.lanes, boundaries=False)
+    same_lanes(got.segments, expected.segments, boundaries=True)
+    np.testing.assert_allclose(got.areas.points[:1], expected.areas.points[:1], atol=1e-4)
+    np.testing.assert_array_equal(got.areas.category, expected.areas.category)
+    np.testing.assert_array_equal(got.traffic_elements.valid, [True, True, False])
+    for name in ("box", "category", "attribute"):
+        theirs = getattr(expected.traffic_elements, name)[1:]
+        np.testing.assert_allclose(getattr(got.traffic_elements, name)[:2], theirs, atol=1e-4)
+    np.testing.assert_array_equal(got.traffic_elements.lane[:, :2], expected.traffic_elements.lane[:, 1:])
+    np.testing.assert_allclose(got.previous_from_ego, expected.previous_from_ego, atol=1e-6)
+    assert got.has_previous == expected.has_previous
+    np.testing.assert_array_equal(got.cameras.image, expected.cameras.image[:, :32, :48])  # less of the padding
+    np.testing.assert_array_equal(got.cameras.size, expected.cameras.size)
+    assert got.cameras.valid.all()
+    np.testing.assert_allclose(got.cameras.intrinsics, expected.cameras.intrinsics, rtol=1e-6)
+    np.testing.assert_allclose(got.cameras.camera_from_ego, expected.cameras.camera_from_ego, atol=1e-6)
+    here, there = dataset.info(index), made.info(index)
+    assert here.scene == f"train/0100{index // FRAMES}"
+    np.testing.assert_allclose(here.global_from_ego, there.global_from_ego)
+    if index % FRAMES:
+        assert here.timestamp_ns - dataset.info(index - 1).timestamp_ns == 500_000_000
+
+
+def test_the_layout_is_the_official_one(exported):
+    content = json.loads((exported / "data_dict_subset_B.json").read_text())
+    assert set(content) == {"train", "val"}
+    assert [len(frames) for frames in content["val"].values()] == [FRAMES, FRAMES]
+    segment, frames = next(iter(content["val"].items()))
+    assert segment == "11000"
+    frame = json.loads((exported / "val" / segment / "info" / frames[0]).read_text())
+    assert frame["meta_data"]["source_id"] == "scene 0"
+    front = frame["sensor"]["CAM_FRONT"]
+    assert (exported / front["image_path"]).is_file()
+    rotation = np.array(front["extrinsic"]["rotation"])
+    np.testing.assert_allclose(rotation[:, 2], [1, 0, 0], atol=1e-6)  # camera to ego: it looks along x
+    assert front["extrinsic"]["translation"] == pytest.approx([1.5, 0.0, 1.6])
+    lanes = frame["annotation"]["lane_centerline"]
+    assert [len(lane["points"]) for lane in lanes] == [201] * 3
+    assert all(isinstance(lane["id"], str) for lane in lanes)
+    segments = json.loads((exported / "val" / segment / "info" / frames[0].replace(".json", "-ls.json")).read_text())
+    # Element 0 governs lane 0, on which segment 0 lies; element 1 lane 2.
+    assert segments["annotation"]["topology_lste"] == [[1, 0], [0, 0], [0, 1]]
+
+
+def test_ids_stay_with_their_lanes(exported):
+    infos = sorted((exported / "train" / "01000" / "info").glob("*[0-9].json"))
+    frames = [json.loads(path.read_text())["annotation"] for path in infos]
+    lanes = [[lane["id"] for lane in frame["lane_centerline"]] for frame in frames]
+    assert [np.roll(lanes[0], k).tolist() for k in range(FRAMES)] == lanes
+    elements = [[element["id"] for element in frame["traffic_element"]] for frame in frames]
+    assert elements[0] == elements[1] == elements[2]
+    assert len(set(elements[0]) | set(lanes[0])) == 5
+
+
+def test_the_scorer_reads_it_too(exported):
+    made = DriveDataset().example(0)
+    for frames, graph in ((read_truth(exported, progress=False), made.lanes),
+                          (read_segment_truth(exported, progress=False), made.segments)):  # fmt: skip
+        assert len(frames) == 2 * len(DriveDataset())
+        truth = next(iter(frames.values()))
+        lanes = getattr(truth, "lanes", truth)
+        np.testing.assert_allclose(lanes.points, graph.points[:3], atol=1e-4)
+        np.testing.assert_array_equal(lanes.elements.attributes, [2, 4])
+
+
+def test_a_jpeg_looks_the_same(tmp_path):
+    made = DriveDataset(DriveConfig(scenes=1, cameras=7))
+    root = export_openlane_v2({"test": made}, tmp_path / "made", progress=False)
+    views = opened(root, split="test", subset="A").example(1).cameras
+    expected = made.example(1).cameras
+    np.testing.assert_array_equal(views.size, expected.size)
+    assert np.abs(views.image.astype(int) - expected.image[:, :32, :48]).mean() < 1.5
+
+
+def test_rigs_have_the_official_names():
+    assert SUBSETS["A"].cameras == tuple(mount.name for mount in ARGOVERSE2_RING)
+    assert SUBSETS["B"].cameras == tuple(mount.name for mount in NUSCENES_RING)
+
+
+@pytest.mark.parametrize(("points", "stride"), [(11, 20), (5, 50), (21, 10)])
+def test_dense_lines_keep_their_own_points(points, stride):
+    line = np.random.default_rng(0).uniform(-30, 30, (points, 3))
+    assert len(dense(line)) == 201
+    np.testing.assert_allclose(dense(line)[::stride], line, atol=1e-12)
+
+
+def test_a_line_whose_points_do_not_fit_in_is_resampled():
+    line = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 2], [9, 0, 2]])
+    np.testing.assert_allclose(dense(line)[[0, 100, 200], 0], [0, 4.5, 9])
+
+
+def test_what_cannot_be_written_is_said(tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").touch()
+    with pytest.raises(UserError, match="is not empty"):
+        export_openlane_v2({"train": DriveDataset()}, tmp_path / "full", progress=False)
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match="no examples"):
+        export_openlane_v2({"train": DriveDataset(DriveConfig(scenes=0))}, out, progress=False)
+    with pytest.raises(UserError, match="has no cameras"):
+        export_openlane_v2({"train": FakeDataset(FakeConfig(1))}, out, progress=False)
+    with pytest.raises(UserError, match="has 3 cameras"):
+        export_openlane_v2({"train": DriveDataset(DriveConfig(cameras=3))}, out, progress=False)
+    both = {"train": DriveDataset(), "val": DriveDataset(DriveConfig(cameras=7))}
+    with pytest.raises(UserError, match="has 7 cameras"):  # half-way
+        export_openlane_v2(both, out, progress=False)
+    assert {path.name for path in tmp_path.iterdir()} == {"full"}

@@ -1,0 +1,255 @@
+"""Any dataset with cameras written in OpenLane-V2's layout, for the official repositories and for `openlane_v2`.
+
+An example has no ids: lanes, areas and elements keep theirs from frame to frame where they stay where they were
+(`datasets.identities`). What an example does not tell is derived: which lane segments an element governs, from the
+centerlines that they lie on.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from tqdm import tqdm
+
+from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.identities import Identities, line_distances
+from tflane_jax.datasets.openlane_frames import SUBSETS, Split, SubsetName, info_path
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import invert_pose
+from tflane_jax.geometry.polylines import resample
+from tflane_jax.images import opencv
+from tflane_jax.openlane_files import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKey
+from tflane_jax.scene import CameraViews, Example, LaneGraph, TrafficElements
+
+ImageFormat = Literal["jpg", "png"]
+VERSION = "tflane_jax 1"
+_JPEG_QUALITY = 95
+# Timestamps of a world start at zero; with this start they have the digits of real ones, so that their order as text is
+# their order in time. Nanoseconds.
+_START_NS = {"A": 315_000_000_000_000_000, "B": 1_500_000_000_000_000_000}
+# A segment lies on a centerline whose points all of its own are nearer to than this; metres.
+_ON_LANE = 0.5
+
+
+def export_openlane_v2(
+    datasets: Mapping[Split, Dataset], out: Path, *, images: ImageFormat = "jpg", progress: bool = True
+) -> Path:
+    """Write datasets as a folder of OpenLane-V2, one for each split; it appears whole or not at all.
+
+    Seven cameras make it subset A, six subset B. Scenes become segments in order of appearance; `meta_data` keeps their
+    names. Times below a year get a fixed start (see `meta_data.time_offset_ns`).
+
+    Args:
+        datasets: whose examples have cameras; the frames of a scene stand together and in time order.
+        out: folder that does not exist yet, or is empty.
+        images: "jpg" as official, "png" without loss.
+        progress: show a bar with rate and time left.
+
+    Raises:
+        UserError: the folder holds something or cannot be written, a dataset is empty or has no cameras, or not six or
+            seven of them.
+    """
+    if out.is_dir() and any(out.iterdir()):
+        raise UserError(f"{out} is not empty: choose another folder")
+    writing = out.with_name(f".{out.name}.writing-{os.getpid()}")
+    try:
+        writing.mkdir(parents=True)
+        subset, content = None, {}
+        for split, dataset in datasets.items():
+            subset = _subset_of(dataset, subset)
+            content[split] = _export_split(dataset, writing, split, subset, images, progress)
+        if subset is None:
+            raise UserError("nothing to export: name at least one split")
+        _write_json(writing / SUBSETS[subset].data_dict, content)
+        if out.is_dir():
+            out.rmdir()
+        writing.rename(out)
+    except OSError as error:
+        raise UserError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(writing, ignore_errors=True)
+    return out
+
+
+def _subset_of(dataset: Dataset, before: SubsetName | None) -> SubsetName:
+    """Return the subset that has as many cameras as the examples of a dataset."""
+    if len(dataset) == 0:
+        raise UserError(f"dataset {dataset.name} has no examples: leave its split out")
+    cameras = dataset.example(0).cameras
+    if cameras is None:
+        raise UserError(f"dataset {dataset.name} has no cameras: OpenLane-V2 needs images (ExampleConfig.cameras)")
+    count = len(cameras.valid)
+    for name, subset in SUBSETS.items():
+        if len(subset.cameras) == count and before in (None, name):
+            return name
+    raise UserError(
+        f"dataset {dataset.name} has {count} cameras: OpenLane-V2 has 7 (subset A) or 6 (subset B), the same for all "
+        "splits"
+    )
+
+
+def _export_split(
+    dataset: Dataset, root: Path, split: Split, subset: SubsetName, images: ImageFormat, progress: bool
+) -> dict[str, list[str]]:
+    """Write the frames of a split and return its part of the split file."""
+    segments: dict[str, list[str]] = {}
+    names: dict[str, str] = {}
+    ids = Identities()
+    for index in tqdm(range(len(dataset)), f"writing {split}", unit="frame", disable=not progress):
+        example, info = dataset.example(index), dataset.info(index)
+        if info.scene not in names:
+            names[info.scene] = f"{SUBSETS[subset].first_segment[split] + len(names):05d}"
+            ids = Identities()
+        offset = _START_NS[subset] if info.timestamp_ns < _START_NS[subset] else 0
+        time = (info.timestamp_ns + offset) // SUBSETS[subset].tick_ns
+        key = FrameKey(split, names[info.scene], str(time))
+        segments.setdefault(key.segment, []).append(f"{key.timestamp}.json")
+        if segments[key.segment][-1] in segments[key.segment][:-1]:
+            raise UserError(f"dataset {dataset.name} has two frames of {info.scene} at {info.timestamp_ns} ns")
+        assert example.cameras is not None
+        ids.step(example)
+        frame = _frame(key, info, subset, offset) | {"sensor": _sensors(example.cameras, root, key, subset, images)}
+        _write_json(info_path(root, key), frame | {"annotation": centerline_annotation(example, ids)})
+        _write_json(info_path(root, key, SEGMENT.suffix), frame | {"annotation": segment_annotation(example, ids)})
+    return segments
+
+
+def _frame(key: FrameKey, info: FrameInfo, subset: SubsetName, offset: int) -> dict[str, Any]:
+    return {
+        "version": VERSION,
+        "segment_id": key.segment,
+        "meta_data": {"source": info.source, "source_id": info.scene, "subset": subset, "time_offset_ns": offset},
+        "timestamp": int(key.timestamp),
+        "pose": _pose(info.global_from_ego),
+    }
+
+
+def _sensors(
+    cameras: CameraViews, root: Path, key: FrameKey, subset: SubsetName, images: ImageFormat
+) -> dict[str, Any]:
+    """Write the images of a frame; a camera that delivered none is left out."""
+    sensors = {}
+    for i, name in enumerate(SUBSETS[subset].cameras):
+        if not cameras.valid[i]:
+            continue
+        place = f"{key.split}/{key.segment}/image/{name}/{key.timestamp}.{images}"
+        width, height = cameras.size[i]
+        _write_image(root / place, np.asarray(cameras.image[i, :height, :width]))
+        sensors[name] = {
+            "image_path": place,
+            "extrinsic": _pose(invert_pose(np.asarray(cameras.camera_from_ego[i], np.float64))),
+            "intrinsic": {"K": np.asarray(cameras.intrinsics[i], float).tolist(), "distortion": [0.0, 0.0, 0.0]},
+        }
+    return sensors
+
+
+def centerline_annotation(example: Example, ids: Identities) -> dict[str, Any]:
+    """Return the annotation of a frame in the centerline flavour, 201 points a line."""
+    rows = np.flatnonzero(example.lanes.valid)
+    elements = _elements(example.traffic_elements, ids)
+    return {
+        CENTERLINE.lanes: [
+            {"id": ids.lanes[n], "points": _rounded(dense(example.lanes.points[n])),
+             "is_intersection_or_connector": bool(example.lanes.is_connector[n])}
+            for n in rows.tolist()
+        ],
+        "traffic_element": elements,
+        CENTERLINE.lane_lane: example.lanes.successor[np.ix_(rows, rows)].astype(int).tolist(),
+        CENTERLINE.lane_element: _governed(example)[rows].astype(int).tolist(),
+    }  # fmt: skip
+
+
+def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
+    """Return the annotation of a frame in the lane-segment flavour, with as many points as the example has."""
+    graph, areas = example.segments, example.areas
+    rows = np.flatnonzero(graph.valid)
+    lane_element = segments_on_lanes(graph, example.lanes)[rows] @ _governed(example)
+    return {
+        SEGMENT.lanes: [
+            {"id": ids.segments[n], "centerline": _rounded(graph.points[n]),
+             "left_laneline": _rounded(graph.left[n]), "left_laneline_type": int(graph.left_type[n]),
+             "right_laneline": _rounded(graph.right[n]), "right_laneline_type": int(graph.right_type[n]),
+             "is_intersection_or_connector": bool(graph.is_connector[n])}
+            for n in rows.tolist()
+        ],
+        "traffic_element": _elements(example.traffic_elements, ids),
+        "area": [
+            {"id": ids.areas[n], "category": int(areas.category[n]), "points": _rounded(areas.points[n])}
+            for n in np.flatnonzero(areas.valid).tolist()
+        ],
+        SEGMENT.lane_lane: graph.successor[np.ix_(rows, rows)].astype(int).tolist(),
+        SEGMENT.lane_element: lane_element.astype(int).tolist(),
+    }  # fmt: skip
+
+
+def dense(line: Float[np.ndarray, "p 3"], count: int = DENSE_POINTS) -> Float[np.ndarray, "count 3"]:
+    """Return a line with `count` points: between its own where they fit in evenly, so that every k-th point is one of
+    them again; equally spaced otherwise."""
+    pieces = len(line) - 1
+    if pieces < 1 or (count - 1) % pieces:
+        return resample(line, count)
+    places = np.linspace(0.0, pieces, count)
+    return np.stack([np.interp(places, np.arange(pieces + 1), line[:, i]) for i in range(3)], -1)
+
+
+def segments_on_lanes(segments: LaneGraph, lanes: LaneGraph) -> Bool[np.ndarray, "s n"]:
+    """Return which segments lie on which centerlines, in the same direction; nothing where either is not valid."""
+    out = np.zeros((len(segments.valid), len(lanes.valid)), bool)
+    rows, columns = np.flatnonzero(segments.valid), np.flatnonzero(lanes.valid)
+    if not len(rows) or not len(columns):
+        return out
+    parts, wholes = np.asarray(segments.points[rows], float), np.asarray(lanes.points[columns], float)
+    distance, along = line_distances(parts, wholes)
+    out[np.ix_(rows, columns)] = (distance.max(-1) < _ON_LANE) & (along[..., -1] > along[..., 0])
+    return out
+
+
+def _governed(example: Example) -> Bool[np.ndarray, "n e"]:
+    """Return which lanes each valid element governs; nothing where there are no elements."""
+    elements = example.traffic_elements
+    if elements is None:
+        return np.zeros((len(example.lanes.valid), 0), bool)
+    lane = np.zeros((len(example.lanes.valid), len(elements.valid)), bool)
+    if len(elements.lane) == len(lane):  # the rows of a lane-segment dataset are segments, whose lanes are not known
+        lane = np.asarray(elements.lane) & np.asarray(example.lanes.valid)[:, None]
+    return lane[:, np.flatnonzero(elements.valid)]
+
+
+def _elements(elements: TrafficElements | None, ids: Identities) -> list[dict[str, Any]]:
+    if elements is None:
+        return []
+    return [
+        {"id": ids.elements[e], "category": int(elements.category[e]), "attribute": int(elements.attribute[e]),
+         "points": _rounded(elements.box[e])}
+        for e in np.flatnonzero(elements.valid).tolist()
+    ]  # fmt: skip
+
+
+def _pose(pose: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    return {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
+
+
+def _rounded(values: np.ndarray) -> list:
+    """Return plain numbers to a tenth of a millimetre."""
+    return np.round(np.asarray(values, np.float64), 4).tolist()
+
+
+def _write_image(path: Path, image: np.ndarray) -> None:
+    cv2 = opencv()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    options: Sequence[int] = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if path.suffix == ".jpg" else []
+    done, data = cv2.imencode(path.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    assert done
+    path.write_bytes(data.tobytes())
+
+
+def _write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")

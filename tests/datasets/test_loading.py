@@ -4,7 +4,7 @@ import pytest
 
 from tests.fakes import FakeConfig, FakeDataset, UnevenDataset
 from tflane_jax.datasets.cache import cached
-from tflane_jax.datasets.loading import TRAINING_PARTS, count, for_training, keep, load_arrays, take
+from tflane_jax.datasets.loading import TRAINING_PARTS, count, for_training, keep, load_arrays
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example, stack_examples
 
@@ -55,16 +55,6 @@ def test_training_keeps_what_a_model_sees_and_the_lanes(dataset):
 def test_an_unknown_part_is_named(dataset):
     with pytest.raises(ValueError, match="no field of Example: lane"):
         load(dataset, parts=("lane",))
-
-
-@pytest.mark.parametrize("indices", [[], [2], [4, 0, 4], [[0, 1], [2, 3]]])
-def test_take_gathers_rows_into_a_copy(dataset, indices):
-    arrays, indices = load(dataset), np.asarray(indices, int)
-    batch = take(arrays, indices)
-    jax.tree.map(lambda leaf, taken: np.testing.assert_array_equal(taken, leaf[indices]), arrays, batch)
-    assert batch.bev.dtype == np.uint8
-    batch.bev[...] = 0
-    assert arrays.bev.any()
 
 
 def test_an_empty_dataset_and_uneven_examples_are_refused():

@@ -1,7 +1,7 @@
-"""Datasets as arrays in memory: one stacked `Example` with a leading axis, and batches gathered from it.
+"""Datasets as arrays in memory: one stacked `Example` with a leading axis.
 
-The arrays are numpy and stay on the host; `take` hands a batch to the device. Parts that a model does not
-look at need not be read at all.
+The arrays are numpy and stay on the host (`training.batches` gathers from them). Parts that a model does not look at
+need not be read at all.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Int
 from tqdm import tqdm
 
 from tflane_jax.datasets.base import Dataset
@@ -92,12 +91,6 @@ def for_training(arrays: Example) -> Example:
 def count(arrays: Example) -> int:
     """Return the number of stacked examples."""
     return len(arrays.has_previous)
-
-
-def take(arrays: Example, indices: Int[np.ndarray, "*b"]) -> Example:
-    """Return the examples at `indices`, which may repeat, as a batch with their shape as leading axes (a
-    copy)."""
-    return jax.tree.map(lambda leaf: np.take(leaf, indices, axis=0), arrays)
 
 
 def _checked(parts: Collection[str]) -> frozenset[str]:

@@ -1,6 +1,7 @@
 """The lane-graph loss: against plain numpy loops, padding, empty scenes, gradients."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,17 @@ from scipy.optimize import linear_sum_assignment
 
 from tflane_jax.losses.costs import focal_cost
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss, matching_cost
-from tflane_jax.scene import LaneGraph, LanePrediction, stack_examples
+from tflane_jax.scene import LaneGraph, LanePrediction, Prediction, stack_examples
 
 CONFIG = LaneGraphLossConfig()
-jitted_loss = jax.jit(lane_graph_loss, static_argnums=2)
+
+
+@partial(jax.jit, static_argnums=2)
+def jitted_loss(lanes, truth, config):
+    return lane_graph_loss(Prediction(lanes), truth, config)
+
+
+
 BATCH, LAYERS, QUERIES, LANES, POINTS = 3, 2, 7, 5, 4
 
 
@@ -85,7 +93,7 @@ def test_padding_changes_nothing():
         points=np.where(hole[..., None, None], np.nan, lanes.points),
         successor=lanes.successor | hole[:, :, None] | hole[:, None, :],
     )
-    grad = jax.jit(jax.value_and_grad(lambda p, g: lane_graph_loss(p, g, CONFIG)[0]))
+    grad = jax.jit(jax.value_and_grad(lambda p, g: jitted_loss(p, g, CONFIG)[0]))
     jax.tree.map(np.testing.assert_array_equal, grad(prediction, lanes), grad(prediction, dirty))
 
 
@@ -94,7 +102,7 @@ def test_gradient_against_finite_differences():
 
     @jax.jit
     def loss(p):
-        return lane_graph_loss(p, lanes, CONFIG)[0]
+        return jitted_loss(p, lanes, CONFIG)[0]
 
     gradient = jax.grad(loss)(prediction)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))

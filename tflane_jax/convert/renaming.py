@@ -139,7 +139,7 @@ def _leaves(path: str, tensor: AnyArray, kind: str) -> dict[str, Any]:
         if last == "weight":
             return {f"{parent}/{part}/kernel": value.T for part, value in parts.items()}
         return {f"{parent}/{part}/bias": value for part, value in parts.items()}
-    if kind == "pair":  # a linear layer on [a | b] as one layer for a, with the bias, and one for b
+    if kind == "pair":  # a linear layer on [a | b] as one layer for each, the bias with the first
         half = tensor.shape[-1] // 2
         if last == "bias":
             return {f"{parent}_first/bias": tensor}

@@ -1,7 +1,8 @@
-"""TopoNet's scene graph: message passing between lanes, and the heads that predict its edges (specs section 5).
+"""TopoNet's scene graph: messages between lanes and from traffic elements to lanes, and the heads that predict edges.
 
-The edges that a layer passes messages along are the previous layer's own predictions, as probabilities without
-gradient. Rows index lanes; [i, j] means that lane j continues lane i.
+Reference: specs/modules.md section 5. The edges that a layer passes messages along are the previous layer's own
+predictions, as probabilities without gradient. Rows index lanes; [i, j] means that lane j continues lane i, or that
+element j governs lane i.
 """
 
 from __future__ import annotations
@@ -9,7 +10,24 @@ from __future__ import annotations
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
+from jax import lax
 from jaxtyping import Array, Float
+
+
+@struct.dataclass
+class ElementNodes:
+    """The traffic elements as the scene graph sees them.
+
+    Attributes:
+        features: (E, C), embedded for the lane decoder.
+        logits: (E, K) by class (sigmoid); no gradient flows through them.
+        edges: (Q, E) probability that element e governs lane q.
+    """
+
+    features: Float[Array, "e c"]
+    logits: Float[Array, "e k"]
+    edges: Float[Array, "q e"]
 
 
 class LaneGraphConvolution(nn.Module):
@@ -32,30 +50,67 @@ class LaneGraphConvolution(nn.Module):
         return linear("own") + self.edge_weight * (onward + backward)
 
 
+class ElementGraphConvolution(nn.Module):
+    """Element-to-lane messages with a matrix of its own for each class (TopoNet's scene knowledge graph).
+
+    (e B) sum_k S[:, k] (T W_k), S the probabilities of the classes, B those of the edges.
+
+    Attributes:
+        dim: channels out.
+        edge_weight: e.
+    """
+
+    dim: int
+    edge_weight: float = 0.6
+
+    @nn.compact
+    def __call__(self, elements: ElementNodes) -> Float[Array, "q d"]:
+        """Return what every lane receives."""
+        (_, c), classes = elements.features.shape, elements.logits.shape[-1]
+        init = nn.initializers.xavier_uniform(batch_axis=0)
+        kernel = self.param("kernel", init, (classes, c, self.dim))
+        share = nn.sigmoid(lax.stop_gradient(elements.logits))
+        support = jnp.einsum("ek,ec,kcd->ed", share, elements.features, kernel)
+        return self.edge_weight * (elements.edges @ support)
+
+
 class SceneGraphFeedForward(nn.Module):
     """FFN_SGNN: a feed-forward block whose output passes through the scene graph.
 
-    The element-to-lane half of TopoNet joins the lane half before `downsample`; without traffic elements (this host
-    so far) only the lane half is there.
+    What comes along the edges from lanes and, where there are any, from traffic elements is joined before `downsample`.
 
     Attributes:
         dim: channels.
         hidden: channels inside the feed-forward part.
         edge_weight: see `LaneGraphConvolution`.
+        dropout: of hidden channels, the joined messages and what is added.
     """
 
     dim: int
     hidden: int
     edge_weight: float = 0.6
+    dropout: float = 0.0
 
     @nn.compact
-    def __call__(self, x: Float[Array, "q c"], adjacency: Float[Array, "q q"]) -> Float[Array, "q c"]:
+    def __call__(
+        self,
+        x: Float[Array, "q c"],
+        adjacency: Float[Array, "q q"],
+        elements: ElementNodes | None = None,
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "q c"]:
         """Return x plus what the block adds."""
+        drop = lambda name, y: nn.Dropout(self.dropout, name=name)(y, deterministic=deterministic)  # noqa: E731
         # The reference applies ReLU after the second linear as well (specs section 15, item 7).
-        features = nn.relu(nn.Dense(self.hidden, name="expand")(x))
-        features = nn.relu(nn.Dense(self.dim, name="contract")(features))
-        lanes = LaneGraphConvolution(self.dim, self.edge_weight, name="lane_lane")(features, adjacency)
-        return x + nn.Dense(self.dim, name="downsample")(nn.relu(lanes))
+        features = drop("expand_dropout", nn.relu(nn.Dense(self.hidden, name="expand")(x)))
+        features = drop("contract_dropout", nn.relu(nn.Dense(self.dim, name="contract")(features)))
+        received = LaneGraphConvolution(self.dim, self.edge_weight, name="lane_lane")(features, adjacency)
+        if elements is not None:
+            along = ElementGraphConvolution(self.dim, self.edge_weight, name="lane_element")(elements)
+            received = jnp.concatenate([received, along], -1)
+        received = drop("received_dropout", nn.relu(received))
+        return x + drop("downsample_dropout", nn.Dense(self.dim, name="downsample")(received))
 
 
 class RelationshipHead(nn.Module):
@@ -102,4 +157,4 @@ class Mlp(nn.Module):
 
 def edge_probabilities(logits: Float[Array, "a b"]) -> Float[Array, "a b"]:
     """Return the probabilities of edges for the next layer's messages; no gradient flows through them."""
-    return jax.lax.stop_gradient(jax.nn.sigmoid(logits.astype(jnp.float32))).astype(logits.dtype)
+    return lax.stop_gradient(jax.nn.sigmoid(logits.astype(jnp.float32))).astype(logits.dtype)

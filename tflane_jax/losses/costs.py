@@ -20,3 +20,24 @@ def focal_cost(
 def pairwise_l1(prediction: Float[Array, "*b q d"], target: Float[Array, "*#b n d"]) -> Float[Array, "*b q n"]:
     """Return the sum of absolute differences of every prediction to every target."""
     return jnp.abs(prediction[..., :, None, :] - target[..., None, :, :]).sum(-1)
+
+
+def generalised_iou(
+    a: Float[Array, "*#b 2 2"], b: Float[Array, "*#b 2 2"], eps: float = 1e-6
+) -> Float[Array, "*b"]:
+    """Return the overlap of boxes less the share of their hull that neither covers, -1 to 1 (Rezatofighi et al. 2019).
+
+    Args:
+        a, b: lower and upper corners.
+        eps: least area of union and hull.
+    """
+    area = lambda low, high: (high - low)[..., 0] * (high - low)[..., 1]  # noqa: E731
+    low, high = jnp.maximum(a[..., 0, :], b[..., 0, :]), jnp.minimum(a[..., 1, :], b[..., 1, :])
+    side = jax.nn.relu(high - low)
+    overlap = side[..., 0] * side[..., 1]
+    union = area(a[..., 0, :], a[..., 1, :]) + area(b[..., 0, :], b[..., 1, :]) - overlap
+    union = jnp.maximum(union, eps)
+    low, high = jnp.minimum(a[..., 0, :], b[..., 0, :]), jnp.maximum(a[..., 1, :], b[..., 1, :])
+    side = jax.nn.relu(high - low)
+    hull = jnp.maximum(side[..., 0] * side[..., 1], eps)
+    return overlap / union - (hull - union) / hull

@@ -1,4 +1,6 @@
-"""TopoNet's lane decoder: queries look at BEV features, refine centerlines and pass messages along predicted topology.
+"""Lane decoder of TopoNet and BEVFormer-DETR: queries look at BEV features, and heads make centerlines of them.
+
+In TopoNet they also pass messages along the predicted topology.
 
 Reference: specs/modules.md section 5. Two modes of refinement: "fixed" is TopoNet's own, where a query looks around one
 reference point that never moves; "iterative" starts from learned anchor lanes, moves all points from layer to layer,
@@ -9,7 +11,7 @@ point by what is seen there, which small models need to converge.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -21,14 +23,16 @@ from scipy.stats import qmc
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention, sample_bilinear
-from tflane_jax.layers.graph import Mlp, RelationshipHead, SceneGraphFeedForward
+from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGraphFeedForward
 from tflane_jax.layers.positions import inverse_sigmoid
-from tflane_jax.scene import LanePrediction
+from tflane_jax.layers.transformer import FeedForward, TransformerConfig
+from tflane_jax.models.element_decoder import ElementOutput
+from tflane_jax.scene import ElementPrediction, LanePrediction, Prediction
 
 
 @dataclass(frozen=True)
 class LaneDecoderConfig:
-    """Sizes of the decoder; the defaults train on two CPU cores (TopoNet: 256, 8, 6, 200, 4, 512, 128, "fixed").
+    """Sizes of the decoder; the defaults train on two CPU cores (`toponet.paper_config` has the paper's).
 
     Attributes:
         dim: channels of a query.
@@ -43,6 +47,7 @@ class LaneDecoderConfig:
         bands: frequencies per coordinate that tell where a refined lane is.
         refine: see the file's docstring.
         range: the box that normalised coordinates span.
+        dropout: of attention weights, hidden channels, messages and everything that is added to a residual.
     """
 
     dim: int = 64
@@ -57,6 +62,7 @@ class LaneDecoderConfig:
     bands: int = 6
     refine: Literal["fixed", "iterative"] = "iterative"
     range: PerceptionRange = BevGrid().range
+    dropout: float = 0.0
 
 
 class LaneQueries(nn.Module):
@@ -100,7 +106,7 @@ def spread_lanes(config: LaneDecoderConfig, length: float = 24.0) -> Float[np.nd
 
 
 class LaneDecoderLayer(nn.Module):
-    """Self-attention, deformable attention to the BEV, scene-graph feed-forward; post-norm."""
+    """Self-attention, deformable attention to the BEV, feed-forward with or without the scene graph; post-norm."""
 
     config: LaneDecoderConfig
 
@@ -111,19 +117,55 @@ class LaneDecoderLayer(nn.Module):
         position: Float[Array, "q c"],
         reference: Float[Array, "q p 3"],
         bev: Float[Array, "h w e"],
-        adjacency: Float[Array, "q q"],
+        adjacency: Float[Array, "q q"] | None,
+        elements: ElementNodes | None = None,
+        *,
+        deterministic: bool = True,
     ) -> Float[Array, "q c"]:
-        """Return the queries after one layer; `adjacency` holds the previous layer's edge probabilities."""
+        """Return the queries after one layer.
+
+        Args:
+            queries, position: content of the queries and what is added to it where they look around.
+            reference: where their lanes are, in [0, 1].
+            bev: BEV features, row 0 at the least y, column 0 at the least x.
+            adjacency: the previous layer's edge probabilities; None is a layer without scene graph (BEVFormer-DETR).
+            elements: traffic elements for the scene graph, if the host has them.
+            deterministic: no dropout.
+        """
         config = self.config
+
+        def add(name, x, change):
+            change = nn.Dropout(config.dropout, name=f"{name}_dropout")(change, deterministic=deterministic)
+            return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change)
+
+        attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
         where = queries + position
-        attended = MultiHeadAttention(config.dim, config.heads, name="self_attention")(where, where, queries, None)
-        queries = nn.LayerNorm(name="self_attention_norm")(queries + attended)
+        queries = add("self_attention", queries, attend(where, where, queries, deterministic=deterministic))
         look = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
         (h, w, e), around = bev.shape, attention_reference(reference, config)
         seen = look(queries + position, bev.reshape(h * w, e), ((h, w),), around)
-        queries = nn.LayerNorm(name="bev_attention_norm")(queries + seen)
-        graph = SceneGraphFeedForward(config.dim, config.hidden, config.edge_weight, name="scene_graph")
-        return nn.LayerNorm(name="scene_graph_norm")(graph(queries, adjacency))
+        queries = add("bev_attention", queries, seen)
+        if adjacency is None:
+            block = FeedForward(TransformerConfig(config.heads, config.hidden, config.dropout), name="feed_forward")
+            return add("feed_forward", queries, block(queries, deterministic=deterministic))
+        graph = SceneGraphFeedForward(
+            config.dim, config.hidden, config.edge_weight, config.dropout, name="scene_graph"
+        )
+        queries = graph(queries, adjacency, elements, deterministic=deterministic)
+        return nn.LayerNorm(epsilon=1e-5, name="scene_graph_norm")(queries)
+
+
+class ElementEmbedding(nn.Module):
+    """Traffic-element queries of the front view, embedded for the lane decoder."""
+
+    config: LaneDecoderConfig
+
+    @nn.compact
+    def __call__(self, queries: Float[Array, "e d"], *, deterministic: bool = True) -> Float[Array, "e c"]:
+        """Return the elements' features."""
+        x = nn.relu(nn.Dense(2 * self.config.dim, name="expand")(queries))
+        x = nn.Dropout(self.config.dropout, name="dropout")(x, deterministic=deterministic)
+        return nn.Dense(self.config.dim, name="contract")(x)
 
 
 class PointwiseRefinement(nn.Module):
@@ -151,20 +193,49 @@ class PointwiseRefinement(nn.Module):
         return 0.3 * nn.Dense(3, kernel_init=nn.initializers.zeros, name="change")(x)
 
 
+class LaneOutput(NamedTuple):
+    """What the heads of one decoder layer say.
+
+    Attributes:
+        points: (Q, P, 3) metres.
+        unit: the same points in [0, 1].
+        logits: (Q, 1) of the class.
+        successor: (Q, Q) logits of lane-lane edges, None where the layer has no relationship heads.
+        element_lane: (Q, E) logits of lane-element edges, None where there are no elements either.
+    """
+
+    points: Float[Array, "q p 3"]
+    unit: Float[Array, "q p 3"]
+    logits: Float[Array, "q 1"]
+    successor: Float[Array, "q q"] | None
+    element_lane: Float[Array, "q e"] | None
+
+
 class LaneHeads(nn.Module):
-    """Class, centerline and topology of one decoder layer."""
+    """Class, centerline and topology of one decoder layer.
+
+    Attributes:
+        config: sizes.
+        relations: whether the layer predicts topology.
+    """
 
     config: LaneDecoderConfig
+    relations: bool = True
 
     @nn.compact
     def __call__(
-        self, queries: Float[Array, "q c"], reference: Float[Array, "q p 3"], bev: Float[Array, "h w e"]
-    ) -> tuple[LanePrediction, Float[Array, "q p 3"]]:
-        """Return the prediction in metres and the same points in [0, 1]."""
+        self,
+        queries: Float[Array, "q c"],
+        reference: Float[Array, "q p 3"],
+        bev: Float[Array, "h w e"],
+        elements: Float[Array, "n d"] | None = None,
+    ) -> LaneOutput:
+        """Return the layer's prediction; `elements` are features of traffic elements."""
         config = self.config
         x = queries
         for i in range(2):
-            x = nn.relu(nn.LayerNorm(name=f"class_norm_{i}")(nn.Dense(config.dim, name=f"class_{i}")(x)))
+            x = nn.Dense(config.dim, name=f"class_{i}")(x)
+            x = nn.relu(nn.LayerNorm(epsilon=1e-5, name=f"class_norm_{i}")(x))
         # Bias -log 99: every query starts as one percent likely (focal loss prior).
         logits = nn.Dense(1, bias_init=nn.initializers.constant(-np.log(99.0)), name="class_out")(x)
         # The change of the reference, in logits of [0, 1].
@@ -173,8 +244,29 @@ class LaneHeads(nn.Module):
             change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
             change = change + PointwiseRefinement(config, name="pointwise")(queries, reference, bev)
         unit = nn.sigmoid(change + inverse_sigmoid(reference))
-        successor = RelationshipHead(config.relation, name="successor")(queries, queries)
-        return LanePrediction(config.range.denormalise(unit), logits, successor), unit
+        successor = element_lane = None
+        if self.relations:
+            successor = RelationshipHead(config.relation, name="successor")(queries, queries)
+            if elements is not None:
+                element_lane = RelationshipHead(config.relation, name="element_lane")(queries, elements)
+        return LaneOutput(config.range.denormalise(unit), unit, logits, successor, element_lane)
+
+
+def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -> Prediction:
+    """Return lanes, elements and topologies with a leading axis over decoder layers.
+
+    The axis of a topology counts only the layers, always the last ones, that predict it.
+    """
+    related = [output for output in outputs if output.successor is not None]
+    lanes = LanePrediction(
+        points=jnp.stack([output.points for output in outputs]),
+        logits=jnp.stack([output.logits for output in outputs]),
+        successor_logits=jnp.stack([output.successor for output in related]),  # pyright: ignore[reportArgumentType]
+    )
+    if elements is None:
+        return Prediction(lanes)
+    edges = jnp.stack([output.element_lane for output in related])  # pyright: ignore[reportArgumentType]
+    return Prediction(lanes, ElementPrediction(elements.box, elements.logits, edges))
 
 
 def smooth_basis(points: int) -> Float[np.ndarray, "p k"]:

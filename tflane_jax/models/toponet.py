@@ -15,15 +15,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tflane_jax.layers.graph import Mlp, edge_probabilities
+from tflane_jax.layers.graph import ElementNodes, Mlp, edge_probabilities
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.models.element_decoder import ElementDecoderConfig, ElementOutput
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
+    ElementEmbedding,
     LaneDecoderConfig,
     LaneDecoderLayer,
     LaneHeads,
     LaneQueries,
+    make_prediction,
     next_reference,
 )
 from tflane_jax.models.traffic_flow_module import (
@@ -32,7 +35,7 @@ from tflane_jax.models.traffic_flow_module import (
     TrafficFlowModuleConfig,
 )
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
-from tflane_jax.scene import Example, LanePrediction, TrafficFlow
+from tflane_jax.scene import Example, Prediction, TrafficFlow
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,13 @@ class TopoNetConfig:
         encoder: BEV features.
         decoder: lane decoder.
         traffic_flow: the TFM and its prior, or None.
+        elements: traffic elements in the front view and in the scene graph, or None.
     """
 
     encoder: EvidenceEncoderConfig = EvidenceEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig()
     traffic_flow: TrafficFlowConfig | None = None
+    elements: ElementDecoderConfig | None = None
 
     def build(self) -> TopoNet:
         """Return the Linen module."""
@@ -75,16 +80,36 @@ class TopoNet(nn.Module):
 
     config: TopoNetConfig
 
-    @nn.compact
-    def __call__(self, example: Example) -> LanePrediction:
+    def setup(self):
+        self.encoder = EvidenceEncoder(self.config.encoder)
+
+    def __call__(self, example: Example, *, train: bool = False) -> Prediction:
         """Return predictions with a leading axis over decoder layers; the last one is the answer."""
-        config = self.config.decoder
         if example.bev is None:
             raise ValueError("this model reads BEV evidence, and the example has none (bev is None)")
-        bev = EvidenceEncoder(self.config.encoder, name="encoder")(example.bev)
+        traffic = self.config.traffic_flow
+        tokens = None if traffic is None else traffic_flow_tokens(example, traffic.prior)
+        return self.decode(self.encoder(example.bev), None, tokens, deterministic=not train)
+
+    @nn.compact
+    def decode(
+        self,
+        bev: Float[Array, "h w e"],
+        elements: ElementOutput | None = None,
+        tokens: TrafficFlowTokens | None = None,
+        *,
+        deterministic: bool = True,
+    ) -> Prediction:
+        """Return lanes and topology of every decoder layer, from BEV features, traffic elements and traffic flow.
+
+        Stores the queries of every layer as the intermediate `queries` where a caller asks for it.
+        """
+        config = self.config.decoder
         queries, position, reference = LaneQueries(config, name="queries")()
-        enhance = self._traffic_flow(example)
+        enhance = self._traffic_flow(tokens)
+        # The first layer knows of no edges.
         adjacency = jnp.zeros((config.queries, config.queries))
+        governs = None if elements is None else jnp.zeros((config.queries, elements.logits.shape[1]))
         outputs = []
         for i in range(config.layers):
             where = position
@@ -94,19 +119,28 @@ class TopoNet(nn.Module):
                 along = along.reshape(config.queries, -1)
                 where = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
             queries = enhance(i, queries, where)
-            queries = LaneDecoderLayer(config, name=f"layer_{i}")(queries, where, reference, bev, adjacency)
-            prediction, unit = LaneHeads(config, name=f"heads_{i}")(queries, reference, bev)
-            reference = next_reference(reference, unit, config)
-            adjacency = edge_probabilities(prediction.successor_logits)
-            outputs.append(prediction)
-        return jax.tree.map(lambda *layers: jnp.stack(layers), *outputs)
+            seen = nodes = None
+            if elements is not None and governs is not None:
+                embed = ElementEmbedding(config, name=f"element_embedding_{i}")
+                seen = embed(elements.queries[i], deterministic=deterministic)
+                nodes = ElementNodes(seen, elements.logits[i], governs)
+            layer = LaneDecoderLayer(config, name=f"layer_{i}")
+            queries = layer(queries, where, reference, bev, adjacency, nodes, deterministic=deterministic)
+            self.sow("intermediates", "queries", queries)
+            output = LaneHeads(config, name=f"heads_{i}")(queries, reference, bev, seen)
+            outputs.append(output)
+            reference = next_reference(reference, output.unit, config)
+            if output.successor is not None:
+                adjacency = edge_probabilities(output.successor)
+            if output.element_lane is not None:
+                governs = edge_probabilities(output.element_lane)
+        return make_prediction(outputs, elements)
 
-    def _traffic_flow(self, example: Example):
+    def _traffic_flow(self, tokens: TrafficFlowTokens | None):
         """Return the function (layer, queries, positions) -> queries that applies the TFM where it belongs."""
         traffic, dim = self.config.traffic_flow, self.config.decoder.dim
-        if traffic is None:
+        if traffic is None or tokens is None:
             return lambda layer, queries, position: queries
-        tokens = traffic_flow_tokens(example, traffic.prior)
         features = TemporalEncoder(traffic.module, dim, name="temporal_encoder")(tokens)
         mask = SpatialMask.from_validity(self.config.decoder.queries, tokens.valid)
 

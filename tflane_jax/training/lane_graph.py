@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
+from tflane_jax.errors import UserError
+from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import Example, LanePrediction, Prediction
+from tflane_jax.scene import Example, Prediction
+from tflane_jax.training.task import STATISTICS, Params, split_statistics
 
 
 @dataclass(frozen=True)
@@ -25,20 +28,36 @@ class LaneGraphTask:
     model: TopoNetConfig = TopoNetConfig()
     losses: LaneGraphLossConfig = LaneGraphLossConfig()
 
-    def init(self, key: jax.Array, example: Example) -> dict[str, Any]:
+    def init(self, key: jax.Array, example: Example) -> Params:
         """Return fresh parameters; `example` gives shapes only."""
-        return dict(self.model.build().init(key, example)["params"])
+        variables = self.model.build().init(key, example)
+        return dict(variables["params"]) | {name: variables[name] for name in (STATISTICS,) if name in variables}
 
-    def loss(
-        self, params: dict[str, Any], batch: Example, key: jax.Array
-    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout, unused here."""
-        del key
-        module = self.model.build()
-        outputs = jax.vmap(lambda example: module.apply({"params": params}, example))(batch)
-        return lane_graph_loss(cast(LanePrediction, outputs), batch.lanes, self.losses)
+    def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
+        """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout."""
+        learned, statistics = split_statistics(params)
+        module, keys = self.model.build(), jax.random.split(key, len(batch.has_previous))
 
-    def predict(self, params: dict[str, Any], example: Example) -> Prediction:
+        def one(example, key):
+            variables, streams = {"params": learned} | statistics, {"dropout": key}
+            outputs, updated = module.apply(variables, example, train=True, mutable=[STATISTICS], rngs=streams)
+            return outputs, dict(updated)
+
+        outputs, updated = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, None))(batch, keys)
+        if outputs.elements is None:
+            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
+        elif batch.traffic_elements is None or batch.cameras is None:
+            raise UserError(
+                "the model predicts traffic elements, and these data label none: choose data with front images and "
+                "traffic elements, or set task.model.elements to None"
+            )
+        else:
+            sizes = batch.cameras.size[:, 0]
+            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses, batch.traffic_elements, sizes)
+        return loss, terms | updated
+
+    def predict(self, params: Params, example: Example) -> Prediction:
         """Return the last decoder layer's answer for one example."""
-        outputs = self.model.build().apply({"params": params}, example)
-        return Prediction(lanes=jax.tree.map(lambda layers: layers[-1], outputs))
+        learned, statistics = split_statistics(params)
+        outputs = self.model.build().apply({"params": learned} | statistics, example)
+        return jax.tree.map(lambda layers: layers[-1], outputs)

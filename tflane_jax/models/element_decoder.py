@@ -1,0 +1,239 @@
+"""Traffic lights and signs in the front view: Deformable DETR with iterative box refinement, TopoNet's TE head.
+
+Reference: specs/modules.md section 5 (Zhu et al. 2021). Features of the front camera, several levels -> encoder -> E
+queries that look at all levels -> after every decoder layer 13 class logits and a box, in pixels of that camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.deformable import DeformableAttention
+from tflane_jax.layers.graph import Mlp
+from tflane_jax.layers.positions import image_sine_encoding, inverse_sigmoid
+from tflane_jax.layers.transformer import FeedForward, Residual, TransformerConfig
+
+ATTRIBUTES = 13
+"""Classes of OpenLane-V2's traffic elements."""
+
+
+@dataclass(frozen=True)
+class ElementDecoderConfig:
+    """Sizes; the defaults train on two CPU cores (`toponet.paper_config` has the paper's).
+
+    Attributes:
+        dim: channels of features and queries.
+        heads: attention heads.
+        levels: feature levels that are looked at.
+        encoder_layers, layers: of encoder and decoder; a host with a lane decoder wants as many `layers` there.
+        queries: traffic elements that can be found, E.
+        sampling_points: per head and level.
+        hidden: channels inside the feed-forward parts.
+        dropout: of attention weights, hidden channels and everything that is added to a residual.
+    """
+
+    dim: int = 64
+    heads: int = 8
+    levels: int = 3
+    encoder_layers: int = 1
+    layers: int = 3
+    queries: int = 16
+    sampling_points: int = 4
+    hidden: int = 128
+    dropout: float = 0.0
+
+
+@struct.dataclass
+class ElementOutput:
+    """What the decoder's layers say, leading axis D over layers.
+
+    Attributes:
+        queries: (D, E, C), what the lane decoder and the relationship heads look at.
+        box: (D, E, 2, 2) top-left and bottom-right corners, pixels of the front image.
+        logits: (D, E, 13).
+    """
+
+    queries: Float[Array, "layers e c"]
+    box: Float[Array, "layers e 2 2"]
+    logits: Float[Array, "layers e 13"]
+
+
+class ElementDecoder(nn.Module):
+    """Feature maps of one image in, traffic elements out."""
+
+    config: ElementDecoderConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        features: Sequence[Float[Array, "h w c"]],
+        size: Int[Array, " 2"],
+        padded: tuple[int, int],
+        *,
+        deterministic: bool = True,
+    ) -> ElementOutput:
+        """Return boxes and classes after every layer.
+
+        Args:
+            features: of the image array, `levels` of them, finest first; what shows padding alone changes nothing.
+            size: width and height of the image, pixels; the rest of the array is padding.
+            padded: (rows, columns) of the image array.
+            deterministic: no dropout.
+
+        Raises:
+            ValueError: another number of levels.
+        """
+        config = self.config
+        if len(features) != config.levels:
+            raise ValueError(f"the element decoder looks at {config.levels} levels, and there are {len(features)}")
+        shapes = [(feature.shape[0], feature.shape[1]) for feature in features]
+        masks = [image_cells(shape, size, padded) for shape in shapes]
+        valid = jnp.concatenate([mask.reshape(-1) for mask in masks])
+        ratios = jnp.stack([valid_ratio(mask) for mask in masks])  # (L, 2), x and y
+        tokens = jnp.concatenate([feature.reshape(-1, feature.shape[-1]) for feature in features])
+        tokens = jnp.where(valid[:, None], tokens, 0.0)
+
+        level = self.param("level", nn.initializers.normal(1.0), (config.levels, config.dim))
+        position = jnp.concatenate([
+            image_sine_encoding(mask, config.dim // 2, offset=-0.5).reshape(-1, config.dim) + level[i][None]
+            for i, mask in enumerate(masks)
+        ])  # fmt: skip
+        cells = jnp.concatenate([cell_centres(shape, ratio) for shape, ratio in zip(shapes, ratios, strict=True)])
+        around = cells[:, None, None] * ratios[None, None]  # (T, 1, L, 2): the same spot on every level
+        for i in range(config.encoder_layers):
+            layer = ElementEncoderLayer(config, name=f"encoder_{i}")
+            tokens = layer(tokens, position, around, shapes, valid, deterministic=deterministic)
+        return self._decode(tokens, shapes, valid, ratios, size, deterministic)
+
+    def _decode(self, memory, shapes, valid, ratios, size, deterministic: bool) -> ElementOutput:
+        """Run the decoder; boxes are (cx, cy, w, h), shares of the image."""
+        config = self.config
+        embedding = self.param("queries", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
+        position, queries = jnp.split(embedding, 2, -1)
+        # A spot first, a box from the second layer on.
+        reference = nn.sigmoid(nn.Dense(2, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
+        outputs = []
+        for i in range(config.layers):
+            scale = jnp.tile(ratios, (1, reference.shape[-1] // 2))
+            around = reference[:, None, None] * scale[None, None]
+            layer = ElementDecoderLayer(config, name=f"decoder_{i}")
+            queries = layer(queries, position, memory, around, shapes, valid, deterministic=deterministic)
+            logits = nn.Dense(ATTRIBUTES, bias_init=nn.initializers.constant(-np.log(99.0)), name=f"class_{i}")(queries)
+            box = ElementBox(config.dim, first=i == 0, name=f"box_{i}")(queries, reference)
+            reference = lax.stop_gradient(box)
+            outputs.append(ElementOutput(queries, corners(box, size), logits))
+        return ElementOutput(*(jnp.stack(leaf) for leaf in zip(*map(_leaves, outputs), strict=True)))
+
+
+class ElementEncoderLayer(nn.Module):
+    """Deformable self-attention of the cells of all levels, feed-forward; post-norm."""
+
+    config: ElementDecoderConfig
+
+    @nn.compact
+    def __call__(self, tokens, position, around, shapes, valid: Bool[Array, " t"], *, deterministic: bool):
+        """Return the tokens (T, C) after the layer."""
+        config, sizes = self.config, _sizes(self.config)
+        look = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
+        block = FeedForward(sizes, name="feed_forward")
+        tokens = Residual(sizes, name="attended")(
+            tokens, lambda x: look(x + position, x, shapes, around, valid), deterministic=deterministic
+        )
+        return Residual(sizes, name="fed")(
+            tokens, lambda x: block(x, deterministic=deterministic), deterministic=deterministic
+        )
+
+
+class ElementDecoderLayer(nn.Module):
+    """Self-attention of the queries, deformable attention to all levels, feed-forward; post-norm."""
+
+    config: ElementDecoderConfig
+
+    @nn.compact
+    def __call__(
+        self, queries, position, memory, around, shapes, valid: Bool[Array, " t"], *, deterministic: bool
+    ) -> Float[Array, "e c"]:
+        """Return the queries after the layer."""
+        config, sizes = self.config, _sizes(self.config)
+        attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
+        look = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
+        block = FeedForward(sizes, name="feed_forward")
+
+        def among_queries(x):
+            return attend(x + position, x + position, x, deterministic=deterministic)
+
+        def to_image(x):
+            return look(x + position, memory, shapes, around, valid)
+
+        queries = Residual(sizes, name="attended")(queries, among_queries, deterministic=deterministic)
+        queries = Residual(sizes, name="crossed")(queries, to_image, deterministic=deterministic)
+        return Residual(sizes, name="fed")(
+            queries, lambda x: block(x, deterministic=deterministic), deterministic=deterministic
+        )
+
+
+class ElementBox(nn.Module):
+    """The box of each query, as a change of its reference in logits.
+
+    Attributes:
+        dim: channels of the queries.
+        first: the reference is a spot, and the boxes begin small.
+    """
+
+    dim: int
+    first: bool
+
+    @nn.compact
+    def __call__(self, queries: Float[Array, "e c"], reference: Float[Array, "e d"]) -> Float[Array, "e 4"]:
+        """Return (cx, cy, w, h) in [0, 1]."""
+        x = nn.relu(Mlp((self.dim, self.dim), name="hidden")(queries))
+        small = jnp.array([0.0, 0.0, -2.0, -2.0]) if self.first else jnp.zeros(4)
+        change = nn.Dense(4, kernel_init=nn.initializers.zeros, bias_init=lambda *_: small, name="out")(x)
+        known = inverse_sigmoid(reference)
+        return nn.sigmoid(change + jnp.pad(known, ((0, 0), (0, 4 - known.shape[-1]))))
+
+
+def image_cells(shape: tuple[int, int], size: Int[Array, " 2"], padded: tuple[int, int]) -> Bool[Array, "h w"]:
+    """Return the cells of a feature map whose nearest pixel (towards the origin) shows the image, not padding."""
+    rows, columns = (
+        jnp.asarray(np.arange(cells) * pixels // cells) < limit
+        for cells, pixels, limit in zip(shape, padded, (size[1], size[0]), strict=True)
+    )
+    return rows[:, None] & columns[None, :]
+
+
+def valid_ratio(mask: Bool[Array, "h w"]) -> Float[Array, " 2"]:
+    """Return the shares of columns and rows that show the image, at least one cell of each."""
+    h, w = mask.shape
+    columns, rows = mask[0].sum(dtype=jnp.float32) / w, mask[:, 0].sum(dtype=jnp.float32) / h
+    return jnp.maximum(jnp.stack([columns, rows]), jnp.array([1.0 / w, 1.0 / h]))
+
+
+def cell_centres(shape: tuple[int, int], ratio: Float[Array, " 2"]) -> Float[Array, "hw 2"]:
+    """Return the centre (x, y) of every cell, row-major, as shares of the part that shows the image."""
+    h, w = shape
+    y, x = np.meshgrid((np.arange(h) + 0.5) / h, (np.arange(w) + 0.5) / w, indexing="ij")
+    return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32) / ratio[None]
+
+
+def corners(box: Float[Array, "e 4"], size: Int[Array, " 2"]) -> Float[Array, "e 2 2"]:
+    """Return top-left and bottom-right corners in pixels of boxes (cx, cy, w, h), shares of an image of some size."""
+    centre, half = box[:, :2], 0.5 * box[:, 2:]
+    return jnp.stack([centre - half, centre + half], 1) * size.astype(box.dtype)[None, None]
+
+
+def _sizes(config: ElementDecoderConfig) -> TransformerConfig:
+    return TransformerConfig(config.heads, config.hidden, config.dropout)
+
+
+def _leaves(output: ElementOutput):
+    return output.queries, output.box, output.logits

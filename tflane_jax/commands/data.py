@@ -34,7 +34,7 @@ def show(options: argparse.Namespace) -> int:
     # Not from the cache: a few examples are made sooner than all of them.
     dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else open_dataset(source)
     picture = show_dataset(
-        dataset, options.count, options.out, ground=source.example.sensor.grid.range, view=source.example.range
+        dataset, options.count, options.out, ground=source.example.ground, view=source.example.range
     )
     indices = spread(len(dataset), options.count)
     rows = dataset_summary(stack_examples([dataset.example(index) for index in indices]))

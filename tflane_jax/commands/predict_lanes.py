@@ -72,7 +72,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
     save_examples(
         options.out / "pictures.png", examples, {f"{Path(trained.name).name}, step {trained.step}": lanes},
-        titles=titles(dataset, indices), ground=source.example.sensor.grid.range, view=source.example.range,
+        titles=titles(dataset, indices), ground=source.example.ground, view=source.example.range,
         threshold=options.threshold,
     )  # fmt: skip
     print(f"{len(indices)} frames written to {options.out}: predictions.npz, truth.npz, predictions.json, "

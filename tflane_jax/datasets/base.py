@@ -7,9 +7,10 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.world.bev_sensor import BevSensorConfig
+from tflane_jax.world.ring_cameras import CameraRigConfig
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class ExampleConfig:
 
     Attributes:
         range: in which lanes, areas and elements are truth.
-        sensor: bird's-eye-view evidence.
+        sensor: bird's-eye-view evidence; None leaves it out.
+        cameras: ring of cameras of the built-in world; None leaves them out. With cameras the traffic elements are
+            those that the first one sees, with their boxes in its image, as OpenLane-V2 annotates them.
         lanes, lane_points: merged centerlines and points on each.
         segments, segment_points: lane segments and points on each.
         areas, area_points: crossings with road boundaries and points on each.
@@ -33,7 +36,8 @@ class ExampleConfig:
     """
 
     range: PerceptionRange = PerceptionRange()
-    sensor: BevSensorConfig = BevSensorConfig()
+    sensor: BevSensorConfig | None = BevSensorConfig()
+    cameras: CameraRigConfig | None = None
     lanes: int = 48
     lane_points: int = 11
     segments: int = 96
@@ -44,6 +48,11 @@ class ExampleConfig:
     tracks: int = 96
     elements: int = 24
     bike_lanes: Literal["include", "exclude"] = "include"
+
+    @property
+    def ground(self) -> PerceptionRange:
+        """The ground that rasters of the example cover, and that pictures of it are drawn on."""
+        return BevGrid().range if self.sensor is None else self.sensor.grid.range
 
 
 class TruncationWarning(UserWarning):

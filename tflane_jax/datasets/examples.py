@@ -15,6 +15,7 @@ from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_
 from tflane_jax.logs import Log, Tracks
 from tflane_jax.scene import Example, TrafficFlow
 from tflane_jax.world.bev_sensor import hidden_cells, render_bev
+from tflane_jax.world.camera_sensor import render_cameras, visible_elements
 
 
 def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tuple[TrafficFlow, int]:
@@ -72,13 +73,15 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     """Return the example of one key frame: numpy arrays of the sizes in `config`, no batch axis.
 
     A log without history (its first frame) or without road users gives a valid example with an empty traffic
-    flow. Warns (`TruncationWarning`) where something in range finds no room.
+    flow. Warns (`TruncationWarning`) where something in range finds no room. Raises UserError where the configured
+    cameras can make no images.
     """
     moment = log.keyframes[keyframe]
     ego_from_global = invert_pose(moment.global_from_ego)
     prepared = prepare_map(log.map, bike_lanes=config.bike_lanes == "include")
     boxes, buildings = occluder_boxes(log, keyframe), _buildings(log, ego_from_global)
-    hidden = hidden_cells(config.sensor.grid, boxes, buildings)
+    sensor, rig = config.sensor, config.cameras
+    hidden = None if sensor is None else hidden_cells(sensor.grid, boxes, buildings)
     lanes = lane_graph(
         prepared.centerlines, ego_from_global, config.range,
         capacity=config.lanes, points=config.lane_points, boxes=boxes, buildings=buildings,
@@ -92,7 +95,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     )
     elements, elements_dropped = traffic_elements(
         log.map.elements, _attributes(log, moment.track_frame), prepared, lanes, ego_from_global, config.range,
-        capacity=config.elements,
+        capacity=config.elements, seen=None if rig is None else visible_elements(log, keyframe, rig),
     )  # fmt: skip
     flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks)
     _warn_dropped(
@@ -101,10 +104,10 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     )  # fmt: skip
     previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
     return Example(
-        bev=render_bev(
+        bev=None if sensor is None or hidden is None else render_bev(
             prepared.samples, ego_from_global, boxes, buildings, hidden,
             weather=log.weather, paint_wear=log.paint_wear, log_seed=log.seed, frame=keyframe,
-            config=config.sensor,
+            config=sensor,
         ),
         hidden=hidden,
         traffic_flow=flow,
@@ -116,6 +119,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         traffic_elements=elements,
         previous_from_ego=relative_pose(previous.global_from_ego, moment.global_from_ego).astype(np.float32),
         has_previous=np.asarray(keyframe > 0),
+        cameras=None if rig is None else render_cameras(log, keyframe, rig),
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from tflane_jax.geometry import PerceptionRange, transform_points
 from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample_lines, sample_at
 from tflane_jax.logs import MapElement
 from tflane_jax.scene import LaneGraph, TrafficElements
+from tflane_jax.world.camera_sensor import ElementViews
 from tflane_jax.world.line_of_sight import hidden_points
 
 # A traffic element farther away than this is not part of the truth; metres.
@@ -150,26 +151,33 @@ def traffic_elements(
     range_: PerceptionRange,
     *,
     capacity: int,
+    seen: ElementViews | None = None,
 ) -> tuple[TrafficElements, int]:
-    """Return lights and signs in range and nearer than `ELEMENT_DISTANCE`, tied to the merged centerlines whose
-    segments they govern, and how many found no room (the farthest).
+    """Return lights and signs, tied to the merged centerlines whose segments they govern, and how many found no room
+    (the farthest).
+
+    Without an image, those in range and nearer than `ELEMENT_DISTANCE` are the truth; with one, those seen in it.
 
     Args:
         elements, attribute: the map's elements and what each shows at this moment.
         lanes: cut from `prepared.centerlines`.
+        seen: the elements in the front image, None where there is no image.
     """
     out = TrafficElements.empty(capacity, len(lanes.graph.valid))
     if not elements:
         return out, 0
     position = transform_points(ego_from_global, np.stack([e.position for e in elements]))
     distance = np.linalg.norm(position[:, :2], axis=-1)
-    found = np.flatnonzero(range_.contains(position) & (distance < ELEMENT_DISTANCE))
+    there = range_.contains(position) & (distance < ELEMENT_DISTANCE) if seen is None else seen.visible
+    found = np.flatnonzero(there)
     kept = np.sort(found[np.argsort(distance[found], kind="stable")[:capacity]])
     for row, number in enumerate(kept):
         governed = [prepared.chain_of[s] for s in elements[number].lanes if s in prepared.chain_of]
         out.lane[: len(lanes.lane), row] = np.isin(lanes.lane, governed)
     n = len(kept)
     out.position[:n] = position[kept]
+    if seen is not None:
+        out.box[:n] = seen.box[kept]
     out.category[:n] = [elements[i].category for i in kept]
     out.attribute[:n] = np.asarray(attribute)[kept]
     out.valid[:n] = True

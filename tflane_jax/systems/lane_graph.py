@@ -76,7 +76,7 @@ class LaneGraphSystem:
                 examples, lanes, _ = predict_examples(config.task, params, dataset, indices)
                 save_examples(
                     folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": lanes},
-                    titles=titles(dataset, indices), ground=source.example.sensor.grid.range,
+                    titles=titles(dataset, indices), ground=source.example.ground,
                     view=source.example.range,
                 )  # fmt: skip
 
@@ -111,7 +111,7 @@ class LaneGraphSystem:
         }
         return save_examples(
             path, examples, lanes, titles=titles(dataset, indices),
-            ground=source.example.sensor.grid.range, view=source.example.range,
+            ground=source.example.ground, view=source.example.range,
         )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from tflane_jax.world.road_area import road_rings
 
 # cv2 fills the texels that a smooth edge passes through too: what it draws is wider by this, texels.
 _GROWTH = 1.4
-_KERB, _GUTTER, _SIDEWALK = 0.22, 0.3, 3.2
+_KERB, _SIDEWALK = 0.22, 3.2
 _GRASS = ((0.27, 0.33, 0.15), (0.33, 0.36, 0.19), (0.4, 0.37, 0.25), (0.22, 0.29, 0.13))
 _PAVING = ((0.55, 0.53, 0.5), (0.5, 0.5, 0.5), (0.58, 0.53, 0.47))
 # Sizes of blotches and grain of the ground and of the places from which paint has gone, metres; what one standard
@@ -127,13 +127,12 @@ def draw_ground(
     _wear_asphalt(rng, image, vector_map, window, asphalt, dirt)
     if not road:
         _pave_lanes(image, vector_map, window, asphalt)
-    stroke(kerbs, 2.0 * _GUTTER, 0.85 * asphalt, cv2.LINE_8)
     stroke(kerbs, _KERB, np.array([0.66, 0.65, 0.62]), cv2.LINE_AA)
     _texture(image, window, dirt)
     _add_paint(image, paint, window)
     if wet:
         cv2.convertScaleAbs(image, image, 1.0 - 0.3 * wet)
-    pyramid = [image]
+    pyramid: list[np.ndarray] = [image]
     while len(pyramid) < levels and min(pyramid[-1].shape[:2]) > 4:
         h, w = pyramid[-1].shape[:2]
         pyramid.append(cv2.resize(pyramid[-1], (-(-w // 2), -(-h // 2)), interpolation=cv2.INTER_AREA))

@@ -203,11 +203,12 @@ def _trees(
             middle = 0.7 * radius if bush else 2.3 + radius * 0.8 + 1.0 * look[2]
             if not bush:
                 trunk = Solid()
-                box(trunk, np.array([x, y]), 3.0 * look[3], (0.3, 0.26), (0.0, middle), _BARK)
+                box(trunk, np.array([x, y]), 3.0 * look[3], (0.3, 0.26), (0.0, middle - 0.5 * radius), _BARK)
                 trunks.append(trunk)
-                boxes.append((x, y, 0.3, 0.26, 3.0 * look[3], 0.0, middle - 0.9 * radius))
+                boxes.append((x, y, 0.3, 0.26, 3.0 * look[3], 0.0, middle - 0.5 * radius))
                 crowns.append((x, y, middle, radius))
-            boxes.append((x, y, 1.6 * radius, 1.6 * radius, 0.0, max(middle - 0.9 * radius, 0.0), middle + radius))
+            low = 0.0 if bush else middle - 0.5 * radius
+            boxes.append((x, y, 1.6 * radius, 1.6 * radius, 0.0, low, middle + radius))
             trunks.append(Solid())
             tint = green * (0.8 + 0.4 * look[4]) + [0.04 * look[5], 0.0, 0.0]
             # Dark leaves low and far, bright ones high and near: later ones are drawn over earlier ones.

@@ -47,6 +47,7 @@ _LARGE = 0.25
 # Bodies farther from the vehicle than this are not drawn, metres.
 _HORIZON = 130.0
 _SHADE_TEXEL = 0.25
+_MOST_WORN = 0.88
 # Poses of a walker's legs.
 _STEPS = 8
 # What a front-view picture of width 640 is to the rain and the lens.
@@ -180,7 +181,8 @@ def _set_stage(log: Log, config: CameraRigConfig) -> _Stage:
     weather = log_weather(
         _stream(log, Stream.WEATHER), config.weather, weather=log.weather, severity=config.severity
     )
-    wear = min(log.paint_wear * config.severity, 1.0)
+    # However worn, some paint is left in the pores of the asphalt.
+    wear = min(log.paint_wear * config.severity, 1.0) * _MOST_WORN
     paint = paint_of(_stream(log, Stream.PAINT), log.map, paint_wear=wear, log_seed=log.seed)
     scenery = draw_scenery(_stream(log, Stream.SCENERY), log.map, weather.night)
     places = np.stack([keyframe.global_from_ego[:2, 3] for keyframe in log.keyframes])

@@ -13,7 +13,10 @@ from tests.golden import (
     load_module_case,
     named_gradients,
 )
+from tflane_jax.convert.toponet import relationship_params, scene_graph_params
 from tflane_jax.layers.graph import (
+    ElementGraphConvolution,
+    ElementNodes,
     LaneGraphConvolution,
     Mlp,
     RelationshipHead,
@@ -40,24 +43,53 @@ def test_graph_convolution_matches_the_reference(path):
     assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
 
 
-def relationship_params(torch_params):
-    """Map the reference's names: the first pair layer is split into the halves that act on each side."""
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_lcte_gcn*"), ids=case_id)
+def test_element_messages_match_the_reference(path):
+    case = load_module_case(path)
+    module = ElementGraphConvolution(case.params["weight"].shape[-1], case.meta["config"]["edge_weight"])
 
-    def linear(name):
-        return {"kernel": torch_params[f"{name}.weight"].T, "bias": torch_params[f"{name}.bias"]}
+    def outputs(torch_params, arrays):
+        def one(*nodes):
+            return module.apply({"params": {"kernel": torch_params["weight"]}}, ElementNodes(*nodes))
 
-    first = linear("classifier.layers.0")
-    half = first["kernel"].shape[0] // 2
-    sides = {
-        f"mlp_{side}": {f"linear_{i}": linear(f"MLP_o{number}.layers.{i}") for i in range(3)}
-        for number, side in ((1, "first"), (2, "second"))
-    }
-    return sides | {
-        "pair_first": {"kernel": first["kernel"][:half], "bias": first["bias"]},
-        "pair_second": {"kernel": first["kernel"][half:]},
-        "pair_hidden": linear("classifier.layers.1"),
-        "pair_out": linear("classifier.layers.2"),
-    }
+        return {"output": jax.vmap(one)(arrays["te_query"], arrays["te_cls_scores"], arrays["lcte_adj"])}
+
+    check(case, outputs)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_ffn_sgnn*"), ids=case_id)
+def test_scene_graph_matches_the_reference(path):
+    case = load_module_case(path)
+    sizes = case.meta["config"]
+    module = SceneGraphFeedForward(case.inputs["lc_query"].shape[-1], sizes["ffn"], sizes["edge_weight"])
+
+    def outputs(torch_params, arrays):
+        params = scene_graph_params(torch_params)
+
+        def one(x, adjacency, *nodes):
+            return module.apply({"params": params}, x, adjacency, ElementNodes(*nodes))
+
+        # The reference puts the batch of lanes second.
+        names = ("lc_query", "lclc_adj", "te_query", "te_cls_scores", "lcte_adj")
+        axes = (1, 0, 0, 0, 0)
+        return {"output": jax.vmap(one, in_axes=axes, out_axes=1)(*(arrays[name] for name in names))}
+
+    check(case, outputs)
+
+
+def check(case, outputs):
+    """Compare outputs and gradients of a function (torch params, inputs) -> outputs by name with the reference's."""
+
+    def scalar(torch_params, arrays):
+        out = outputs(torch_params, arrays)
+        return sum((out[name] * weight).sum() for name, weight in case.weights.items()), out
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (_, out), (by_param, by_input) = step(case.params, case.inputs)
+    assert_outputs_close(out, without_scalar(case.outputs))
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
 
 
 @pytest.mark.golden

@@ -1,16 +1,18 @@
 """Matching costs and the focal loss against the reference's numbers."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-from tests.golden import case_id, golden_modules, load_module_case
+from tests.golden import assert_gradients_close, case_id, golden_modules, load_module_case
 from tflane_jax.layers.positions import inverse_sigmoid
-from tflane_jax.losses.costs import focal_cost, pairwise_l1
+from tflane_jax.losses.costs import focal_cost, generalised_iou, pairwise_l1
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, matching_cost
+from tflane_jax.losses.traffic_elements import ElementLossConfig, element_cost
 from tflane_jax.matching import match
-from tflane_jax.scene import LaneGraph, LanePrediction
+from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
 
 
 @pytest.mark.golden
@@ -23,6 +25,41 @@ def test_focal_cost_and_inverse_sigmoid(path):
     np.testing.assert_allclose(
         inverse_sigmoid(jnp.asarray(case.inputs["inv_sigmoid_x"])), case.outputs["inv_sigmoid"], rtol=2e-5, atol=2e-5
     )
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("mmdet_match_costs*"), ids=case_id)
+def test_box_costs(path):
+    case = load_module_case(path)
+    boxes, truth = case.inputs["box_pred_cxcywh"], case.inputs["gt_boxes_xyxy"].reshape(-1, 2, 2)
+    corners = np.stack([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], 1)
+    iou = jax.jit(lambda a, b: generalised_iou(a[:, None], b[None]))(corners, truth)
+    np.testing.assert_allclose(-iou, case.outputs["giou"], rtol=2e-5, atol=2e-5)
+    # Elements on an image of one pixel: boxes are shares of it, and the two other terms are switched off.
+    count = len(truth)
+    prediction = ElementPrediction(corners[None], np.zeros((1, len(boxes), 13), np.float32), np.zeros((1, 1, 1)))
+    elements = TrafficElements.empty(count, 1).replace(box=truth, valid=np.ones(count, bool))
+    config = ElementLossConfig(class_weight=0.0, iou_weight=0.0)
+    cost = jax.jit(element_cost, static_argnums=3)(prediction, elements, np.ones(2, np.int32), config)
+    np.testing.assert_allclose(cost[0], case.outputs["bbox_l1_xywh"], rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("mmdet_losses*"), ids=case_id)
+def test_overlap_and_its_gradient(path):
+    case = load_module_case(path)
+    boxes, truth = (case.inputs[name].reshape(-1, 2, 2) for name in ("box_pred", "box_target"))
+    np.testing.assert_allclose(1.0 - generalised_iou(boxes, truth), case.outputs["giou_none"], rtol=2e-5, atol=2e-5)
+    np.testing.assert_allclose((1.0 - generalised_iou(boxes, truth)).mean(), case.outputs["giou_mean"], rtol=2e-5)
+
+    def scalar(boxes):
+        """Sum what the fixture sums of the boxes: L1 of weight 2.5 and overlap, plain and weighted; 3 positives."""
+        apart, error = 1.0 - generalised_iou(boxes, truth), 2.5 * jnp.abs(boxes - truth).sum((1, 2))
+        weighted = (case.inputs["weight"] * (apart + error)).sum() / 3.0
+        return (case.weights["giou_none"] * apart).sum() + apart.mean() + error.mean() / 4 + weighted
+
+    gradient = jax.jit(jax.grad(scalar))(boxes).reshape(-1, 4)
+    assert_gradients_close({"in/box_pred": gradient}, {"in/box_pred": case.gradients["in/box_pred"]})
 
 
 @pytest.mark.golden

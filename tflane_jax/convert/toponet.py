@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tflane_jax.convert.renaming import Rule, below, renamed_params
+from tflane_jax.convert.renaming import Rule, below, convert, renamed_params
 from tflane_jax.geometry.namespace import AnyArray
 
 _DEFORMABLE = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
@@ -111,3 +111,13 @@ def relationship_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
 def element_decoder_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
     """Return the parameters of `ElementDecoder` from those of CustomDeformableDETRHead."""
     return renamed_params(state, ELEMENTS)
+
+
+def toponet_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
+    """Return the parameters of `TopoNet.decode` from those of TopoNetHead."""
+    return convert(state, TOPONET_LANES, "TopoNet's lane head").variables["params"]
+
+
+def baseline_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
+    """Return the parameters of `BevFormerDetr.decode`, less relationship heads, from those of LCDeformableDETRHead."""
+    return convert(state, BASELINE_LANES, "the baseline's lane head").variables["params"]

@@ -102,7 +102,7 @@ class TopoNet(nn.Module):
     ) -> Prediction:
         """Return lanes and topology of every decoder layer, from BEV features, traffic elements and traffic flow.
 
-        Stores the queries of every layer as the intermediate `queries` where a caller asks for it.
+        Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
         """
         config = self.config.decoder
         queries, position, reference = LaneQueries(config, name="queries")()
@@ -126,7 +126,7 @@ class TopoNet(nn.Module):
                 nodes = ElementNodes(seen, elements.logits[i], governs)
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
             queries = layer(queries, where, reference, bev, adjacency, nodes, deterministic=deterministic)
-            self.sow("intermediates", "queries", queries)
+            self.sow("intermediates", "layer_queries", queries)
             output = LaneHeads(config, name=f"heads_{i}")(queries, reference, bev, seen)
             outputs.append(output)
             reference = next_reference(reference, output.unit, config)

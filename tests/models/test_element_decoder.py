@@ -1,0 +1,119 @@
+"""The traffic-element head against the reference's numbers, and what must not matter to it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tflane_jax.convert.toponet import element_decoder_params
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig, element_losses
+from tflane_jax.losses.traffic_elements import element_cost
+from tflane_jax.matching import match
+from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig
+from tflane_jax.scene import ElementPrediction, TrafficElements, stack_examples
+
+
+def reference_config(sizes):
+    return ElementDecoderConfig(
+        dim=sizes["C"], heads=sizes["heads"], levels=sizes["levels"], encoder_layers=sizes["enc"], layers=sizes["dec"],
+        queries=sizes["num_query"], sampling_points=sizes["points"], hidden=sizes["ffn"],
+    )  # fmt: skip
+
+
+def reference_truth(case, image, capacity=4):
+    """Return the elements of one image of the fixture, padded."""
+    boxes, labels = case.inputs[f"gt_bboxes.{image}"], case.inputs[f"gt_labels.{image}"]
+    elements, count = TrafficElements.empty(capacity, 1), len(boxes)
+    elements.box[:count], elements.attribute[:count] = boxes.reshape(-1, 2, 2), labels
+    elements.box[count:], elements.valid[:count] = np.nan, True
+    return elements
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_te_head*"), ids=case_id)
+def test_matches_the_reference(path):
+    case = load_module_case(path)
+    config = reference_config(case.meta["config"])
+    padded = tuple(int(n) for n in case.inputs["batch_hw"])
+    sizes = case.inputs["img_hw"][:, ::-1].astype(np.int32)
+    elements = stack_examples([reference_truth(case, image) for image in range(len(sizes))])
+    weights = LaneGraphLossConfig()
+    features = {name: case.inputs[name] for name in sorted(case.inputs) if name.startswith("feat")}
+
+    def outputs(torch_params, features):
+        params = element_decoder_params(torch_params)
+
+        def one(size, *levels):
+            levels = [level.transpose(1, 2, 0) for level in levels]
+            return ElementDecoder(config).apply({"params": params}, levels, size, padded)
+
+        found = jax.vmap(one)(sizes, *features.values())
+        prediction = ElementPrediction(found.box, found.logits, jnp.zeros((*found.box.shape[:3], 1)))
+        clear = elements.replace(box=jnp.where(elements.valid[..., None, None], elements.box, 0.0))
+        cost = jax.vmap(lambda p, e, s: element_cost(p, e, s, weights.elements))(prediction, clear, sizes)
+        terms = element_losses(prediction, match(cost, elements.valid[:, None]), clear, sizes, weights)
+        box = found.box / sizes[:, None, None, None].astype(np.float32)
+        box = jnp.concatenate([box.mean(-2), box[..., 1, :] - box[..., 0, :]], -1)
+        # The reference puts the layers before the batch.
+        out = {"all_cls_scores": found.logits, "all_bbox_preds": box, "history_states": found.queries}
+        out = {name: value.swapaxes(0, 1) for name, value in out.items()}
+        for name, term in {"loss_cls": "class", "loss_bbox": "box", "loss_iou": "iou"}.items():
+            out |= {f"loss.{name}": terms[f"element_{term}"][-1], f"loss.d0.{name}": terms[f"element_{term}"][0]}
+        return out, cost
+
+    def scalar(torch_params, features):
+        out, cost = outputs(torch_params, features)
+        return sum((out[name] * weight).sum() for name, weight in case.weights.items()), (out, cost)
+
+    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (_, (out, cost)), (by_param, by_input) = step(case.params, features)
+    assert_outputs_close(out, {name: case.outputs[name] for name in case.weights})
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+    for name in (name for name in case.outputs if name.startswith("cost.")):
+        layer, image = (int(part) for part in name.split(".")[1:])
+        expected = case.outputs[name]
+        np.testing.assert_allclose(cost[image, layer, :, : expected.shape[1]], expected, rtol=1e-4, atol=1e-4)
+        count = expected.shape[1]
+        query = match(cost[image, layer], elements.valid[image]).query[:count]
+        by_query = np.argsort(query)
+        np.testing.assert_array_equal(np.asarray(query)[by_query], case.outputs[f"pos_inds.{layer}.{image}"])
+        np.testing.assert_array_equal(by_query, case.outputs[f"pos_assigned_gt_inds.{layer}.{image}"])
+
+
+def test_what_shows_padding_changes_nothing():
+    config = ElementDecoderConfig(dim=16, heads=2, levels=2, encoder_layers=1, layers=2, queries=3, hidden=16)
+    rng = np.random.default_rng(0)
+    levels = [rng.normal(size=(h, w, 16)).astype(np.float32) for h, w in ((8, 12), (4, 6))]
+    # An image of 64 x 40 in an array of 96 x 64 pixels covers 5 rows and 8 columns of the first level.
+    size = np.array([64, 40], np.int32)
+    module = ElementDecoder(config)
+    params = jax.jit(lambda key: module.init(key, levels, size, (64, 96)))(jax.random.key(0))
+    # Off the start, where boxes do not depend on anything.
+    keys = jax.random.split(jax.random.key(1), len(jax.tree.leaves(params)))
+    leaves, tree = jax.tree.flatten(params)
+    noisy = [leaf + 0.1 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
+    params = jax.tree.unflatten(tree, noisy)
+
+    @jax.jit
+    def step(params, levels):
+        def scalar(params, levels):
+            out = module.apply(params, levels, size, (64, 96))
+            return (out.box**2).sum() * 1e-3 + (out.logits**2).sum(), out
+
+        return jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True)(params, levels)
+
+    dirty = [level.copy() for level in levels]
+    dirty[0][5:], dirty[0][:, 8:], dirty[1][3:], dirty[1][:, 4:] = (np.nan,) * 4
+    clean, soiled = step(params, levels), step(params, dirty)
+    jax.tree.map(np.testing.assert_array_equal, clean, soiled)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(clean))
+    other = [levels[0] + 0.5, levels[1]]
+    assert not np.array_equal(clean[0][1].box, step(params, other)[0][1].box)

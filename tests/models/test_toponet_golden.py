@@ -1,0 +1,93 @@
+"""TopoNet's lane head (decoder, scene graph, heads, matching, losses) against the reference's numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.models.golden_lanes import (
+    bev_maps,
+    check,
+    check_matching,
+    decoder_config,
+    layers_first,
+    queries_of,
+    truth,
+)
+from tflane_jax.convert.toponet import toponet_lane_params
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig, element_lane_loss, lane_losses, matching_cost
+from tflane_jax.matching import Assignment, match
+from tflane_jax.models.element_decoder import ElementOutput
+from tflane_jax.models.toponet import TopoNet, TopoNetConfig
+from tflane_jax.scene import TrafficElements, stack_examples
+
+
+def element_truth(case, lanes, capacity=3):
+    """Return the fixture's lane-element relations, and the assignment of elements that it was made with."""
+    layers, images = case.inputs["te_feats"].shape[:2]
+    elements, query = [], np.zeros((images, layers, capacity), np.int32)
+    for image in range(images):
+        relation, one = case.inputs[f"gt_lcte.{image}"], TrafficElements.empty(capacity, lanes)
+        one.lane[: len(relation), : relation.shape[1]], one.valid[: relation.shape[1]] = relation, True
+        elements.append(one)
+        for layer in range(layers):
+            gts = case.inputs[f"te_pos_assigned_gt_inds.{layer}.{image}"]
+            query[image, layer, gts] = case.inputs[f"te_pos_inds.{layer}.{image}"]
+    elements = stack_examples(elements)
+    return elements, Assignment(query, np.broadcast_to(elements.valid[:, None], query.shape))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("toponet_head*"), ids=case_id)
+def test_lane_head_matches_the_reference(path):
+    case = load_module_case(path)
+    sizes, weights = case.meta["config"], LaneGraphLossConfig()
+    decoder = decoder_config(sizes, sizes["n_points"])
+    module = TopoNet(TopoNetConfig(decoder=decoder))
+    lanes = truth(case, sizes["n_points"])
+    elements, found = element_truth(case, lanes.valid.shape[1])
+
+    def outputs(torch_params, inputs):
+        params = toponet_lane_params(torch_params)
+
+        def one(bev, queries, logits):
+            # Boxes play no part here.
+            seen = ElementOutput(queries, jnp.zeros((*queries.shape[:2], 2, 2)), logits)
+            prediction, state = module.apply(
+                {"params": params}, bev, seen, method=TopoNet.decode, mutable=["intermediates"]
+            )
+            return prediction, queries_of(state)
+
+        logits = case.inputs["te_cls_scores"]
+        prediction, queries = jax.vmap(one, in_axes=(0, 1, 1))(
+            bev_maps(case, inputs["bev_feats"]), inputs["te_feats"], logits
+        )
+        cost = jax.vmap(lambda p, g: matching_cost(p, g, weights))(prediction.lanes, lanes)
+        assignment = match(cost, lanes.valid[:, None])
+        terms = lane_losses(prediction.lanes, assignment, lanes, weights)
+        terms["lcte"] = element_lane_loss(prediction.elements, assignment, found, lanes, elements, weights)
+        out = layers_first({
+            "all_cls_scores": prediction.lanes.logits,
+            "all_lanes_preds": prediction.lanes.points,
+            "all_lclc_preds": prediction.lanes.successor_logits[..., None],
+            "all_lcte_preds": prediction.elements.lane_logits[..., None],
+            "history_states": queries,
+        })
+        names = {"lane_cls": "class", "lane_reg": "points", "lclc_rel": "successor", "lcte_rel": "lcte"}
+        for name, term in names.items():
+            out |= {f"loss.loss_{name}": terms[term][1], f"loss.d0.loss_{name}": terms[term][0]}
+        return out, (cost, assignment, prediction)
+
+    cost, assignment, prediction = check(case, outputs, {name: case.inputs[name] for name in ("bev_feats", "te_feats")})
+    check_matching(case, cost, assignment)
+    for image in range(len(lanes.valid)):
+        answer = jax.tree.map(lambda leaf, i=image: leaf[i, -1], prediction)
+        decoded = {
+            "lanes": answer.lanes.points.reshape(sizes["num_query"], -1),
+            "scores": answer.lanes.scores,
+            "lclc": jax.nn.sigmoid(answer.lanes.successor_logits),
+            "lcte": jax.nn.sigmoid(answer.elements.lane_logits),
+        }
+        expected = {name: case.outputs[f"decoded.{image}.{name}"] for name in decoded}
+        assert_outputs_close(decoded, expected, tolerance=5e-5)

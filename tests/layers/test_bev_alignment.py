@@ -1,0 +1,64 @@
+"""The previous frame's features in the present frame: the reference's rotation, and the warp."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import case_id, golden_modules, load_module_case
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry.poses import yaw_pose
+from tflane_jax.layers.bev_alignment import ego_shift, rotate_nearest, vehicle_center, warp
+
+GRID = BevGrid(PerceptionRange((-12.0, 12.0), (-6.0, 6.0)), 24, 48)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("rotate_nearest*"), ids=case_id)
+def test_rotation_matches_torchvision(path):
+    case = load_module_case(path)
+    turn = jax.jit(rotate_nearest, static_argnums=2)
+    for i in range(case.meta["cases"]):
+        image, angle = case.inputs[f"{i}.img"].transpose(1, 2, 0), np.deg2rad(case.inputs[f"{i}.angle"])
+        center = tuple(float(x) for x in case.inputs[f"{i}.center_xy"])
+        got = turn(image, angle, center).transpose(2, 0, 1)
+        np.testing.assert_array_equal(got, case.outputs[f"{i}.rotated"], err_msg=str(i))
+
+
+def bump(x, y):
+    """Return a smooth feature of two channels with its middle at (x, y) metres."""
+    columns, rows = (np.array(axis) for axis in GRID.centers())
+    distance = (columns[None] - x) ** 2 + (rows[:, None] - y) ** 2
+    return np.stack([np.exp(-distance / 8.0), 2 * np.exp(-distance / 8.0)], -1).astype(np.float32)
+
+
+@pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (2.0, 0.5, 0.0), (0.0, 0.0, 0.4), (1.5, -0.7, -0.6)])
+def test_what_stands_still_stays_at_its_place_in_the_world(motion):
+    """A bump at p in the present frame was at pose(p) in the previous one; both alignments must bring it back."""
+    pose = yaw_pose(*(np.float32(v) for v in motion)).astype(np.float32)
+    now = np.array([3.0, 1.0, 0.0, 1.0])
+    before = bump(*(pose @ now)[:2])
+    expected = bump(3.0, 1.0)
+    warped = np.asarray(warp(jnp.asarray(before), GRID, jnp.asarray(pose)))
+    near = expected[..., 0] > 0.4
+    np.testing.assert_allclose(warped[near], expected[near], atol=0.03)
+    if motion == (0.0, 0.0, 0.0):
+        np.testing.assert_allclose(warped, expected, atol=2e-6)
+    # The reference's way: turned to the nearest cell, then looked at with a shift.
+    turned = np.asarray(rotate_nearest(jnp.asarray(before), jnp.float32(motion[2]), vehicle_center(GRID)))
+    peak = np.unravel_index(turned[..., 0].argmax(), turned.shape[:2])
+    there = np.array([GRID.centers()[0][peak[1]], GRID.centers()[1][peak[0]]])
+    shift = np.asarray(ego_shift(GRID, jnp.asarray(pose))) * GRID.range.size(2)
+    np.testing.assert_allclose(there, now[:2] + shift, atol=0.5)
+
+
+def test_beyond_the_previous_grid_there_is_nothing():
+    pose = jnp.asarray(yaw_pose(np.float32(30.0), np.float32(0), np.float32(0)), jnp.float32)
+    assert not np.asarray(warp(jnp.ones((24, 48, 1)), GRID, pose)).any()
+    half = jnp.asarray(yaw_pose(np.float32(12.0), np.float32(0), np.float32(0)), jnp.float32)
+    np.testing.assert_array_equal(np.asarray(warp(jnp.ones((24, 48, 1)), GRID, half))[:, 24:], 0)
+
+
+def test_the_vehicle_need_not_stand_in_the_middle():
+    assert vehicle_center(GRID) == (24.0, 12.0)
+    assert vehicle_center(BevGrid(PerceptionRange((-10.0, 30.0), (-5.0, 5.0)), 10, 40)) == (10.0, 5.0)

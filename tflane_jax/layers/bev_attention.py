@@ -1,0 +1,150 @@
+"""BEVFormer's two attentions of bird's-eye-view queries: to the previous frame and to the cameras.
+
+Reference: Li et al. 2022, sections 3.3 and 3.4; specs/modules.md section 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from tflane_jax.layers.deformable import cell_units, deformable_attention, offsets_and_logits
+
+_INIT = nn.initializers.xavier_uniform()
+
+
+class TemporalSelfAttention(nn.Module):
+    """Queries look at the previous BEV features and at the present ones.
+
+    Attributes:
+        dim: channels in and out.
+        heads, points: sampling points per head and frame.
+        value_projections: how often the value is projected; OpenLane-V2's baseline and SMERF do it twice.
+        dtype: of the projections.
+    """
+
+    dim: int
+    heads: int = 8
+    points: int = 4
+    value_projections: int = 1
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(
+        self,
+        query: Float[Array, "q c"],
+        history: Float[Array, "q c"],
+        current: Float[Array, "q c"],
+        shape: tuple[int, int],
+        reference: Float[Array, "q 2 2"],
+    ) -> Float[Array, "q c"]:
+        """Return the attended features, without residual.
+
+        Args:
+            query: content plus position.
+            history: features of the previous frame; the present ones where there is none.
+            current: features of this frame, without position.
+            shape: (h, w) of the grid, Q = h w.
+            reference: (x, y) in [0, 1] of each query in the previous and in the present grid.
+        """
+        heads, points = self.heads, self.points
+        frames = jnp.stack([history, current])
+        project = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")
+        value = frames
+        for _ in range(self.value_projections):
+            value = project(value)
+        # The two frames are two levels of one value, each with its own softmax, and each half of the answer.
+        offsets, logits = offsets_and_logits(jnp.concatenate([history, query], -1), heads, 2, points, self.dtype)
+        weights = 0.5 * jax.nn.softmax(logits, -1)
+        shapes = (shape, shape)
+        locations = reference[:, None, :, None] + offsets * cell_units(shapes)[None, None, :, None]
+        value = value.reshape(-1, heads, self.dim // heads).astype(jnp.float32)
+        attended = deformable_attention(value, shapes, locations, weights)
+        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(attended)
+
+
+class SpatialCrossAttention(nn.Module):
+    """Queries look into the cameras that see their pillars.
+
+    Attributes:
+        dim: channels in and out.
+        heads, points: sampling points per head and level, shared out among the anchors of a pillar.
+        capacity: queries that one camera can serve; None lets every camera serve all queries, which gives the same
+            where the capacity suffices and costs as many times more as cameras see a query in vain. Queries beyond it
+            (the last of the grid) do without that camera; their number is sown as the intermediate `overflow`.
+        dtype: of the projections.
+    """
+
+    dim: int
+    heads: int = 8
+    points: int = 8
+    capacity: int | None = None
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(
+        self,
+        query: Float[Array, "q c"],
+        features: Float[Array, "v hw c"],
+        shapes: Sequence[tuple[int, int]],
+        reference: Float[Array, "v q z 2"],
+        visible: Bool[Array, "v q z"],
+    ) -> Float[Array, "q c"]:
+        """Return the mean of what the cameras that see a query show, without residual.
+
+        Args:
+            query: content.
+            features: of each camera, levels concatenated; finite.
+            shapes: (h, w) of each level.
+            reference: (x, y) of a query's Z anchors in each image, in [0, 1].
+            visible: anchors inside the image.
+        """
+        heads, (cameras, queries) = self.heads, reference.shape[:2]
+        value = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")(features)
+        value = value.reshape(cameras, -1, heads, self.dim // heads).astype(jnp.float32)
+        offsets, logits = offsets_and_logits(query, heads, len(shapes), self.points, self.dtype)
+        weights = jax.nn.softmax(logits, (-2, -1))
+        offsets = offsets * cell_units(shapes)[None, None, :, None]
+        seen = visible.any(-1)
+        if self.capacity is None or self.capacity >= queries:
+            around = jax.vmap(_around_anchors, in_axes=(0, None))(reference, offsets)
+            # Unseen queries take nothing, so that nothing but zeros flows back through them.
+            taken = jnp.where(seen[:, :, None, None, None], weights[None], 0.0)
+            total = deformable_attention(value, shapes, around, taken).sum(0)
+        else:
+            index = first_seen(seen, self.capacity)
+            self.sow("intermediates", "overflow", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
+            pick = jnp.minimum(index, queries - 1)
+            by_camera = jnp.take_along_axis(reference, pick[:, :, None, None], 1)
+            around = jax.vmap(_around_anchors)(by_camera, offsets[pick])
+            taken = jnp.where((index < queries)[:, :, None, None, None], weights[pick], 0.0)
+            found = deformable_attention(value, shapes, around, taken)
+            total = jnp.zeros((queries, self.dim), found.dtype)
+            total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
+        mean = total / jnp.maximum(seen.sum(0), 1)[:, None]
+        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
+
+
+def first_seen(seen: Bool[Array, "v q"], capacity: int) -> Int[Array, "v capacity"]:
+    """Return the indices of the first queries that each camera sees, ascending; Q where it sees no more."""
+    cameras, queries = seen.shape
+    place = jnp.cumsum(seen, 1) - 1
+    place = jnp.where(seen, place, capacity)
+    camera = jnp.broadcast_to(jnp.arange(cameras)[:, None], place.shape)
+    query = jnp.broadcast_to(jnp.arange(queries, dtype=jnp.int32)[None], place.shape)
+    return jnp.full((cameras, capacity), queries, jnp.int32).at[camera, place].set(query, mode="drop")
+
+
+def _around_anchors(
+    reference: Float[Array, "q z 2"], offsets: Float[Array, "q heads levels p 2"]
+) -> Float[Array, "q heads levels p 2"]:
+    """Return locations: point p of a head belongs to anchor p modulo Z."""
+    *lead, points, _ = offsets.shape
+    anchors = reference.shape[1]
+    split = offsets.reshape(*lead, points // anchors, anchors, 2)
+    return (reference[:, None, None, None] + split).reshape(offsets.shape)

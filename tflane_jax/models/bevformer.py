@@ -1,0 +1,200 @@
+"""BEVFormer: from feature maps of several cameras, and the previous frame's result, to bird's-eye-view features.
+
+Reference: Li et al. 2022; specs/modules.md section 4 (the BEV constructer of TopoNet). One frame is a module, time an
+explicit carry: `encode_sequence` scans over the frames, `step` makes one of them, with equal results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.pillars import pillar_points, project_pillars
+from tflane_jax.geometry.poses import pose_yaw
+from tflane_jax.layers.bev_alignment import ego_shift, rotate_nearest, vehicle_center, warp
+from tflane_jax.layers.positions import LearnedImageEncoding
+from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory
+from tflane_jax.scene import CameraViews
+
+# Length of the reference's vector of vehicle motion (the "CAN bus").
+MOTION = 18
+
+
+class BevFormer(nn.Module):
+    """The whole encoder of one frame."""
+
+    config: BevFormerConfig
+
+    def __call__(
+        self,
+        features: Sequence[Float[Array, "v h w c"]],
+        cameras: CameraViews,
+        memory: BevMemory | None,
+        previous_from_ego: Float[Array, "4 4"],
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "h w c"]:
+        """Return the BEV features.
+
+        Args:
+            features: levels of the image encoder, finest first.
+            cameras: where the images were taken; the pixels are not looked at.
+            memory: of the previous frame; None and an invalid one are the same.
+            previous_from_ego: pose of this ego frame in the previous one's, looked at where the memory is valid.
+            deterministic: no dropout; with it, the key `dropout` is needed.
+        """
+        config = self.config
+        memory = BevMemory.empty(config) if memory is None else memory
+        # An invalid memory's pose may be anything.
+        pose = jnp.where(memory.valid, previous_from_ego, jnp.eye(4, dtype=previous_from_ego.dtype))
+        history = BevMemory(jnp.where(memory.valid, memory.features, 0.0), memory.valid)
+        history, shift = align(config, history, pose)
+        motion = motion_vector(pose, memory.valid)
+        return self.encode(features, cameras, history, shift, motion, deterministic=deterministic)
+
+    @nn.compact
+    def encode(
+        self,
+        features: Sequence[Float[Array, "v h w c"]],
+        cameras: CameraViews,
+        history: BevMemory,
+        shift: Float[Array, "2"],
+        motion: Float[Array, " m"],
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "h w c"]:
+        """Return the BEV features from a memory that has been aligned (`align`) and a vector of vehicle motion."""
+        config, grid = self.config, self.config.grid
+        if len(features) != config.levels or len(cameras.valid) > config.cameras:
+            raise UserError(
+                f"the BEV encoder is configured for {config.levels} levels of at most {config.cameras} cameras and got "
+                f"{len(features)} levels of {len(cameras.valid)}: change `levels` and `cameras` of BevFormerConfig"
+            )
+        queries = self.param("queries", nn.initializers.normal(1.0), (grid.rows * grid.columns, config.dim))
+        queries = queries + MotionEmbedding(config.dim, name="motion")(motion)[None]
+        learned = LearnedImageEncoding(grid.rows, grid.columns, config.dim // 2, name="position")
+        position = learned(grid.rows, grid.columns).reshape(-1, config.dim)
+
+        embed = nn.initializers.normal(1.0)
+        by_camera = self.param("cameras", embed, (config.cameras, config.dim))[: len(cameras.valid), None]
+        by_level = self.param("levels", embed, (config.levels, config.dim))
+        tokens = [
+            level.reshape(len(level), -1, config.dim) + by_camera + by_level[None, i : i + 1]
+            for i, level in enumerate(features)
+        ]
+        # What an invalid camera shows may be anything.
+        tokens = jnp.where(cameras.valid[:, None, None], jnp.concatenate(tokens, 1), 0.0)
+        shapes = tuple((level.shape[1], level.shape[2]) for level in features)
+        reference, visible = see_pillars(config, cameras)
+        encoder = BevEncoder(config, name="encoder")
+        encoded = encoder(queries, position, tokens, shapes, reference, visible, history, shift, deterministic)
+        return encoded.reshape(grid.rows, grid.columns, config.dim)
+
+
+class MotionEmbedding(nn.Module):
+    """What is added to all queries for the vehicle's motion."""
+
+    dim: int
+
+    @nn.compact
+    def __call__(self, motion: Float[Array, " m"]) -> Float[Array, " c"]:
+        """Return the embedding of the motion vector."""
+        init = nn.initializers.xavier_uniform()
+        x = nn.relu(nn.Dense(self.dim // 2, kernel_init=init, name="hidden")(motion))
+        x = nn.relu(nn.Dense(self.dim, kernel_init=init, name="out")(x))
+        return nn.LayerNorm(epsilon=1e-5, name="norm")(x)
+
+
+def see_pillars(config: BevFormerConfig, cameras: CameraViews) -> tuple[Float[Array, "v q z 2"], Bool[Array, "v q z"]]:
+    """Return where the pillars of all queries lie in each image (shares of its size), and which anchors it shows.
+
+    The features are those of the padded images, so shares of an image become shares of the array that it lies in.
+    """
+    points = config.grid.range.denormalise(pillar_points(config.grid, config.anchors))
+    # Places need all of float32, also where an accelerator multiplies more coarsely by default.
+    with jax.default_matmul_precision("highest"):
+        share, inside = project_pillars(
+            jnp.asarray(points), cameras.intrinsics, cameras.camera_from_ego, jnp.asarray(cameras.size)
+        )
+    height, width = cameras.image.shape[1:3]
+    used = jnp.asarray(cameras.size).astype(share.dtype) / jnp.array([width, height], share.dtype)[None]
+    return share * used[:, None, None], inside & cameras.valid[:, None, None]
+
+
+def seen_queries(config: BevFormerConfig, cameras: CameraViews) -> Int[Array, " v"]:
+    """Return how many queries each camera sees."""
+    return see_pillars(config, cameras)[1].any(-1).sum(-1)
+
+
+def check_capacity(config: BevFormerConfig, cameras: CameraViews) -> None:
+    """Raise UserError where a camera of a typical frame sees more queries than it can serve (on the host)."""
+    most = int(np.max(seen_queries(config, cameras)))
+    if config.capacity is not None and most > config.capacity:
+        raise UserError(
+            f"a camera sees {most} cells of the BEV grid, but `capacity` of BevFormerConfig is {config.capacity}: "
+            f"raise it to {most}, or leave it None"
+        )
+
+
+def align(
+    config: BevFormerConfig, memory: BevMemory, previous_from_ego: Float[Array, "4 4"]
+) -> tuple[BevMemory, Float[Array, "2"]]:
+    """Return the memory in the present frame, and the shift left to the points that temporal attention looks at."""
+    if config.align == "warp":
+        moved = warp(memory.features, config.grid, previous_from_ego)
+        return BevMemory(moved, memory.valid), jnp.zeros(2, moved.dtype)
+    center = config.rotation_center or vehicle_center(config.grid)
+    turned = rotate_nearest(memory.features, pose_yaw(previous_from_ego), center)
+    return BevMemory(turned, memory.valid), ego_shift(config.grid, previous_from_ego)
+
+
+def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]) -> Float[Array, " m"]:
+    """Return the vehicle's motion since the previous frame at the places of the reference's vector, zero without one.
+
+    Metres along the present axes at 0 to 2, radians and degrees turned at 16 and 17. The absolute heading and the
+    fields of the vehicle's bus that the reference holds beside them are left out: a lane does not depend on them.
+    """
+    moved = previous_from_ego[:3, :3].T @ previous_from_ego[:3, 3]
+    yaw = pose_yaw(previous_from_ego)
+    turned = jnp.stack([yaw, jnp.rad2deg(yaw)])
+    motion = jnp.concatenate([moved, jnp.zeros(MOTION - 5, moved.dtype), turned])
+    return jnp.where(valid, motion, 0.0)
+
+
+@struct.dataclass
+class BevFrame:
+    """What the encoder reads of one frame, or of T frames with a leading axis.
+
+    Attributes:
+        features: levels (V, h, w, C).
+        cameras: the views.
+        previous_from_ego: (4, 4).
+        has_previous: () the previous frame belongs to the same sequence.
+    """
+
+    features: Sequence[Float[Array, "v h w c"]]
+    cameras: CameraViews
+    previous_from_ego: Float[Array, "4 4"]
+    has_previous: Bool[Array, ""]
+
+
+def step(model: BevFormer, variables: Any, memory: BevMemory, frame: BevFrame) -> tuple[BevMemory, Array]:
+    """Return the memory for the next frame and the BEV features (h, w, c) of this one."""
+    memory = memory.replace(valid=memory.valid & frame.has_previous)  # pyright: ignore[reportAttributeAccessIssue]
+    bev: Any = model.apply(variables, list(frame.features), frame.cameras, memory, frame.previous_from_ego)
+    return BevMemory(bev, jnp.ones((), bool)), bev
+
+
+def encode_sequence(model: BevFormer, variables: Any, frames: BevFrame) -> Float[Array, "t h w c"]:
+    """Return the BEV features of T frames, each of which knows the one before it."""
+    start = BevMemory.empty(model.config)
+    return lax.scan(lambda memory, frame: step(model, variables, memory, frame), start, frames)[1]

@@ -126,9 +126,14 @@ def _example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
 
 def _split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
     parser.add_argument("--split", choices=("train", "val", "test"), default=split, help=f"default {split}")
-    parser.add_argument("--data", choices=("procedural", "argoverse2", "front-views", "tusimple"),
+    _source_arguments(parser)
+
+
+def _source_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", choices=("procedural", "argoverse2", "openlane-v2", "front-views", "tusimple"),
                         help="take other data than the configuration's")  # fmt: skip
-    parser.add_argument("--root", metavar="PATH", help="folder of --data argoverse2 (a log, or logs) or tusimple")
+    parser.add_argument("--root", metavar="PATH",
+                        help="folder of --data argoverse2 (a log, or logs), openlane-v2 or tusimple")  # fmt: skip
     parser.add_argument("--openlane", metavar="PATH", help="folder of the OpenLane-V2 split files, if there is one")
 
 
@@ -180,8 +185,20 @@ def _data(commands) -> None:
     show.add_argument("--count", type=int, default=8, help="examples (default 8)")
     show.add_argument("--out", metavar="FILE", type=Path, default=Path("samples.png"),
                       help="picture (default samples.png)")  # fmt: skip
-    check = _command(inner, "check", "say what a folder of Argoverse 2 logs lacks", module="data", function="check")
-    check.add_argument("root", metavar="PATH", help="a log or a folder of logs")
+    check = _command(inner, "check", "say what a dataset's folder lacks", module="data", function="check")
+    check.add_argument("root", metavar="PATH", help="a log, a folder of logs, or OpenLane-V2's folder")
+    check.add_argument("--format", choices=("argoverse2", "openlane-v2"), default="argoverse2",
+                       help="of the dataset (default argoverse2)")  # fmt: skip
+    export = _command(inner, "export", "write a dataset with cameras in another format", module="data_export",
+                      function="run", epilog=_OVERRIDES)  # fmt: skip
+    export.add_argument("--format", choices=("openlane-v2",), default="openlane-v2", help="default openlane-v2")
+    export.add_argument("--config", metavar="FILE[:NAME]", help="config file whose data to write", required=True)
+    _source_arguments(export)
+    export.add_argument("--splits", choices=("train", "val", "test"), nargs="+", default=["train", "val"],
+                        help="default train val")  # fmt: skip
+    export.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg as official, png without loss")
+    export.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    export.set_defaults(takes_overrides=True)
     overlap = _command(inner, "overlap", "say whether two splits show the same places", module="data",
                        function="overlap_of_splits")  # fmt: skip
     overlap.add_argument("train", metavar="TRAIN", type=Path,

@@ -22,8 +22,13 @@ from tflane_jax.datasets.argoverse2 import Argoverse2Config, Keyframes
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.front_views import FrontViewConfig
+from tflane_jax.datasets.openlane_frames import SubsetName
+from tflane_jax.datasets.openlane_v2 import OPENLANE_V2_SIZES, Flavour, OpenLaneV2Config
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.lane_graph import LaneGraphTask
@@ -32,7 +37,7 @@ from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.simulate import WorldConfig
 
 Split = Literal["train", "val", "test"]
-LaneGraphSource = ProceduralConfig | Argoverse2Config
+LaneGraphSource = ProceduralConfig | Argoverse2Config | OpenLaneV2Config
 LaneCurveSource = FrontViewConfig | TuSimpleConfig
 Source = LaneGraphSource | LaneCurveSource
 T = TypeVar("T")
@@ -80,6 +85,38 @@ class LogData:
     def source(self, split: Split) -> Argoverse2Config:
         """Return the dataset of a split."""
         return Argoverse2Config(getattr(self, split), self.keyframes, self.openlane, self.example)
+
+
+@dataclass(frozen=True)
+class OpenLaneV2Data:
+    """OpenLane-V2, or anything in its layout, read from disk while training.
+
+    Attributes:
+        root: folder of the dataset.
+        train, val, test: which split stands for each; the official test split has no annotations.
+        subset, flavour, data_dict, image, example: see `OpenLaneV2Config`.
+        augmentation: of the colours of training images, or None.
+        loading: workers.
+    """
+
+    root: Path
+    train: Split = "train"
+    val: Split = "val"
+    test: Split = "val"
+    subset: SubsetName = "A"
+    flavour: Flavour = "centerline"
+    data_dict: str | None = None
+    image: ImageConfig = TOPONET_SUBSET_A
+    example: ExampleConfig = OPENLANE_V2_SIZES
+    augmentation: PhotometricConfig | None = PhotometricConfig()
+    loading: StreamingConfig = StreamingConfig()
+
+    def source(self, split: Split) -> OpenLaneV2Config:
+        """Return the dataset of a split."""
+        return OpenLaneV2Config(
+            self.root, getattr(self, split), self.subset, self.flavour, self.data_dict, self.image, self.example,
+            self.loading,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -149,7 +186,7 @@ class RunConfig:
     """
 
     task: LaneGraphTask | LaneCurveTask = LaneGraphTask()
-    data: WorldData | LogData | FrontViewData | TuSimpleData = WorldData()
+    data: WorldData | LogData | OpenLaneV2Data | FrontViewData | TuSimpleData = WorldData()
     optim: OptimConfig = OptimConfig()
     training: TrainingConfig = TrainingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()

@@ -14,13 +14,12 @@ from tflane_jax.datasets.augmentation import (
     NO_AUGMENTATION,
     AugmentationConfig,
     augment,
-    augment_batch,
     colour_map,
     draw_warp,
     warp_example,
     warp_lines,
 )
-from tflane_jax.scene import LaneLines, RoadImage, stack_examples
+from tflane_jax.scene import LaneLines, RoadImage
 
 HEIGHT, WIDTH = 90, 160
 ALWAYS = AugmentationConfig(geometry=1.0)
@@ -258,22 +257,6 @@ def test_lighting_reads_red_green_and_blue():
     vectors = augmentation.PCA_VECTORS
     np.testing.assert_allclose(vectors.T @ vectors, np.eye(3), atol=1e-6)
     assert abs(vectors[2, 0]) > abs(vectors[1, 0]) > abs(vectors[0, 0]) > 0.5
-
-
-@pytest.mark.parametrize("workers", [1, 3])
-def test_a_batch_is_its_examples(workers):
-    batch = stack_examples([example(i) for i in range(4)])
-    seeds = [(9, i) for i in range(4)]
-    after = augment_batch(batch, ALWAYS, seeds, workers=workers)
-    assert_same(after, stack_examples([augment(example(i), ALWAYS, seeds[i]) for i in range(4)]))
-
-
-def test_batches_of_other_sizes():
-    batch = stack_examples([example()])
-    none = jax.tree.map(lambda leaf: leaf[:0], batch)
-    assert augment_batch(none, ALWAYS, []).image.shape == (0, HEIGHT, WIDTH, 3)
-    with pytest.raises(ValueError, match="1 examples and 2 seeds"):
-        augment_batch(batch, ALWAYS, [1, 2])
 
 
 def test_shared_read_only_masks_are_fine():

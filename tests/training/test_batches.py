@@ -38,13 +38,14 @@ def test_batches_hold_the_examples_of_their_step(seeds):
 
 
 @pytest.mark.parametrize("seeds", [(4,), (4, 9)])
-def test_batches_are_prepared_by_seed_and_step(seeds):
-    def prepare(batch, key):
-        return {"a": batch["a"] + 100 * key[0] + 10_000 * key[1]}
+def test_examples_are_prepared_by_seed_step_and_place(seeds):
+    def prepare(example, key):
+        return {"a": example["a"] + 100 * key[0] + 10_000 * key[1] + 1_000_000 * key[2]}
 
     arrays = {"a": np.arange(7)}
     for step, batch in zip(range(2, 5), batches(arrays, seeds, range(2, 5), 3, prepare), strict=True):
-        order = [batch_indices(seed, step, 7, 3) + 100 * seed + 10_000 * step for seed in seeds]
+        place = 1_000_000 * np.arange(3)
+        order = [batch_indices(seed, step, 7, 3) + 100 * seed + 10_000 * step + place for seed in seeds]
         np.testing.assert_array_equal(batch["a"], order[0] if len(seeds) == 1 else order)
 
 

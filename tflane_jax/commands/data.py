@@ -13,6 +13,7 @@ from tflane_jax.config import FrontViewData, LaneCurveSource, RunConfig, apply_o
 from tflane_jax.datasets.argoverse2 import check_log, find_logs, load_log
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
+from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
@@ -21,7 +22,10 @@ from tflane_jax.scene import stack_examples
 from tflane_jax.systems import spread, system_of
 from tflane_jax.systems.lane_curve import open_images
 from tflane_jax.systems.lane_graph import open_dataset
+from tflane_jax.training.batches import prepared
 from tflane_jax.training.lane_curve import LaneCurveTask
+
+_FAULTS = 50  # printed
 
 
 def show(options: argparse.Namespace) -> int:
@@ -58,7 +62,7 @@ def _show_images(source: LaneCurveSource, config: RunConfig, options: argparse.N
     examples = stack_examples([dataset.example(index) for index in indices])
     columns = {"images": examples}
     if (prepare := system_of(config).prepare(config)) is not None:
-        columns["augmented"] = prepare(examples, (0, 0))
+        columns["augmented"] = prepared(examples, prepare, 0, 0)
     for name, shown in columns.items():
         path = options.out if name == "images" else options.out.with_stem(f"{options.out.stem}-{name}")
         print(f"{name} written to {save_road_images(path, shown, titles=[f'image {index}' for index in indices])}")
@@ -69,7 +73,9 @@ def _show_images(source: LaneCurveSource, config: RunConfig, options: argparse.N
 
 
 def check(options: argparse.Namespace) -> int:
-    """Say of every log what it lacks; exit code 2 where one lacks something."""
+    """Say what a dataset lacks; exit code 2 where it lacks something."""
+    if options.format == "openlane-v2":
+        return _check_openlane_v2(Path(options.root))
     lacking = 0
     for folder in find_logs(Path(options.root)):
         faults = check_log(folder)
@@ -81,6 +87,16 @@ def check(options: argparse.Namespace) -> int:
         print(f"{folder}: ok, {len(log.keyframes)} key frames, {log.tracks.frames} annotated frames, "
               f"{len(log.tracks.uuid)} road users, {len(log.map.segments)} lane segments")  # fmt: skip
     return 2 if lacking else 0
+
+
+def _check_openlane_v2(root: Path) -> int:
+    found = check_openlane_v2(root)
+    print(format_table(found.rows, title=f"{root}: OpenLane-V2, subset {found.subset}"))
+    if found.faults:
+        print(f"\n{len(found.faults)} faults:", *(f"  - {fault}" for fault in found.faults[:_FAULTS]), sep="\n")
+    if len(found.faults) > _FAULTS:
+        print(f"  ... and {len(found.faults) - _FAULTS} more")
+    return 2 if found.faults else 0
 
 
 def overlap_of_splits(options: argparse.Namespace) -> int:

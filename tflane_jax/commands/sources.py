@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tflane_jax.config import LaneCurveSource, LaneGraphSource, RunConfig, Source, load_config
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
 from tflane_jax.datasets.front_views import FrontViewConfig
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.errors import UserError
@@ -48,19 +50,27 @@ def lane_graph_source(config: RunConfig, options: argparse.Namespace) -> LaneGra
     configured = config.data.source(options.split)
     if not isinstance(configured, LaneGraphSource):
         raise UserError("this configuration's data are images, but its task wants lanes around the vehicle")
-    if options.data is None and options.root is not None and not isinstance(configured, Argoverse2Config):
-        raise UserError("--root is the folder of real logs: add --data argoverse2")
+    kept = (Argoverse2Config, OpenLaneV2Config)
+    if options.data is None and options.root is not None and not isinstance(configured, kept):
+        raise UserError("--root is the folder of real data: add --data argoverse2 or --data openlane-v2")
     if options.data == "procedural":
         if isinstance(configured, ProceduralConfig):
             return configured
         return ProceduralConfig(split=options.split, scenes=100, example=configured.example)
-    if options.data == "argoverse2" or (options.data is None and options.root is not None):
+    real = options.data is None and options.root is not None
+    if options.data == "openlane-v2" or (real and isinstance(configured, OpenLaneV2Config)):
+        if options.root is None:
+            raise UserError("--data openlane-v2 needs --root PATH, its folder")
+        if isinstance(configured, OpenLaneV2Config):
+            return replace(configured, root=Path(options.root))
+        return OpenLaneV2Config(Path(options.root), options.split, example=configured.example)
+    if options.data == "argoverse2" or real:
         if options.root is None:
             raise UserError("--data argoverse2 needs --root PATH, a log or a folder of logs")
         openlane = None if options.openlane is None else Path(options.openlane)
         return Argoverse2Config(Path(options.root), openlane=openlane, example=configured.example)
     if options.data is not None:
-        raise UserError(f"--data {options.data} are images: this model takes procedural or argoverse2")
+        raise UserError(f"--data {options.data} are images: this model takes procedural, argoverse2 or openlane-v2")
     return configured
 
 
@@ -90,6 +100,8 @@ def source_name(source: Source) -> str:
         return f"tusimple-{source.split}"
     if isinstance(source, ProceduralConfig):
         return f"procedural-{source.split}"
+    if isinstance(source, OpenLaneV2Config):
+        return f"openlane-v2-{source.subset}-{source.split}"
     return "argoverse2"
 
 

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.images import opencv
-from tflane_jax.scene import LaneLines, RoadImage, stack_examples
+from tflane_jax.scene import LaneLines, RoadImage
 
 Seed = int | Sequence[int]
 
@@ -80,27 +78,6 @@ def augment(example: RoadImage, config: AugmentationConfig, seed: Seed) -> RoadI
     if not (factors == 1.0).all() or light.any():
         example = replace(example, image=_recoloured(example, factors, order, light))
     return example
-
-
-def augment_batch(
-    batch: RoadImage, config: AugmentationConfig, seeds: Sequence[Seed], *, workers: int = 1
-) -> RoadImage:
-    """Return changed copies of stacked examples, each with its own seed; `workers` threads share the work.
-
-    Raises ValueError where there is not one seed for each example.
-    """
-    if len(seeds) != len(batch.image):
-        raise ValueError(f"{len(batch.image)} examples and {len(seeds)} seeds: give one seed for each example")
-    if not len(seeds):
-        return batch
-
-    def one(index: int) -> RoadImage:
-        return augment(jax.tree.map(lambda leaf: leaf[index], batch), config, seeds[index])
-
-    if workers > 1:
-        with ThreadPoolExecutor(workers) as pool:
-            return stack_examples(list(pool.map(one, range(len(seeds)))))
-    return stack_examples([one(index) for index in range(len(seeds))])
 
 
 def draw_warp(

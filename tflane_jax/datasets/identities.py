@@ -103,6 +103,6 @@ def _separation(now: _Kind, before: _Kind) -> Float[np.ndarray, "n m"]:
     shorter), plus a little of the other direction to choose among lines that share a stretch."""
     there = line_distances(now.lines, before.lines)[0].mean(-1)
     back = line_distances(before.lines, now.lines)[0].mean(-1).T
-    unknown = ~now.lines.any((1, 2))[:, None]  # an element whose position is not known
+    known = np.abs(now.lines).max((1, 2)) > 0.0  # not an element whose position is not known
     apart = np.minimum(there, back) + 1e-3 * np.maximum(there, back)
-    return np.where(unknown | (now.label[:, None] != before.label), _FAR, apart)
+    return np.where(known[:, None] & (now.label[:, None] == before.label), apart, _FAR)

@@ -73,14 +73,14 @@ def _stacked(dataset: Dataset, parts: Collection[str] | None, progress: bool) ->
 
 
 def keep(arrays: Example, parts: Collection[str]) -> Example:
-    """Return the arrays without the fields that are not in `parts`.
+    """Return stacked examples, or one, without the fields that are not in `parts`.
 
     A field that an `Example` cannot do without (`lanes`, `segments`, `areas`) stays with a capacity of zero,
     the others become None. Raises ValueError for a name that is no field of `Example`.
     """
     wanted = _checked(parts)
     dropped = {name: None for name in Example.__dataclass_fields__ if name not in wanted}
-    return _completed(replace(arrays, **dropped), count(arrays))
+    return _completed(replace(arrays, **dropped), *np.shape(arrays.has_previous))
 
 
 def for_training(arrays: Example) -> Example:
@@ -100,9 +100,9 @@ def _checked(parts: Collection[str]) -> frozenset[str]:
     return frozenset(parts).union(_ALWAYS)
 
 
-def _completed(arrays: Example, size: int) -> Example:
+def _completed(arrays: Example, *leading: int) -> Example:
     """Return the arrays with a graph or set of capacity zero where a field that must be there is None."""
     empty = {"lanes": LaneGraph.empty(0, 2), "segments": LaneGraph.empty(0, 2), "areas": Areas.empty(0, 2)}
     missing = {name: part for name, part in empty.items() if getattr(arrays, name) is None}
-    stacked = jax.tree.map(lambda leaf: np.zeros((size, *leaf.shape), leaf.dtype), missing)
+    stacked = jax.tree.map(lambda leaf: np.zeros((*leading, *leaf.shape), leaf.dtype), missing)
     return replace(arrays, **stacked)

@@ -36,12 +36,14 @@ class Subset:
 
     Attributes:
         cameras: names; the first looks ahead, and traffic elements are labelled in its image.
+        sizes: width and height of each camera's original images, pixels.
         tick_ns: nanoseconds of one unit of the timestamps.
         first_segment: number of the first segment of each split.
         data_dict: name of the split file.
     """
 
     cameras: tuple[str, ...]
+    sizes: tuple[tuple[int, int], ...]
     tick_ns: int
     first_segment: Mapping[Split, int]
     data_dict: str
@@ -51,12 +53,14 @@ SUBSETS: Mapping[SubsetName, Subset] = {
     "A": Subset(
         cameras=("ring_front_center", "ring_front_left", "ring_front_right", "ring_rear_left", "ring_rear_right",
                  "ring_side_left", "ring_side_right"),
+        sizes=((1550, 2048), *6 * ((2048, 1550),)),
         tick_ns=1,
         first_segment={"train": 0, "val": 10_000, "test": 20_000},
         data_dict="data_dict_subset_A.json",
     ),
     "B": Subset(
         cameras=("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"),
+        sizes=6 * ((1600, 900),),
         tick_ns=1000,
         first_segment={"train": 1000, "val": 11_000, "test": 21_000},
         data_dict="data_dict_subset_B.json",

@@ -8,6 +8,7 @@ evidence and no prior.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,7 @@ from tflane_jax.datasets.openlane_frames import (
     list_frames,
     read_frame,
 )
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig, ImageFit, canvas_size, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, relative_pose
@@ -36,6 +38,8 @@ from tflane_jax.openlane_files import CENTERLINE, DENSE_POINTS, SEGMENT
 from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
 
 Flavour = Literal["centerline", "lane_segment", "both"]
+OPENLANE_V2_SIZES = ExampleConfig(lanes=128, segments=192, areas=64, elements=48)
+"""Room in an example; a frame of Argoverse 2 has some 60 centerlines, 75 segments and 11 elements (specs 2.3)."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,7 @@ class OpenLaneV2Config:
         image: what happens to the images; None leaves them unread (`Example.cameras` is None, boxes are in pixels of
             the files).
         example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
+        loading: workers; changes no example.
     """
 
     root: Path
@@ -61,7 +66,8 @@ class OpenLaneV2Config:
     flavour: Flavour = "centerline"
     data_dict: str | None = None
     image: ImageConfig | None = TOPONET_SUBSET_A
-    example: ExampleConfig = ExampleConfig(lanes=128, segments=192, areas=64, elements=48)
+    example: ExampleConfig = OPENLANE_V2_SIZES
+    loading: StreamingConfig = StreamingConfig()
 
 
 class OpenLaneV2Dataset:
@@ -166,14 +172,7 @@ class OpenLaneV2Dataset:
 
     def _views(self, file: FrameFile) -> CameraViews:
         assert self.config.image is not None
-        sizes = [fit.size for fit in self._fits if fit is not None]
-        width, height = canvas_size(sizes, self.config.image.divisor)
-        count = len(file.cameras)
-        views = CameraViews(
-            image=np.zeros((count, height, width, 3), np.uint8), size=np.zeros((count, 2), np.int32),
-            intrinsics=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
-            camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), valid=np.zeros(count, bool),
-        )  # fmt: skip
+        views = empty_views(self._fits, self.config.image)
         for place, (camera, fit) in enumerate(zip(file.cameras, self._fits, strict=True)):
             if camera is None or fit is None:
                 continue
@@ -189,6 +188,35 @@ class OpenLaneV2Dataset:
             views.camera_from_ego[place] = invert_pose(camera.ego_from_camera)
             views.valid[place] = True
         return views
+
+
+def nominal_example(config: OpenLaneV2Config) -> Example:
+    """Return an example of original image sizes in which nothing is valid: shapes without data."""
+    sizes, subset = config.example, SUBSETS[config.subset]
+    views = None
+    if config.image is not None:
+        fits = [fit_image(*size, config.image, front=place == 0) for place, size in enumerate(subset.sizes)]
+        views = empty_views(fits, config.image)
+    lanes = LaneGraph.empty(sizes.lanes, sizes.lane_points)
+    segments = LaneGraph.empty(sizes.segments, sizes.segment_points)
+    governed = segments if config.flavour == "lane_segment" else lanes
+    return Example(
+        bev=None, hidden=None, traffic_flow=None, markers=None, sd_map=None, lanes=lanes, segments=segments,
+        areas=Areas.empty(sizes.areas, sizes.area_points),
+        traffic_elements=TrafficElements.empty(sizes.elements, len(governed.valid)),
+        previous_from_ego=np.eye(4, dtype=np.float32), has_previous=np.asarray(False), cameras=views,
+    )  # fmt: skip
+
+
+def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraViews:
+    """Return room for the images of cameras, none valid."""
+    width, height = canvas_size([fit.size for fit in fits if fit is not None], config.divisor)
+    count = len(fits)
+    return CameraViews(
+        image=np.zeros((count, height, width, 3), np.uint8), size=np.zeros((count, 2), np.int32),
+        intrinsics=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+        camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), valid=np.zeros(count, bool),
+    )  # fmt: skip
 
 
 def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph, Int[np.ndarray, " n"]]:

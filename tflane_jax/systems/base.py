@@ -60,11 +60,11 @@ class System(Protocol):
     """Scores ("group/name") that a comparison tests, as far as all of its models have them."""
 
     def load(self, source: Any, *, progress: bool = True) -> Any:
-        """Return a split in memory, as `evaluate` takes it."""
+        """Return a split, as `evaluate` takes it: in memory, or a `datasets.streaming.Streamed` of it."""
         ...
 
     def examples(self, data: Any) -> Any:
-        """Return the examples of a split: what training looks at, stacked along a leading axis."""
+        """Return the examples of a split: what training looks at, as `training.batches` takes it."""
         ...
 
     def shapes(self, config: Any) -> Any:
@@ -72,7 +72,7 @@ class System(Protocol):
         ...
 
     def prepare(self, config: Any) -> Prepare | None:
-        """Return the augmentation of training batches, None for none."""
+        """Return the augmentation of training examples, None for none."""
         ...
 
     def evaluate(self, task: Task, params: Params, data: Any, batch_size: int) -> Evaluation:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tflane_jax.config import LaneCurveSource, RunConfig
-from tflane_jax.datasets.augmentation import augment_batch
+from tflane_jax.datasets.augmentation import augment
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
 from tflane_jax.datasets.tusimple import TuSimpleDataset, row_lanes
@@ -93,8 +93,8 @@ class LaneCurveSystem:
         if augmentation is None:
             return None
 
-        def prepare(batch: RoadImage, key: tuple[int, int]) -> RoadImage:
-            return augment_batch(batch, augmentation, [(*key, i) for i in range(len(batch.image))])
+        def prepare(example: RoadImage, key: tuple[int, int, int]) -> RoadImage:
+            return augment(example, augmentation, key)
 
         return prepare
 

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from tflane_jax.config import LaneGraphSource, RunConfig
 from tflane_jax.datasets.argoverse2 import Argoverse2Dataset
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.cache import cached
-from tflane_jax.datasets.loading import TRAINING_PARTS, for_training, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
+from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
 from tflane_jax.scene import ElementPrediction, Example, LanePrediction, shapes_of, stack_examples
 from tflane_jax.systems.base import Evaluation, Model, spread
@@ -40,25 +43,36 @@ class LaneGraphSystem:
         *(f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in ("all", "occluded", "clear")),
     )  # fmt: skip
 
-    def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example:
-        """Return the examples of a source, stacked."""
-        return load_arrays(open_dataset(source, progress=progress), parts=TRAINING_PARTS, progress=progress)
+    def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example | Streamed:
+        """Return the examples of a source, stacked; those of OpenLane-V2 are read while they are used."""
+        dataset = open_dataset(source, progress=progress)
+        if isinstance(source, OpenLaneV2Config):
+            return Streamed(dataset, source.loading, partial(keep, parts=TRAINING_PARTS))
+        return load_arrays(dataset, parts=TRAINING_PARTS, progress=progress)
 
-    def examples(self, data: Example) -> Example:
+    def examples(self, data: Example | Streamed) -> Example | Streamed:
         """Return the examples themselves."""
         return data
 
     def shapes(self, config: RunConfig) -> Example:
         """Return shapes of the training parts of an example."""
         source = _source(config, "train")
-        dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else Argoverse2Dataset(source)
-        one = for_training(stack_examples([dataset.example(0)]))
-        return shapes_of(jax.tree.map(lambda leaf: leaf[0], one))
+        if isinstance(source, OpenLaneV2Config) and not source.root.is_dir():
+            example = nominal_example(source)
+        else:
+            # Not from the cache: one example is made sooner than all of them.
+            made = isinstance(source, ProceduralConfig)
+            example = (ProceduralDataset(source) if made else open_dataset(source)).example(0)
+        return shapes_of(keep(example, TRAINING_PARTS))
 
-    def prepare(self, config: RunConfig) -> None:
-        """Return None: examples are used as they are."""
+    def prepare(self, config: RunConfig) -> Prepare | None:
+        """Return the photometric augmentation of the configuration's data, if it has one."""
+        augmentation = getattr(config.data, "augmentation", None)
+        if augmentation is None:
+            return None
+        return partial(_augmented, augmentation)
 
-    def evaluate(self, task: Any, params: Params, data: Example, batch_size: int) -> Evaluation:
+    def evaluate(self, task: Any, params: Params, data: Example | Streamed, batch_size: int) -> Evaluation:
         """Return OpenLane-V2's centerline metrics for all, occluded and clear lanes."""
         metrics = evaluate_lanes(task, params, data, batch_size)
         return Evaluation(metrics.protocol, metrics.compute())
@@ -97,14 +111,17 @@ class LaneGraphSystem:
         return []
 
     def draw_comparison(
-        self, models: Mapping[str, Model], source: LaneGraphSource, data: Example, path: Path
+        self, models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path
     ) -> Path:
-        """Draw the test frames with the most hidden lanes, every model beside the truth."""
+        """Draw the test frames with the most hidden lanes (of streamed data, any), every model beside the truth."""
         from tflane_jax.plots import save_examples
 
         dataset = open_dataset(source)
-        hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
-        indices = np.argsort(-hidden, kind="stable")[:_COMPARED_EXAMPLES].tolist()
+        if isinstance(data, Streamed):
+            indices = spread(len(data), _COMPARED_EXAMPLES)
+        else:
+            hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
+            indices = np.argsort(-hidden, kind="stable")[:_COMPARED_EXAMPLES].tolist()
         examples = stack_examples([dataset.example(index) for index in indices])
         lanes = {
             name: predict_examples(model.task, model.params, dataset, indices)[1] for name, model in models.items()
@@ -119,7 +136,11 @@ def open_dataset(source: LaneGraphSource, *, progress: bool = True) -> Dataset:
     """Return the dataset of a source; the built-in world is built once and then read from its cache."""
     if isinstance(source, ProceduralConfig):
         return cached(ProceduralDataset(source), progress=progress)
-    return Argoverse2Dataset(source)
+    return OpenLaneV2Dataset(source) if isinstance(source, OpenLaneV2Config) else Argoverse2Dataset(source)
+
+
+def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:
+    return augment_example(example, config, key)
 
 
 def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:

@@ -1,18 +1,25 @@
-"""Which examples a step sees, and having them ready when it starts."""
+"""Which examples a step sees, and having them ready when it starts.
+
+Examples come as arrays in memory (stacked, numpy leaves with a leading axis) or as a `datasets.streaming.Streamed`;
+either way gives the same batches.
+"""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
-Prepare = Callable[[Any, tuple[int, int]], Any]
-"""(a batch, numpy, and the run's seed with the step) -> the batch that the step sees: seeded augmentation."""
+from tflane_jax.datasets.streaming import Prepare, Request, Streamed
+from tflane_jax.scene import stack_examples
+
+__all__ = ["Prepare", "batch_indices", "batches", "count", "first_example", "ordered_batches", "prepared"]
 
 
 def batch_indices(seed: int, step: int, examples: int, batch_size: int) -> Int[np.ndarray, " b"]:
@@ -35,27 +42,72 @@ def _permutation(seed: int, epoch: int, examples: int) -> Int[np.ndarray, " n"]:
     return order
 
 
+def count(arrays: Any) -> int:
+    """Return the number of examples."""
+    return len(arrays) if isinstance(arrays, Streamed) else len(jax.tree.leaves(arrays)[0])
+
+
+def first_example(arrays: Any) -> Any:
+    """Return one example."""
+    return arrays.example(0) if isinstance(arrays, Streamed) else _row(arrays, 0)
+
+
+def prepared(batch: Any, prepare: Prepare, seed: int, step: int) -> Any:
+    """Return stacked examples as that step sees them."""
+    size = len(jax.tree.leaves(batch)[0])
+    return stack_examples([prepare(_row(batch, i), (seed, step, i)) for i in range(size)])
+
+
 def batches(
-    arrays: Any, seeds: Sequence[int], steps: range, batch_size: int, prepare: Prepare | None = None
+    arrays: Any,
+    seeds: Sequence[int],
+    steps: range,
+    batch_size: int,
+    prepare: Prepare | None = None,
+    *,
+    share: tuple[int, int] = (0, 1),
 ) -> Generator[Any]:
     """Yield the batch of each step on the device, the next one being gathered in a thread meanwhile.
 
     Args:
-        arrays: stacked examples, numpy leaves with a leading axis.
+        arrays: examples, see above.
         seeds: of the run; each has an order of its own, and more than one gives batches a leading seed axis.
         steps: which steps.
         batch_size: examples of a step (and seed).
-        prepare: called in that thread.
-    """
-    examples = len(jax.tree.leaves(arrays)[0])
+        prepare: augments each example; called in that thread, or in the workers of a `Streamed`.
+        share: (index, count) of this process among several that divide every batch (`jax.process_index()`,
+            `jax.process_count()`): it gets that part of the rows.
 
-    def fetch(step: int) -> Any:
+    Raises:
+        ValueError: the processes cannot divide a batch evenly.
+    """
+    index, processes = share
+    if batch_size % processes:
+        raise ValueError(f"{processes} processes cannot share batches of {batch_size} evenly")
+    rows = batch_size // processes
+    order = _Order(tuple(seeds), steps.start, count(arrays), batch_size, range(index * rows, (index + 1) * rows))
+
+    def gathered(step: int) -> list[Any]:
         parts = []
         for seed in seeds:
-            order = batch_indices(seed, step, examples, batch_size)
+            indices = batch_indices(seed, step, order.examples, batch_size)[order.places]
             # Not np.take: that copies the whole of a leaf that is a broadcast view.
-            part = jax.tree.map(lambda leaf, order=order: leaf[order], arrays)
-            parts.append(part if prepare is None else prepare(part, (seed, step)))
+            part = jax.tree.map(lambda leaf, indices=indices: leaf[indices], arrays)
+            if prepare is not None:
+                keys = [(seed, step, place) for place in order.places]
+                part = stack_examples([prepare(_row(part, i), key) for i, key in enumerate(keys)])
+            parts.append(part)
+        return parts
+
+    def streamed(step: int) -> list[Any]:
+        return [stack_examples([next(stream) for _ in order.places]) for _ in seeds]
+
+    stream: Iterator[Any] = iter(())
+    if isinstance(arrays, Streamed):
+        stream = arrays.stream(order, len(steps) * len(seeds) * rows, prepare)
+
+    def fetch(step: int) -> Any:
+        parts = streamed(step) if isinstance(arrays, Streamed) else gathered(step)
         batch = parts[0] if len(seeds) == 1 else jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
         return jax.device_put(batch)
 
@@ -65,3 +117,54 @@ def batches(
             batch = fetch(step) if ahead is None else ahead.result()
             ahead = pool.submit(fetch, step + 1) if step + 1 in steps else None
             yield batch
+
+
+def ordered_batches(arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]:
+    """Yield all examples once in order: their indices, and a batch (numpy) that begins with them.
+
+    The last batch is filled up with the last example, so that all have one size.
+    """
+    examples = count(arrays)
+    starts = range(0, examples, batch_size)
+    stream: Iterator[Any] = iter(())
+    if isinstance(arrays, Streamed):
+        stream = arrays.stream(_InOrder(examples), len(starts) * batch_size)
+    for start in starts:
+        if isinstance(arrays, Streamed):
+            batch = stack_examples([next(stream) for _ in range(batch_size)])
+        else:
+            filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
+            batch = jax.tree.map(lambda leaf, rows=filled: leaf[rows], arrays)
+        yield range(start, min(start + batch_size, examples)), batch
+
+
+def _row(batch: Any, index: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], batch)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """The requests of a training: step by step, seed by seed, the places of the batch that are this process's."""
+
+    seeds: tuple[int, ...]
+    first_step: int
+    examples: int
+    batch_size: int
+    places: range
+
+    def __call__(self, number: int) -> Request:
+        rest, place = divmod(number, len(self.places))
+        step, seed = divmod(rest, len(self.seeds))
+        step, seed, place = self.first_step + step, self.seeds[seed], self.places[place]
+        index = batch_indices(seed, step, self.examples, self.batch_size)[place]
+        return Request(int(index), (seed, step, place))
+
+
+@dataclass(frozen=True)
+class _InOrder:
+    """The requests of an evaluation; after the last example it comes again."""
+
+    examples: int
+
+    def __call__(self, number: int) -> Request:
+        return Request(min(number, self.examples - 1), (0, 0, number))

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-import numpy as np
 
+from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.metrics.frames import detections_from_prediction, truth_from_example
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.scene import Example
+from tflane_jax.training.batches import ordered_batches
 from tflane_jax.training.task import Params, Task
 
 
@@ -26,19 +27,24 @@ def predictions(task: Task, params: Params, arrays: Any, batch_size: int) -> Ite
 
     Args:
         task, params: the model; hashable, see `Task`.
-        arrays: stacked examples, numpy leaves with a leading axis.
+        arrays: examples, see `training.batches`.
         batch_size: examples predicted at a time. The last batch is filled up and cut, so that one program serves all.
     """
-    params, examples = jax.device_put(params), len(jax.tree.leaves(arrays)[0])
-    for start in range(0, examples, batch_size):
-        indices = range(start, min(start + batch_size, examples))
-        filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
-        batch = jax.tree.map(lambda leaf, rows=filled: leaf[rows], arrays)
+    for indices, _, answers in _answered(task, params, arrays, batch_size):
+        yield indices, answers
+
+
+def _answered(task: Task, params: Params, arrays: Any, batch_size: int) -> Iterator[tuple[range, Any, Any]]:
+    """Yield indices, examples and answers, the last two stacked; there may be more examples than indices."""
+    params = jax.device_put(params)
+    for indices, batch in ordered_batches(arrays, batch_size):
         answers, kept = jax.device_get(predict_batch(task, params, batch)), slice(len(indices))
-        yield indices, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
+        yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 
 
-def evaluate_lanes(task: Task, params: Params, arrays: Example, batch_size: int = 16) -> GroupedCenterlineMetrics:
+def evaluate_lanes(
+    task: Task, params: Params, arrays: Example | Streamed, batch_size: int = 16
+) -> GroupedCenterlineMetrics:
     """Return the filled accumulator of OpenLane-V2's centerline metrics (groups all, occluded, clear) of a dataset.
 
     Traffic elements are measured where the task predicts them and the examples have them.
@@ -46,22 +52,22 @@ def evaluate_lanes(task: Task, params: Params, arrays: Example, batch_size: int 
     Args:
         task: predicts lanes.
         params: of the task.
-        arrays: stacked examples with `lanes`.
+        arrays: examples with `lanes`, see `training.batches`.
         batch_size: see `predictions`.
 
     Raises:
         ValueError: the task predicts no lanes.
     """
     metrics = GroupedCenterlineMetrics()
-    for indices, answer in predictions(task, params, arrays, batch_size):
+    for indices, batch, answer in _answered(task, params, arrays, batch_size):
         if answer.lanes is None:
             raise ValueError("this task predicts no lanes, so there is nothing to measure")
-        both = answer.elements is not None and arrays.traffic_elements is not None
+        both = answer.elements is not None and batch.traffic_elements is not None
         found = answer.lanes, answer.elements if both else None
-        true = arrays.lanes, arrays.traffic_elements if both else None
-        for row, index in enumerate(indices):
+        true = batch.lanes, batch.traffic_elements if both else None
+        for row in range(len(indices)):
             metrics.update(
                 detections_from_prediction(*jax.tree.map(lambda leaf, i=row: leaf[i], found)),
-                truth_from_example(*jax.tree.map(lambda leaf, i=index: leaf[i], true)),
+                truth_from_example(*jax.tree.map(lambda leaf, i=row: leaf[i], true)),
             )
     return metrics

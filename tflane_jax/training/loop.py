@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from tflane_jax.errors import UserError
 from tflane_jax.training.adaptive import Memory
-from tflane_jax.training.batches import Prepare, batches
+from tflane_jax.training.batches import Prepare, batches, first_example
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
@@ -107,17 +107,18 @@ def train(
     resolved: dict[str, Any], resolved_text: str = "", start: Start = "new",
     prepare: Prepare | None = None, evaluate: Evaluate | None = None, draw: Draw | None = None, progress: bool = True,
 ) -> TrainingResult:  # fmt: skip
-    """Train a task on arrays in memory and leave everything about the run in `folder`.
+    """Train a task and leave everything about the run in `folder`.
 
     Args:
         task: what to train.
-        arrays: stacked training examples (numpy, leading axis).
+        arrays: training examples, see `training.batches`. Which of them a step sees follows from its number, so that
+            the step in a checkpoint is also the position in the data.
         folder: of the run.
         config, optim: settings.
         resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
         resolved_text: the same for people.
         start: see `run_folder.claimed`.
-        prepare: augments every batch, see `training.batches`.
+        prepare: augments every example, see `training.batches`.
         evaluate, draw: called at every evaluation.
         progress: show a bar with rate and time left.
 
@@ -145,7 +146,7 @@ def train(
         # State: fresh, of another run, or resumed
         # =============================================================================================================
         optimizer = make_optimizer(optim, config.steps)
-        state = init_states(task, optimizer, config.seeds, jax.tree.map(lambda leaf: leaf[0], arrays))
+        state = init_states(task, optimizer, config.seeds, first_example(arrays))
         window, metrics, seconds = _Window(), {}, 0.0
         memories = [Memory() for _ in config.seeds]
         if start == "resume" and (written := checkpoints.steps()):

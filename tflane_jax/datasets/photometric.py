@@ -1,0 +1,126 @@
+"""Random colours of multi-view images, as every camera system of the papers trains with, and GridMask.
+
+Photometric distortion is mmdetection's (brightness, contrast, saturation, hue, channel swap; contrast before or after
+the colours), drawn for each view on its own, as BEVFormer does. The originals work on floats without bounds; here
+images are uint8, so that what leaves 0 to 255 is cut off. GridMask is Chen et al. 2020 in BEVFormer's setting: squares
+without rotation, one mask for all views. Source: shared specs/modules.md section 13.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from tflane_jax.images import opencv
+from tflane_jax.scene import CameraViews, Example
+
+# What a hidden square shows: the mean of ImageNet, which normalisation turns to zero as in the original.
+_HIDDEN = np.array([124, 116, 104], np.uint8)
+
+
+@dataclass(frozen=True)
+class PhotometricConfig:
+    """What may happen to the images of an example.
+
+    Attributes:
+        probability: of each of the five changes, on its own.
+        brightness: most that is added to all channels, of 255.
+        contrast: least and most factor on all channels.
+        saturation: least and most factor.
+        hue: most that is added, degrees.
+        swap: probability of another order of the channels.
+        grid_mask: probability of a GridMask; the papers that use one have 0.7.
+        grid_ratio: share of its period that stays in either direction.
+    """
+
+    probability: float = 0.5
+    brightness: float = 32.0
+    contrast: tuple[float, float] = (0.5, 1.5)
+    saturation: tuple[float, float] = (0.5, 1.5)
+    hue: float = 18.0
+    swap: float = 0.5
+    grid_mask: float = 0.0
+    grid_ratio: float = 0.5
+
+
+def augment_example(example: Example, config: PhotometricConfig, seed: int | Sequence[int]) -> Example:
+    """Return an example with its images changed; one without cameras as it is."""
+    if example.cameras is None:
+        return example
+    return replace(example, cameras=augment_views(example.cameras, config, seed))
+
+
+def augment_views(cameras: CameraViews, config: PhotometricConfig, seed: int | Sequence[int]) -> CameraViews:
+    """Return images changed at random; the same seed gives the same bits. Padding and calibration stay.
+
+    Args:
+        cameras: numpy.
+        config: what may happen.
+        seed: an integer or several, such as (run seed, step, index).
+    """
+    masking, *colours = np.random.default_rng(seed).spawn(1 + len(cameras.valid))
+    images = np.array(cameras.image)
+    grid = draw_grid(config, masking, *images.shape[1:3])
+    for image, rng, (width, height), valid in zip(images, colours, cameras.size, cameras.valid, strict=True):
+        if not valid:
+            continue
+        part = distort(image[:height, :width], config, rng)
+        if grid is not None:
+            part[grid[:height, :width]] = _HIDDEN
+        image[:height, :width] = part
+    return replace(cameras, image=images)
+
+
+def distort(
+    image: UInt8[np.ndarray, "h w 3"], config: PhotometricConfig, rng: np.random.Generator
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return one RGB image with its brightness, contrast, saturation, hue and channels changed at random (a copy)."""
+    cv2 = opencv()
+    # All draws are made whatever happens, so that a setting changes nothing else.
+    changes = rng.uniform(size=4) < config.probability
+    early, swapped = rng.uniform() < 0.5, rng.uniform() < config.swap
+    brightness = rng.uniform(-config.brightness, config.brightness)
+    contrast, saturation = rng.uniform(*config.contrast), rng.uniform(*config.saturation)
+    hue, order = rng.uniform(-config.hue, config.hue), rng.permutation(3)
+
+    out = image.astype(np.float32)
+    if changes[0]:
+        out += np.float32(brightness)
+    if changes[1] and early:
+        out *= np.float32(contrast)
+    if changes[2] or changes[3]:
+        # Hue in degrees, saturation 0 to 1. Negative values have no hue.
+        colour = cv2.cvtColor(np.maximum(out, 0.0), cv2.COLOR_RGB2HSV)
+        if changes[2]:
+            colour[..., 1] = np.minimum(colour[..., 1] * np.float32(saturation), 1.0)
+        if changes[3]:
+            colour[..., 0] = np.mod(colour[..., 0] + np.float32(hue), 360.0)
+        out = cv2.cvtColor(colour, cv2.COLOR_HSV2RGB)
+    if changes[1] and not early:
+        out *= np.float32(contrast)
+    if swapped:
+        out = out[..., order]
+    return np.clip(np.rint(out), 0, 255).astype(np.uint8)
+
+
+def draw_grid(
+    config: PhotometricConfig, rng: np.random.Generator, height: int, width: int
+) -> Bool[np.ndarray, "h w"] | None:
+    """Return which pixels a grid of squares hides, or None for no grid.
+
+    The period is anything from 2 pixels to the image's height; a square is hidden where both the row and the column lie
+    outside the share of the period that stays.
+    """
+    chance, period, row, column = rng.uniform(size=4)
+    if chance >= config.grid_mask or height < 3:
+        return None
+    period = 2 + int(period * (height - 2))
+    kept = min(max(round(period * config.grid_ratio), 1), period - 1)
+    rows, columns = (
+        (np.arange(size) + int(start * period)) % period >= kept
+        for size, start in ((height, row), (width, column))
+    )
+    return rows[:, None] & columns

@@ -26,6 +26,8 @@ _GROWTH = 1.4
 _KERB, _SIDEWALK = 0.22, 3.2
 _GRASS = ((0.27, 0.33, 0.15), (0.33, 0.36, 0.19), (0.4, 0.37, 0.25), (0.22, 0.29, 0.13))
 _PAVING = ((0.55, 0.53, 0.5), (0.5, 0.5, 0.5), (0.58, 0.53, 0.47))
+# Windows have a multiple of so many texels, so that they can be halved five times.
+_BLOCK = 32
 # Sizes of blotches and grain of the ground and of the places from which paint has gone, metres; what one standard
 # deviation of noise is in bytes.
 _BLOTCH, _GRAIN, _PATCH, _SIGMA = 0.96, 0.04, 0.16, 40.0
@@ -61,9 +63,9 @@ class Window:
 
 def window_around(points: Float[np.ndarray, "n 2"], reach: float, texel: float) -> Window:
     """Return the window that holds all that lies within `reach` metres of the points along x and y."""
-    # On a grid of whole texels, so that windows that overlap have the same texels.
+    # On a grid of whole texels, so that windows that overlap have the same texels; halving leaves nothing over.
     first = np.floor((points.min(0) - reach) / texel)
-    count = np.ceil((points.max(0) + reach) / texel) - first
+    count = np.ceil(((points.max(0) + reach) / texel - first) / _BLOCK) * _BLOCK
     low = first * texel
     return Window((float(low[0]), float(low[1])), texel, int(count[0]), int(count[1]))
 
@@ -102,7 +104,7 @@ def draw_ground(
         dirt: 0 (spotless asphalt) to 1.
         wet: 0 to 1, darkens.
         urban: paved beside the road.
-        levels: how often to halve the window, the first included.
+        levels: how many levels to make, the first included; at most 6.
     """
     import cv2
 

@@ -188,7 +188,7 @@ def _trees(
     rng: np.random.Generator, kerbs: list[np.ndarray], room: _Room, urban: bool
 ) -> tuple[Bodies, Float[np.ndarray, "c 4"]]:
     """Return trees and bushes as trunks with blobs, and the crowns of the trees."""
-    green = np.array([0.24, 0.36, 0.13]) * rng.uniform(0.8, 1.25) + rng.uniform(0.0, 0.05, 3)
+    green = np.array([0.3, 0.42, 0.17]) * rng.uniform(0.8, 1.25) + rng.uniform(0.0, 0.05, 3)
     trunks: list[Solid] = []
     boxes: list[Box] = []
     crowns, blobs, colours, owners = [], [], [], []

@@ -53,7 +53,9 @@ class BevFormer(nn.Module):
             deterministic: no dropout; with it, the key `dropout` is needed.
         """
         config = self.config
-        memory = BevMemory.empty(config) if memory is None else memory
+        if memory is None:
+            # The barrier lets XLA round as it does with an invalid memory, which it cannot simplify away.
+            memory = lax.optimization_barrier(BevMemory.empty(config))
         # An invalid memory's pose may be anything.
         pose = jnp.where(memory.valid, previous_from_ego, jnp.eye(4, dtype=previous_from_ego.dtype))
         history = BevMemory(jnp.where(memory.valid, memory.features, 0.0), memory.valid)

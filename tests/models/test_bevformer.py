@@ -1,0 +1,284 @@
+"""BEVFormer's encoder against the reference's numbers; memory, streaming, cameras, sizes."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tflane_jax.convert.bevformer import ENCODER, convert_bevformer
+from tflane_jax.convert.renaming import check_fits, renamed_params
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry.poses import yaw_pose
+from tflane_jax.models.bev_encoder import BevEncoder
+from tflane_jax.models.bevformer import (
+    BevFormer,
+    BevFormerConfig,
+    BevFrame,
+    BevMemory,
+    align,
+    check_capacity,
+    encode_sequence,
+    see_pillars,
+    seen_queries,
+    step,
+)
+from tflane_jax.scene import CameraViews
+
+
+def golden_config(case):
+    """Return the reference's configuration, with the options that reproduce its departures from the paper."""
+    config = case.meta["config"]
+    low, high = np.array(config["pc_range"]).reshape(2, 3)
+    limits = PerceptionRange(*map(tuple, zip(low, high, strict=True)))
+    return BevFormerConfig(
+        BevGrid(limits, *config["bev"]), config["C"], config["heads"], config.get("layers", 1),
+        config.get("ffn", 2 * config["C"]), temporal_points=config.get("tsa_points", 4),
+        spatial_points=config.get("num_points", 8), anchors=config.get("D", 4), levels=2, cameras=config["cams"],
+        align="reference", rotation_center=tuple(config.get("rotate_center", ())) or None, temporal_value="initial",
+    )  # fmt: skip
+
+
+def golden_views(arrays):
+    """Return the views of a batch of one: the reference has one matrix from the vehicle to the pixels."""
+    matrix = arrays["lidar2img"][0]
+    height, width = (int(n) for n in arrays["img_hw"])
+    n = len(matrix)
+    image = np.zeros((n, height, width, 3), np.uint8)
+    eye = np.broadcast_to(np.eye(3, dtype=np.float32), (n, 3, 3))
+    return CameraViews(image, np.tile([width, height], (n, 1)), eye, matrix, np.ones(n, bool))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("bevformer_encoder*"), ids=case_id)
+def test_encoder_matches_the_reference(path):
+    case = load_module_case(path)
+    config, views = golden_config(case), golden_views(case.inputs)
+    shapes = tuple(tuple(int(n) for n in row) for row in case.inputs["spatial_shapes"])
+    reference, visible = see_pillars(config, views)
+    inputs = {k: v for k, v in case.inputs.items() if k in ("bev_query", "feats", "bev_pos", "shift", "prev_bev")}
+
+    def scalar(torch_params, arrays):
+        queries, position, tokens = arrays["bev_query"][:, 0], arrays["bev_pos"][:, 0], arrays["feats"][:, :, 0]
+        past = arrays.get("prev_bev", jnp.full((len(queries), 1, config.dim), jnp.nan))[:, 0]
+        history = BevMemory(past, jnp.asarray("prev_bev" in arrays))
+        out = BevEncoder(config).apply(
+            {"params": renamed_params(torch_params, ENCODER)},
+            queries, position, tokens, shapes, reference, visible, history, arrays["shift"][0], True,
+        )  # fmt: skip
+        return (out[None] * case.weights["output"]).sum(), out[None]
+
+    gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, out), (by_param, by_input) = gradient(case.params, inputs)
+    assert_outputs_close({"output": out, "grad_scalar": total}, case.outputs)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("bev_constructer_*"), ids=case_id)
+def test_constructer_matches_the_reference(path):
+    case = load_module_case(path)
+    config, views, arrays = golden_config(case), golden_views(case.inputs), case.inputs
+    model, motion = BevFormer(config), arrays["can_bus"][0]
+    # The pose that the reference's vector stands for: turned by the last entry, moved in global axes by the first.
+    pose = yaw_pose(np.float32(0), np.float32(0), np.deg2rad(motion[-1])).astype(np.float32)
+    pose[:3, 3] = pose[:3, :3] @ arrays["lidar2global_rotation"][0].T @ motion[:3]
+    shape, valid = (config.grid.rows, config.grid.columns, config.dim), "prev_bev" in arrays
+    past = arrays["prev_bev"].reshape(shape) if valid else np.full(shape, np.nan, np.float32)
+    history, shift = align(config, BevMemory(jnp.asarray(past), jnp.asarray(valid)), jnp.asarray(pose))
+    assert_outputs_close({"inner.shift": shift[None]}, {"inner.shift": case.outputs["inner.shift"]})
+    if valid:
+        np.testing.assert_array_equal(history.features.reshape(-1, 1, config.dim), case.outputs["inner.prev"])
+
+    def scalar(torch_params, features):
+        levels = [features[name][0].transpose(0, 2, 3, 1) for name in sorted(features)]
+        variables = {"params": convert_bevformer(torch_params).variables["params"]}
+        out = model.apply(variables, levels, views, history, shift, jnp.asarray(motion), method="encode")
+        out = out.reshape(1, -1, config.dim)
+        return (out * case.weights["output"]).sum(), out
+
+    gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    features = {name: arrays[name] for name in ("feat0", "feat1")}
+    (total, out), (by_param, by_input) = gradient(case.params, features)
+    expected = {name: case.outputs[name] for name in ("output", "grad_scalar")}
+    assert_outputs_close({"output": out, "grad_scalar": total}, expected)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("bev_constructer_*"), ids=case_id)
+def test_every_tensor_of_the_reference_is_accounted_for(path):
+    case = load_module_case(path)
+    config = golden_config(case)
+    converted = convert_bevformer(case.params)
+    assert [row["tensor"] for row in converted.table] == list(case.params)
+    views = golden_views(case.inputs)
+    levels = [case.inputs[name][0].transpose(0, 2, 3, 1) for name in ("feat0", "feat1")]
+    fresh = jax.eval_shape(BevFormer(config).init, jax.random.key(0), levels, views, None, jnp.eye(4))
+    check_fits(converted.variables["params"], fresh["params"], path)
+    with pytest.raises(UserError, match="no tensor of BEVFormer"):
+        convert_bevformer(case.params | {"encoder.layers.0.norms.3.weight": case.params["level_embeds"]})
+
+
+def test_paper_size_has_the_published_parameters():
+    shapes = ((100, 128), (50, 64), (25, 32), (13, 16))
+    levels = [jax.ShapeDtypeStruct((7, *shape, 256), jnp.float32) for shape in shapes]
+    views = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, ring(7, (800, 1024))))
+    for config in (BevFormerConfig(), BevFormerConfig(capacity=6000, remat=True, precision="bfloat16")):
+        model = BevFormer(config)
+        out, fresh = jax.eval_shape(lambda *a, m=model: m.init_with_output(jax.random.key(0), *a, None, jnp.eye(4)),
+                                    levels, views)  # fmt: skip
+        assert sum(leaf.size for leaf in jax.tree.leaves(fresh)) == 7_667_648
+        assert out.shape == (100, 200, 256)
+        assert {leaf.dtype for leaf in jax.tree.leaves((fresh, out))} == {np.dtype("float32")}
+
+
+GRID = BevGrid(PerceptionRange((-10.0, 10.0), (-5.0, 5.0), (-2.0, 2.0)), 5, 10)
+CONFIG = BevFormerConfig(GRID, 8, 2, 1, 16, 0.0, 2, 4, anchors=2, levels=2, cameras=3)
+MODEL = BevFormer(CONFIG)
+
+
+def ring(cameras=3, shape=(48, 64)):
+    """Return cameras that look evenly around, 1.5 m above the ground."""
+    height, width = shape
+    ahead = np.array([[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    turns = [ahead @ yaw_pose(0.0, 0.0, -2 * np.pi * i / cameras) for i in range(cameras)]
+    k = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]], np.float32)
+    size = np.tile([width, height], (cameras, 1)).astype(np.int32)
+    return CameraViews(
+        np.zeros((cameras, *shape, 3), np.uint8), size, np.tile(k, (cameras, 1, 1)),
+        np.stack(turns).astype(np.float32), np.ones(cameras, bool),
+    )  # fmt: skip
+
+
+def levels(seed=0, cameras=3):
+    rng = np.random.default_rng(seed)
+    return [rng.normal(size=(cameras, h, w, 8)).astype(np.float32) for h, w in ((6, 8), (3, 4))]
+
+
+@pytest.fixture(scope="module")
+def variables():
+    fresh = jax.jit(lambda: MODEL.init(jax.random.key(0), levels(), ring(), None, jnp.eye(4)))()
+    # Away from the initial zeros: queries decide where they look and how much they take.
+    leaves, tree = jax.tree.flatten(fresh)
+    rng = np.random.default_rng(1)
+    return jax.tree.unflatten(tree, [leaf + 0.1 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves])
+
+
+@pytest.fixture(scope="module")
+def encode(variables):
+    return jax.jit(lambda *arguments: MODEL.apply(variables, *arguments))
+
+
+@pytest.fixture(scope="module")
+def memory():
+    return BevMemory(np.random.default_rng(3).normal(size=(5, 10, 8)).astype(np.float32), np.array(True))
+
+
+POSE = yaw_pose(np.float32(1.5), np.float32(-0.3), np.float32(0.2)).astype(np.float32)
+
+
+def test_a_memory_tells_something_and_an_invalid_one_nothing(encode, variables, memory):
+    with_memory = encode(levels(), ring(), memory, POSE)
+    nothing = encode(
+        levels(), ring(), BevMemory(np.full((5, 10, 8), np.nan, np.float32), np.array(False)), POSE * np.nan
+    )
+    without = jax.jit(lambda *a: MODEL.apply(variables, *a[:2], None, a[2]))(levels(), ring(), POSE)
+    np.testing.assert_array_equal(nothing, without)
+    assert np.abs(with_memory - without).max() > 0.05
+
+
+def test_streaming_equals_the_scan_bit_for_bit(variables, encode):
+    def stacked(make):
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *[make(t) for t in range(4)])
+
+    frames = BevFrame(
+        stacked(levels), stacked(lambda t: ring()), np.stack([POSE] * 4), np.array([False, True, True, False])
+    )
+    scanned = np.asarray(jax.jit(lambda f: encode_sequence(MODEL, variables, f))(frames))
+    one, carry = jax.jit(lambda m, f: step(MODEL, variables, m, f)), BevMemory.empty(CONFIG)
+    for t in range(4):
+        carry, bev = one(carry, jax.tree.map(lambda leaf, t=t: leaf[t], frames))
+        np.testing.assert_array_equal(bev, scanned[t])
+    none = BevMemory.empty(CONFIG)
+    alone = encode(levels(3), ring(), none, POSE)
+    np.testing.assert_allclose(scanned[3], alone, atol=1e-5)
+    assert np.abs(scanned[2] - encode(levels(2), ring(), none, POSE)).max() > 0.05
+
+
+def test_cameras_have_no_order_but_their_own_embedding(encode, variables, memory):
+    out = encode(levels(), ring(), memory, POSE)
+    order = np.array([2, 0, 1])
+    params = variables["params"] | {"cameras": variables["params"]["cameras"][order]}
+    shuffled = jax.tree.map(lambda leaf: leaf[order], ring())
+    other = jax.jit(lambda *a: MODEL.apply({"params": params}, *a))
+    same = other([level[order] for level in levels()], shuffled, memory, POSE)
+    np.testing.assert_allclose(same, out, atol=2e-5)
+
+
+def test_an_invalid_camera_may_hold_anything(encode, memory):
+    views = ring()
+    gone = views.replace(valid=np.array([True, False, True]))
+    garbage = gone.replace(
+        intrinsics=np.where(gone.valid[:, None, None], views.intrinsics, np.nan),
+        camera_from_ego=np.where(gone.valid[:, None, None], views.camera_from_ego, np.nan),
+        size=np.where(gone.valid[:, None], views.size, 0),
+    )
+    bad = [np.where(gone.valid[:, None, None, None], level, np.nan).astype(np.float32) for level in levels()]
+    clean = encode(levels(), gone, memory, POSE)
+    np.testing.assert_array_equal(clean, encode(bad, garbage, memory, POSE))
+    assert np.isfinite(clean).all()
+    assert np.abs(clean - encode(levels(), views, memory, POSE)).max() > 0.05
+
+
+def test_gradients_are_finite_whatever_padding_holds(variables):
+    views = ring().replace(valid=np.array([True, False, True]))
+    views = views.replace(camera_from_ego=np.where(views.valid[:, None, None], views.camera_from_ego, np.nan))
+    bad = [np.where(views.valid[:, None, None, None], level, np.nan).astype(np.float32) for level in levels()]
+    empty = BevMemory(np.full((5, 10, 8), np.nan, np.float32), np.array(False))
+    config = replace(CONFIG, capacity=20, remat=True)
+
+    def loss(params, features):
+        return jnp.square(BevFormer(config).apply({"params": params}, features, views, empty, POSE * np.nan)).sum()
+
+    by_params, by_features = jax.jit(jax.grad(loss, (0, 1)))(variables["params"], bad)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((by_params, by_features)))
+    assert np.abs(by_features[0][0]).max() > 0
+    assert not np.asarray(by_features[0][1]).any()
+
+
+def test_capacity_and_rematerialisation_change_no_number(encode, variables, memory):
+    most = int(seen_queries(CONFIG, ring()).max())
+    assert 5 < most < 50
+    config = replace(CONFIG, capacity=most, remat=True)
+    check_capacity(config, ring())
+    compact = jax.jit(lambda *a: BevFormer(config).apply(variables, *a))(levels(), ring(), memory, POSE)
+    np.testing.assert_allclose(compact, encode(levels(), ring(), memory, POSE), atol=2e-5)
+    with pytest.raises(UserError, match=f"a camera sees {most} cells"):
+        check_capacity(replace(config, capacity=most - 1), ring())
+
+
+def test_levels_and_cameras_must_fit_the_configuration(variables):
+    for features, views in ((levels()[:1], ring()), (levels(cameras=4), ring(4))):
+        with pytest.raises(UserError, match="2 levels of at most 3 cameras"):
+            MODEL.apply(variables, features, views, None, np.eye(4, dtype=np.float32))
+
+
+def test_smaller_images_lie_in_the_corner_of_their_array():
+    """In an array twice as wide and high, the same pixels lie at half the share of it."""
+    views = ring()
+    reference, visible = see_pillars(CONFIG, views)
+    larger = views.replace(image=np.zeros((3, 96, 128, 3), np.uint8))
+    halved, same = see_pillars(CONFIG, larger)
+    np.testing.assert_array_equal(same, visible)
+    np.testing.assert_allclose(2 * halved, reference, rtol=1e-6)

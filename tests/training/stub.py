@@ -46,3 +46,19 @@ def line_arrays(examples: int = 20) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(7)
     x = rng.normal(size=(examples, 4)).astype(np.float32)
     return {"x": x, "y": (x @ [1.0, -2.0, 0.5, 3.0]).astype(np.float32)}
+
+
+class LineDataset:
+    """The same examples one by one; it keeps the order in which they were asked for."""
+
+    name = "lines"
+
+    def __init__(self) -> None:
+        self.arrays, self.asked = line_arrays(), []
+
+    def __len__(self) -> int:
+        return len(self.arrays["y"])
+
+    def example(self, index: int) -> dict[str, np.ndarray]:
+        self.asked.append(index)
+        return {name: values[index] for name, values in self.arrays.items()}

@@ -30,9 +30,12 @@ def score(params) -> dict[str, float]:
     return {"score": -float(jnp.abs(params["line"]["kernel"]).sum())}
 
 
-def run(folder: Path, *, start="new", config=CONFIG, optim=OPTIM, task=TASK, **others) -> loop.TrainingResult:
+def run(
+    folder: Path, *, start="new", config=CONFIG, optim=OPTIM, task=TASK, arrays=None, **others
+) -> loop.TrainingResult:
     options = {"resolved": RESOLVED, "evaluate": score, "progress": False} | others
-    return loop.train(task, line_arrays(), folder, config=config, optim=optim, start=start, **options)
+    arrays = line_arrays() if arrays is None else arrays
+    return loop.train(task, arrays, folder, config=config, optim=optim, start=start, **options)
 
 
 def main() -> None:

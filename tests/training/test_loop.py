@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from tests.shared import ROOT
-from tests.training.stub import LineTask, line_arrays
+from tests.training.stub import LineDataset, LineTask, line_arrays
 from tests.training.stub_run import CONFIG, OPTIM, RESOLVED, run, score
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
+from tflane_jax.training.batches import batch_indices
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.loop import train
 from tflane_jax.training.records import read_records
@@ -78,6 +80,24 @@ def test_a_signal_ends_the_step_and_keeps_it(whole, tmp_path, number):
     assert (result.step, result.stopped_by) == (10, number)
     run(tmp_path / "run", start="resume")
     assert arrays(tmp_path / "run") == arrays(whole)
+
+
+def test_streamed_data_give_the_same_bits_and_go_on_where_they_were(whole, tmp_path):
+    """The position is the step of the checkpoint: a resumed run asks for the batch that comes next."""
+
+    def evaluate_and_stop(params):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return score(params)
+
+    folder, (before, after) = tmp_path / "run", (LineDataset(), LineDataset())
+    assert run(folder, arrays=Streamed(before, StreamingConfig(threads=3)), evaluate=evaluate_and_stop).step == 10
+    assert Checkpoints(folder / "checkpoints").manifest(10).step == 10
+    resumed = run(folder, start="resume", arrays=Streamed(after, StreamingConfig(threads=0)))
+    assert resumed.step == 30
+    assert arrays(folder) == arrays(whole)
+    assert timeless(folder) == timeless(whole)
+    expected = np.concatenate([batch_indices(0, step, len(after), CONFIG.batch_size) for step in range(10, 30)])
+    assert after.asked == [0, *expected]  # the first one is asked for its shapes
 
 
 def test_a_complete_run_resumes_to_itself(whole):

@@ -86,8 +86,13 @@ class Streamed:
             grain.ReadOptions(num_threads=self.config.threads, prefetch_buffer_size=ahead)
         )
         if self.config.processes:
+            _mark_flags_as_parsed()
             loaded = loaded.mp_prefetch(grain.MultiprocessingOptions(num_workers=self.config.processes))
-        yield from loaded
+        iterator = iter(loaded)
+        try:
+            yield from iterator
+        finally:
+            iterator.close()
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,14 @@ class _Load:
         index, key = self.requests(int(number))
         example = self.source.example(index)
         return example if self.prepare is None else self.prepare(example, key)
+
+
+def _mark_flags_as_parsed() -> None:
+    """Let grain start processes in a program that has no absl flags: it asks for one of its own."""
+    from absl import flags
+
+    if not flags.FLAGS.is_parsed():
+        flags.FLAGS.mark_as_parsed()
 
 
 def _grain() -> ModuleType:

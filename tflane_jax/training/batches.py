@@ -6,6 +6,7 @@ either way gives the same batches.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -102,7 +103,7 @@ def batches(
     def streamed(step: int) -> list[Any]:
         return [stack_examples([next(stream) for _ in order.places]) for _ in seeds]
 
-    stream: Iterator[Any] = iter(())
+    stream: Generator[Any] = _nothing()
     if isinstance(arrays, Streamed):
         stream = arrays.stream(order, len(steps) * len(seeds) * rows, prepare)
 
@@ -111,7 +112,7 @@ def batches(
         batch = parts[0] if len(seeds) == 1 else jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
         return jax.device_put(batch)
 
-    with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
+    with contextlib.closing(stream), ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
         ahead = None
         for step in steps:
             batch = fetch(step) if ahead is None else ahead.result()
@@ -126,16 +127,21 @@ def ordered_batches(arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]
     """
     examples = count(arrays)
     starts = range(0, examples, batch_size)
-    stream: Iterator[Any] = iter(())
+    stream: Generator[Any] = _nothing()
     if isinstance(arrays, Streamed):
         stream = arrays.stream(_InOrder(examples), len(starts) * batch_size)
-    for start in starts:
-        if isinstance(arrays, Streamed):
-            batch = stack_examples([next(stream) for _ in range(batch_size)])
-        else:
-            filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
-            batch = jax.tree.map(lambda leaf, rows=filled: leaf[rows], arrays)
-        yield range(start, min(start + batch_size, examples)), batch
+    with contextlib.closing(stream):
+        for start in starts:
+            if isinstance(arrays, Streamed):
+                batch = stack_examples([next(stream) for _ in range(batch_size)])
+            else:
+                filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
+                batch = jax.tree.map(lambda leaf, rows=filled: leaf[rows], arrays)
+            yield range(start, min(start + batch_size, examples)), batch
+
+
+def _nothing() -> Generator[Any]:
+    yield from ()
 
 
 def _row(batch: Any, index: int) -> Any:

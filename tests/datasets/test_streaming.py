@@ -1,0 +1,112 @@
+"""Examples read while they are used: the same as from memory, whatever the workers."""
+
+import dataclasses
+import threading
+import time
+from functools import partial
+
+import jax
+import numpy as np
+import pytest
+
+from tests.fakes import BrokenDataset, FakeConfig, FakeDataset
+from tflane_jax.datasets.loading import keep, load_arrays
+from tflane_jax.datasets.streaming import Request, Streamed, StreamingConfig
+from tflane_jax.errors import UserError
+from tflane_jax.training.batches import batches, first_example, ordered_batches
+
+PARTS = ("lanes", "traffic_elements")
+SIZE, BATCH = 7, 3
+
+
+def streamed(*, dataset=None, **workers) -> Streamed:
+    config = StreamingConfig(**{"threads": 2, "ahead": 4} | workers)
+    return Streamed(dataset or FakeDataset(FakeConfig(SIZE)), config, partial(keep, parts=PARTS))
+
+
+def in_memory():
+    return load_arrays(FakeDataset(FakeConfig(SIZE)), parts=PARTS, progress=False)
+
+
+def shifted(example, key):
+    """Augment an example by where it stands: seed, step, place."""
+    seed, step, place = key
+    lanes = example.lanes.replace(points=example.lanes.points + np.float32(100 * seed + 10 * step + place))
+    return example.replace(lanes=lanes)
+
+
+def assert_same(left, right):
+    assert jax.tree.structure(left) == jax.tree.structure(right)
+    jax.tree.map(np.testing.assert_array_equal, left, right)
+
+
+@pytest.mark.parametrize("seeds", [(4,), (4, 9)])
+@pytest.mark.parametrize("threads", [0, 1, 4])
+def test_batches_are_those_of_arrays_in_memory(seeds, threads):
+    steps = range(3, 7)
+    ours = batches(streamed(threads=threads), seeds, steps, BATCH, shifted)
+    for batch, expected in zip(ours, batches(in_memory(), seeds, steps, BATCH, shifted), strict=True):
+        assert_same(batch, expected)
+
+
+@pytest.mark.slow
+def test_processes_change_nothing():
+    ours = batches(streamed(processes=2), (4,), range(4), BATCH, shifted)
+    for batch, expected in zip(ours, batches(in_memory(), (4,), range(4), BATCH, shifted), strict=True):
+        assert_same(batch, expected)
+
+
+@pytest.mark.parametrize("make", [streamed, in_memory])
+def test_processes_of_a_run_share_every_batch(make):
+    def rows(share):
+        return list(batches(make(), (4,), range(2), 4, shifted, share=share))
+
+    whole, parts = rows((0, 1)), [rows((0, 2)), rows((1, 2))]
+    for step in range(2):
+        both = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(part[step] for part in parts))
+        assert_same(both, jax.device_get(whole[step]))
+    with pytest.raises(ValueError, match="3 processes cannot share batches of 4"):
+        rows((0, 3))
+
+
+def test_an_evaluation_goes_through_all_examples_in_order():
+    ours, expected = (list(ordered_batches(arrays, BATCH)) for arrays in (streamed(), in_memory()))
+    assert [indices for indices, _ in ours] == [range(0, 3), range(3, 6), range(6, 7)]
+    for (_, batch), (_, other) in zip(ours, expected, strict=True):
+        assert_same(batch, other)
+
+
+def test_one_example_gives_the_shapes():
+    assert_same(first_example(streamed()), first_example(in_memory()))
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_an_error_in_a_worker_reaches_the_caller(threads):
+    broken = Streamed(BrokenDataset(FakeConfig(4)), StreamingConfig(threads=threads))
+    with pytest.raises(RuntimeError, match="example 2 is broken"):
+        list(broken.stream(lambda number: Request(number, (0, 0, number)), 4))
+
+
+def test_what_is_not_needed_is_not_loaded():
+    loaded = []
+
+    class Counting(FakeDataset):
+        def example(self, index):
+            loaded.append(index)
+            return super().example(index)
+
+    feed = streamed(dataset=Counting(FakeConfig(SIZE)), ahead=4).stream(lambda n: Request(n % SIZE, (0, 0, n)), 1000)
+    next(feed)
+    feed.close()
+    assert len(loaded) <= 4 + 3
+    deadline = time.monotonic() + 5.0
+    while any("grain" in thread.name for thread in threading.enumerate()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not [thread.name for thread in threading.enumerate() if "grain" in thread.name]
+
+
+@pytest.mark.parametrize("change", [{"threads": -1}, {"processes": -1}, {"ahead": 0}])
+def test_settings_that_cannot_work_are_named(change):
+    source = dataclasses.replace(streamed(), config=StreamingConfig(**change))
+    with pytest.raises(UserError, match=f"{next(iter(change))}="):
+        next(source.stream(lambda number: Request(number, (0, 0, number)), 4))

@@ -8,6 +8,7 @@ from tflane_jax.plots.attention import (
     draw_temporal_mask,
 )
 from tflane_jax.plots.bev import draw_prediction, draw_scene
+from tflane_jax.plots.cameras import save_camera_views
 from tflane_jax.plots.curves import save_curves
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.gallery import add_legend, save_examples, show_dataset
@@ -25,6 +26,7 @@ __all__ = [
     "draw_temporal_mask",
     "format_table",
     "new_figure",
+    "save_camera_views",
     "save_curves",
     "save_examples",
     "save_figure",

@@ -1,0 +1,224 @@
+"""Camera images with lanes and traffic elements drawn into them, and the scene from above beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import PerceptionRange, invert_pose
+from tflane_jax.geometry.cameras import project
+from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.plots import style
+from tflane_jax.plots.bev import GROUND, VIEW, draw_ego, draw_evidence, draw_lanes, draw_prediction, draw_scene, prepare
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.images import draw_image
+from tflane_jax.scene import CameraViews, ElementPrediction, Example, LanePrediction, TrafficElements
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ATTRIBUTES = (
+    "?", "red", "green", "yellow", "straight", "left", "right", "no left", "no right", "U-turn", "no U-turn",
+    "slight left", "slight right",
+)  # fmt: skip
+"""Short names of OpenLane-V2's attributes of traffic elements, by number."""
+
+_PANEL = 3.4  # inches
+# Points on a lane in an image: closer together than half a metre even on the longest.
+_POINTS = 201
+# Lanes nearer to the image plane than this are cut off, metres.
+_NEAR = 0.5
+# Images smaller than this are shown with sharp pixels.
+_PIXELATED = 400
+
+Tree = TypeVar("Tree")
+
+
+def save_camera_views(
+    path: Path,
+    examples: Example,
+    lanes: LanePrediction | None = None,
+    elements: ElementPrediction | None = None,
+    *,
+    titles: Sequence[str] = (),
+    threshold: float = 0.3,
+    ground: PerceptionRange = GROUND,
+    view: PerceptionRange = VIEW,
+) -> Path:
+    """Write two rows per example: the cameras that look ahead with the scene from above, then those that look back.
+
+    Without predictions the truth is drawn, with predictions these; from above, the truth stands thin beside them. Lanes
+    are coloured by the direction in which they are driven, seen from the vehicle.
+
+    Args:
+        path: .png, .pdf or .svg.
+        examples: B of them with camera images, stacked along a leading axis.
+        lanes, elements: predictions, stacked in the same way, one layer.
+        titles: one per example; default their numbers.
+        threshold: lowest score of what is drawn.
+        ground, view: see `draw_scene`.
+
+    Returns:
+        `path`.
+
+    Raises:
+        UserError: the examples have no camera images.
+        ValueError: the numbers of examples, predictions and titles differ.
+    """
+    if examples.cameras is None:
+        raise UserError("these examples have no camera images: set ExampleConfig.cameras")
+    count = len(examples.has_previous)
+    titles = titles or [f"example {row}" for row in range(count)]
+    sizes = {"titles": len(titles)}
+    sizes |= {} if lanes is None else {"lanes": len(lanes.points)}
+    sizes |= {} if elements is None else {"elements": len(elements.box)}
+    if any(size != count for size in sizes.values()):
+        raise ValueError(f"{count} examples, but {sizes}")
+    first = _pick(examples, 0)
+    assert first.cameras is not None
+    ahead, back = _rows_of_cameras(first.cameras)
+    columns = max(len(ahead) + 1, len(back))
+    height, width = examples.cameras.image.shape[2:4]
+    figure, axes = new_figure(2 * count, columns, panel=(_PANEL, _PANEL * min(height / width, 0.8) + 0.25))
+    for ax in axes.flat:
+        ax.set_axis_off()
+    for row, title in enumerate(titles):
+        example = _pick(examples, row)
+        found = None if lanes is None else _pick(lanes, row)
+        boxes = None if elements is None else _pick(elements, row)
+        for numbers, line in ((ahead, axes[2 * row]), (back, axes[2 * row + 1])):
+            for number, ax in zip(numbers, line, strict=False):
+                draw_camera(ax, example, number, found, boxes, threshold=threshold)
+        above = axes[2 * row, len(ahead)]
+        above.set_axis_on()
+        _draw_above(above, example, found, title, threshold, ground, view)
+    return save_figure(figure, path)
+
+
+def draw_camera(
+    ax: Axes,
+    example: Example,
+    number: int,
+    lanes: LanePrediction | None = None,
+    elements: ElementPrediction | None = None,
+    *,
+    threshold: float = 0.3,
+) -> None:
+    """Draw one camera's image with lanes, and in camera 0 with traffic elements: the truth, or what is predicted.
+
+    Args:
+        ax: where to draw.
+        example: one example with camera images.
+        number: of the camera.
+        lanes, elements: predictions for the example; with either, the truth is left out.
+        threshold: lowest score of what is drawn.
+    """
+    views = example.cameras
+    assert views is not None
+    width, height = (int(side) for side in np.asarray(views.size)[number])
+    image = np.asarray(views.image)[number, :height, :width]
+    draw_image(ax, image, _heading(views, number) if bool(np.asarray(views.valid)[number]) else "no image")
+    if max(width, height) < _PIXELATED:
+        ax.images[-1].set_interpolation("nearest")
+    predicted = lanes is not None or elements is not None
+    if lanes is not None:
+        draw_projected(ax, views, number, np.asarray(lanes.points)[np.asarray(lanes.scores) >= threshold])
+    elif not predicted:
+        draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
+    if number == 0 and elements is not None:
+        score = 1.0 / (1.0 + np.exp(-np.asarray(elements.logits, np.float64)))
+        draw_boxes(ax, np.asarray(elements.box), score.argmax(-1), score.max(-1) >= threshold)
+    elif number == 0 and not predicted and example.traffic_elements is not None:
+        truth: TrafficElements = example.traffic_elements
+        draw_boxes(ax, np.asarray(truth.box), np.asarray(truth.attribute), np.asarray(truth.valid))
+
+
+def draw_projected(ax: Axes, views: CameraViews, number: int, lines: Float[np.ndarray, "n p 3"]) -> None:
+    """Draw lines of the ego frame into a camera's image, coloured by direction: forward green, to the left blue, back
+    red."""
+    from matplotlib.collections import LineCollection
+
+    if not len(lines):
+        return
+    dense = resample_lines(list(np.asarray(lines, np.float64)), _POINTS)
+    width, height = np.asarray(views.size)[number]
+    pixels, depth, _ = project(
+        dense.reshape(-1, 3), np.asarray(views.intrinsics, np.float64)[number],
+        np.asarray(views.camera_from_ego, np.float64)[number],
+    )  # fmt: skip
+    pixels, depth = pixels.reshape(*dense.shape[:2], 2), depth.reshape(dense.shape[:2])
+    margin = 0.1 * max(width, height)
+    shown = (depth > _NEAR) & ((pixels > -margin) & (pixels < [width + margin, height + margin])).all(-1)
+    step = np.diff(dense[..., :2], axis=1)
+    colours = _direction_colours(np.arctan2(step[..., 1], step[..., 0]))
+    pieces = shown[:, 1:] & shown[:, :-1]
+    parts = np.stack([pixels[:, :-1], pixels[:, 1:]], 2)[pieces]
+    ax.add_collection(LineCollection(list(parts), colors=colours[pieces], linewidths=1.3, alpha=0.85, zorder=2.0))
+
+
+def draw_boxes(
+    ax: Axes, box: Float[np.ndarray, "e 2 2"], attribute: Int[np.ndarray, " e"], chosen: Bool[np.ndarray, " e"]
+) -> None:
+    """Draw boxes of traffic elements (pixels) with what they show."""
+    from matplotlib.patches import Rectangle
+
+    for (low, high), shows in zip(box[chosen], attribute[chosen].tolist(), strict=True):
+        colour = style.LIGHT.get(shows, style.PREDICTION)
+        ax.add_patch(Rectangle(low, *(high - low), fill=False, edgecolor=colour, linewidth=1.0, zorder=3.0))
+        label = ATTRIBUTES[shows]
+        ax.text(low[0], low[1], label, color=colour, fontsize=5, va="bottom", ha="left", clip_on=True, zorder=3.1)
+
+
+def _draw_above(
+    ax: Axes, example: Example, lanes: LanePrediction | None, title: str, threshold: float, ground: PerceptionRange,
+    view: PerceptionRange,
+) -> None:  # fmt: skip
+    if lanes is None:
+        layers = ("hidden", "areas", "lanes", "traffic", "elements")
+        draw_scene(ax, example, layers=layers, ground=ground, view=view, title=title)
+        return
+    prepare(ax, view, title)
+    if example.bev is not None:
+        draw_evidence(ax, example.bev, ground, strength=0.3)
+    draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
+    draw_prediction(ax, lanes, threshold=threshold)
+    draw_ego(ax)
+
+
+def _azimuth(views: CameraViews) -> Float[np.ndarray, " v"]:
+    axis = invert_pose(np.asarray(views.camera_from_ego, np.float64))[:, :3, 2]
+    return np.arctan2(axis[:, 1], axis[:, 0])
+
+
+def _rows_of_cameras(views: CameraViews) -> tuple[list[int], list[int]]:
+    """Return the cameras that look ahead and those that do not, each from left to right as one turns around."""
+    azimuth = _azimuth(views)
+    order = np.argsort(-azimuth, kind="stable")
+    ahead = np.cos(azimuth) > 0.25
+    # Behind, one turns from the left shoulder over the back to the right one.
+    back = order[~ahead[order]]
+    return order[ahead[order]].tolist(), sorted(back.tolist(), key=lambda number: azimuth[number] % (2.0 * np.pi))
+
+
+def _heading(views: CameraViews, number: int) -> str:
+    degrees = round(float(np.rad2deg(_azimuth(views)[number])))
+    if abs(degrees) <= 2:
+        return "ahead"
+    return "back" if abs(degrees) >= 178 else f"{abs(degrees)}° {'left' if degrees > 0 else 'right'}"
+
+
+def _direction_colours(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    from matplotlib.colors import hsv_to_rgb
+
+    hue = (angle / (2.0 * np.pi) + 1.0 / 3.0) % 1.0
+    return hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.75), np.ones_like(hue)], -1))
+
+
+def _pick(stacked: Tree, row: int) -> Tree:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

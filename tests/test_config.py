@@ -10,7 +10,7 @@ from typing import Literal
 import pytest
 
 from tests.shared import ROOT
-from tflane_jax.config import LogData, RunConfig, apply_overrides, load_ablations, load_config
+from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, apply_overrides, load_ablations, load_config
 from tflane_jax.config_io import from_json, settings, to_json, to_text
 from tflane_jax.errors import UserError
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
@@ -51,8 +51,13 @@ def test_every_golden_text_has_its_configuration():
 
 
 @pytest.mark.parametrize(
-    "config", [RunConfig(), FLOW, RunConfig(data=LogData(Path("a"), Path("b/c"), Path("d"), openlane=Path("e")))]
-)
+    "config",
+    [
+        RunConfig(), FLOW, RunConfig(data=LogData(Path("a"), Path("b/c"), Path("d"), openlane=Path("e"))),
+        RunConfig(data=OpenLaneV2Data(Path("a"), subset="B")),
+        RunConfig(data=OpenLaneV2Data(Path("a"), augmentation=None)),
+    ],
+)  # fmt: skip
 def test_json_round_trip(config):
     assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config
     assert hash(config) == hash(from_json(RunConfig, to_json(config)))
@@ -131,6 +136,14 @@ def test_overrides_change_what_they_name(arguments, changed):
     before, after = dict(settings(FLOW)), dict(settings(apply_overrides(FLOW, arguments)))
     differing = {k: v for k, v in after.items() if v != before[k] and not dataclasses.is_dataclass(v)}
     assert differing == changed
+
+
+def test_settings_of_other_data_can_be_changed():
+    config = RunConfig(data=OpenLaneV2Data(Path("a")))
+    arguments = ["--data.image.scale", "0.25", "--data.augmentation.grid-mask", "0.7", "--data.root", "b"]
+    data = apply_overrides(config, arguments).data
+    assert isinstance(data, OpenLaneV2Data)
+    assert (data.image.scale, data.augmentation.grid_mask, data.root) == (0.25, 0.7, Path("b"))
 
 
 @pytest.mark.parametrize(

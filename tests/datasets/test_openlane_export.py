@@ -7,6 +7,7 @@ import pytest
 
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tests.fakes import FakeConfig, FakeDataset
+from tflane_jax.cli import main
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.openlane_export import dense, export_openlane_v2
 from tflane_jax.datasets.openlane_frames import SUBSETS
@@ -121,6 +122,19 @@ def test_a_jpeg_looks_the_same(tmp_path):
     expected = made.example(1).cameras
     np.testing.assert_array_equal(views.size, expected.size)
     assert np.abs(views.image.astype(int) - expected.image[:, :32, :48]).mean() < 1.5
+
+
+def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("tflane_jax.commands.data_export.open_dataset", lambda source: DriveDataset())
+    (tmp_path / "config.py").write_text("from tflane_jax.config import RunConfig as get_config")
+    command = ["data", "export", "--config", str(tmp_path / "config.py"), "--out", str(tmp_path / "out")]
+    assert main([*command, "--splits", "val", "test", "--data.val", "5"]) == 0
+    said = capsys.readouterr().out
+    assert "| val " in said
+    assert "| test " in said
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["data_dict_subset_B.json", "test", "val"]
+    assert main(command) == 2
+    assert "is not empty" in capsys.readouterr().err
 
 
 def test_rigs_have_the_official_names():

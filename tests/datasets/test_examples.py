@@ -9,9 +9,12 @@ import pytest
 from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.examples import make_example, occluder_boxes, traffic_flow
+from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
+from tflane_jax.geometry.cameras import project
 from tflane_jax.logs import MapElement
 from tflane_jax.scene import stack_examples
+from tflane_jax.world.ring_cameras import CameraRigConfig
 
 ROAD = lane_map(segment(0, [(900.0, -2000.0), (1100.0, -2000.0)]))
 POSES = drive(30)
@@ -157,3 +160,38 @@ def test_a_light_shows_its_state_at_the_key_frame():
         elements = make_example(recording, 0, ExampleConfig()).traffic_elements
         assert elements.attribute[:2].tolist() == expected
         assert elements.lane[0].tolist() == [True, True] + [False] * 22
+
+
+def test_cameras_bring_their_images_and_the_elements_seen_in_them():
+    """A light ahead and one behind: without cameras both are the truth, with cameras the one in the image."""
+    pytest.importorskip("cv2")
+    ahead, behind = (
+        MapElement(np.array([1000.0 + x, -2000.0, 5.0]), np.pi if x > 0 else 0.0, 1, 1, (0,)) for x in (22.0, -22.0)
+    )
+    pose = yaw_pose(1000.0, -2000.0, 0.0)
+    recording = log(
+        dataclasses.replace(ROAD, elements=(behind, ahead)), tracks(np.zeros((1, 0, 3))), [pose], [(0, pose)]
+    )
+    plain = make_example(recording, 0, ExampleConfig())
+    rig = CameraRigConfig(severity=0.0)
+    seen = make_example(recording, 0, ExampleConfig(cameras=rig))
+    alone = make_example(recording, 0, ExampleConfig(sensor=None, cameras=rig))
+    for example in (plain, seen, alone):
+        example.validate()
+    assert plain.cameras is None
+    assert plain.traffic_elements.valid.sum() == 2
+    assert not plain.traffic_elements.box.any()
+    assert seen.cameras.image.shape == (6, 90, 160, 3)
+    assert seen.traffic_elements.valid.sum() == 1
+    np.testing.assert_allclose(seen.traffic_elements.position[0], [22.0, 0.0, 5.0], atol=1e-5)
+    (pixel,), _, _ = project(
+        seen.traffic_elements.position[:1], seen.cameras.intrinsics[0], seen.cameras.camera_from_ego[0]
+    )
+    low, high = seen.traffic_elements.box[0]
+    assert (low < pixel).all()
+    assert (pixel < high).all()
+    np.testing.assert_array_equal(plain.bev, seen.bev)
+    assert alone.bev is alone.hidden is None
+    np.testing.assert_array_equal(alone.cameras.image, seen.cameras.image)
+    restored = example_from_leaves(example_leaves(alone))
+    np.testing.assert_array_equal(restored.cameras.image, alone.cameras.image)

@@ -97,7 +97,7 @@ def distort(
         if changes[2]:
             colour[..., 1] = np.minimum(colour[..., 1] * np.float32(saturation), 1.0)
         if changes[3]:
-            colour[..., 0] = np.mod(colour[..., 0] + np.float32(hue), 360.0)
+            colour[..., 0] += np.float32(hue)  # OpenCV goes round the circle; np.mod would take as long as all the rest
         out = cv2.cvtColor(colour, cv2.COLOR_HSV2RGB)
     if changes[1] and not early:
         out *= np.float32(contrast)

@@ -53,9 +53,7 @@ class BevFormer(nn.Module):
             deterministic: no dropout; with it, the key `dropout` is needed.
         """
         config = self.config
-        if memory is None:
-            # The barrier lets XLA round as it does with an invalid memory, which it cannot simplify away.
-            memory = lax.optimization_barrier(BevMemory.empty(config))
+        memory = memory or _no_memory(config)
         # An invalid memory's pose may be anything.
         pose = jnp.where(memory.valid, previous_from_ego, jnp.eye(4, dtype=previous_from_ego.dtype))
         history = BevMemory(jnp.where(memory.valid, memory.features, 0.0), memory.valid)
@@ -100,6 +98,11 @@ class BevFormer(nn.Module):
         encoder = BevEncoder(config, name="encoder")
         encoded = encoder(queries, position, tokens, shapes, reference, visible, history, shift, deterministic)
         return encoded.reshape(grid.rows, grid.columns, config.dim)
+
+
+def _no_memory(config: BevFormerConfig) -> BevMemory:
+    # The barrier lets XLA round as it does with an invalid memory, which it cannot simplify away.
+    return lax.optimization_barrier(BevMemory.empty(config))
 
 
 class MotionEmbedding(nn.Module):

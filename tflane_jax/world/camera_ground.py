@@ -18,7 +18,7 @@ from jaxtyping import Float, Int, UInt8
 from tflane_jax.logs import VectorMap
 from tflane_jax.world.camera_paint import Paint
 from tflane_jax.world.front_view_polygons import SHIFT
-from tflane_jax.world.front_view_surface import noise_tile
+from tflane_jax.world.ground_window import NOISE_SIGMA, Window, ground_noise
 from tflane_jax.world.road_area import road_rings
 
 # cv2 fills the texels that a smooth edge passes through too: what it draws is wider by this, texels.
@@ -26,48 +26,10 @@ _GROWTH = 1.4
 _KERB, _SIDEWALK = 0.22, 3.2
 _GRASS = ((0.27, 0.33, 0.15), (0.33, 0.36, 0.19), (0.4, 0.37, 0.25), (0.22, 0.29, 0.13))
 _PAVING = ((0.55, 0.53, 0.5), (0.5, 0.5, 0.5), (0.58, 0.53, 0.47))
-# Windows have a multiple of so many texels, so that they can be halved five times.
-_BLOCK = 32
-# Sizes of blotches and grain of the ground and of the places from which paint has gone, metres; what one standard
-# deviation of noise is in bytes.
-_BLOTCH, _GRAIN, _PATCH, _SIGMA = 0.96, 0.04, 0.16, 40.0
+# Sizes of blotches and grain of the ground and of the places from which paint has gone, metres.
+_BLOTCH, _GRAIN, _PATCH = 0.96, 0.04, 0.16
 # Footprints up to this many times longer than wide are averaged over their length as well; longer ones blur sideways.
 _STRETCH = 5.0
-
-
-@dataclass(frozen=True)
-class Window:
-    """An axis-aligned part of the ground.
-
-    Attributes:
-        low: (2,) global x and y of its corner, metres.
-        texel: metres.
-        columns, rows: texels along x and y.
-    """
-
-    low: tuple[float, float]
-    texel: float
-    columns: int
-    rows: int
-
-    def fixed(self, points: Float[np.ndarray, "*n 2"]) -> Int[np.ndarray, "*n 2"]:
-        """Return points as cv2 takes them: from the first texel's centre, in 1/16 texels."""
-        return np.round(((points - np.array(self.low)) / self.texel - 0.5) * (1 << SHIFT)).astype(np.int32)
-
-    def meets(self, corners: Float[np.ndarray, "n k 2"]) -> np.ndarray:
-        """Return which polygons may reach into the window."""
-        low = np.array(self.low)
-        high = low + self.texel * np.array([self.columns, self.rows])
-        return ((corners.max(1) > low) & (corners.min(1) < high)).all(-1)
-
-
-def window_around(points: Float[np.ndarray, "n 2"], reach: float, texel: float) -> Window:
-    """Return the window that holds all that lies within `reach` metres of the points along x and y."""
-    # On a grid of whole texels, so that windows that overlap have the same texels; halving leaves nothing over.
-    first = np.floor((points.min(0) - reach) / texel)
-    count = np.ceil(((points.max(0) + reach) / texel - first) / _BLOCK) * _BLOCK
-    low = first * texel
-    return Window((float(low[0]), float(low[1])), texel, int(count[0]), int(count[1]))
 
 
 @dataclass(frozen=True)
@@ -202,35 +164,12 @@ def _texture(image: UInt8[np.ndarray, "h w 3"], window: Window, dirt: float) -> 
     """Multiply the colours by blotches and grain that are fixed to the ground, in place."""
     import cv2
 
-    blotches, grain = (0.035 + 0.05 * dirt) * 128.0 / _SIGMA, (0.05 + 0.03 * dirt) * 128.0 / _SIGMA
+    blotches, grain = (0.035 + 0.05 * dirt) * 128.0 / NOISE_SIGMA, (0.05 + 0.03 * dirt) * 128.0 / NOISE_SIGMA
     # Grain finer than a texel averages out.
     grain *= min(1.0, _GRAIN / window.texel)
     middle = 128.0 * (1.0 - blotches - grain)
-    factor = cv2.addWeighted(_noise(window, _BLOTCH), blotches, _noise(window, _GRAIN), grain, middle)
+    factor = cv2.addWeighted(ground_noise(window, _BLOTCH), blotches, ground_noise(window, _GRAIN), grain, middle)
     cv2.multiply(image, cv2.merge([factor, factor, factor]), image, 1.0 / 128.0)
-
-
-def _noise(window: Window, cell: float) -> UInt8[np.ndarray, "h w"]:
-    """Return noise that is fixed to the ground, 128 + `_SIGMA` for one standard deviation, in cells of about `cell`
-    metres."""
-    import cv2
-
-    texels = max(round(cell / window.texel), 1)
-    tile = _noise_bytes()
-    # From one cell before the window to one behind it, so that cells lie where they lie in every window.
-    first = [round(low / window.texel) // texels - 1 for low in window.low]
-    columns, rows = (
-        (start + np.arange(count // texels + 4)) % len(tile)
-        for start, count in zip(first, (window.columns, window.rows), strict=True)
-    )
-    wide = cv2.resize(tile[rows][:, columns], None, fx=texels, fy=texels, interpolation=cv2.INTER_LINEAR)
-    left, top = (round(low / window.texel) - start * texels for low, start in zip(window.low, first, strict=True))
-    return wide[top : top + window.rows, left : left + window.columns]
-
-
-@functools.cache
-def _noise_bytes() -> UInt8[np.ndarray, "n n"]:
-    return np.clip(128.0 + _SIGMA * noise_tile(), 0.0, 255.0).astype(np.uint8)
 
 
 def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) -> None:
@@ -239,7 +178,7 @@ def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) 
 
     near = np.flatnonzero(window.meets(paint.corners) & (paint.left > 0.02))
     colours, kind = np.unique(paint.colour[near], axis=0, return_inverse=True)
-    rough = _noise(window, _PATCH) if len(near) and paint.left[near].min() < 0.98 else None
+    rough = ground_noise(window, _PATCH) if len(near) and paint.left[near].min() < 0.98 else None
     flat = image.reshape(-1, 3)
     for number, colour in enumerate(colours):
         rows = near[kind == number]
@@ -251,7 +190,7 @@ def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) 
         share = mask.ravel()[painted].astype(np.float32) * np.float32(1.0 / 255.0)
         if rough is not None:
             # Half worn paint is gone in half of the places; fresh and vanished paint are the same everywhere.
-            height = (rough[np.unravel_index(painted, rough.shape)].astype(np.float32) - 128.0) / _SIGMA
+            height = (rough[np.unravel_index(painted, rough.shape)].astype(np.float32) - 128.0) / NOISE_SIGMA
             share *= np.clip(1.0 + 1.6 * (1.0 - share) * np.minimum(height, 0.6), 0.0, 1.0)
         base = flat[painted].astype(np.float32)
         base += share[:, None] * (255.0 * colour.astype(np.float32) - base)

@@ -154,7 +154,7 @@ def _measured(compiled: dict[str, Compiled], seconds: float) -> dict[str, Any]:
 def run(out: Path, seconds: float = 10.0) -> dict[str, Any]:
     """Run everything, print the tables, write `host.json` and `host.md` into `out`, and return the record."""
     batch = examples()
-    traffic = tasks()["+TFM"].model.traffic_flow or TrafficFlowConfig()
+    traffic = tasks()["+TFM"].traffic_flow or TrafficFlowConfig()
     results = inference(batch, seconds) | training(batch, seconds) | seeds(batch, seconds)
     record = {
         "machine": machine(),

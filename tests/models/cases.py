@@ -5,12 +5,20 @@ import dataclasses
 import numpy as np
 
 from tests.priors.test_traffic_flow import make_flow
+from tflane_jax.geometry import BevGrid
+from tflane_jax.layers.fpn import FeaturePyramidConfig
+from tflane_jax.layers.resnet import ResNetConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_decoder import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
-from tflane_jax.scene import Areas, Example, LaneGraph
+from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
 
 BASELINE = TopoNetConfig(
     encoder=EvidenceEncoderConfig(dim=16, dilations=(1,)),
@@ -47,3 +55,38 @@ def make_example(seed: int = 0, instances: int = 9, lanes: int = 4) -> Example:
         previous_from_ego=np.eye(4, dtype=np.float32),
         has_previous=np.zeros((), bool),
     )
+
+
+CAMERA = CameraEncoderConfig(
+    ImageEncoderConfig(ResNetConfig((1, 1, 1, 1), (4, 4, 8, 8), stem_channels=4), pyramid=FeaturePyramidConfig(16, 2)),
+    BevFormerConfig(
+        BevGrid(rows=4, columns=6), dim=16, heads=2, layers=1, hidden=16, dropout=0.1, spatial_points=4, anchors=2,
+        levels=2, cameras=2,
+    ),
+)  # fmt: skip
+ELEMENTS = ElementDecoderConfig(dim=16, heads=2, layers=2, queries=5, hidden=16, sampling_points=2, dropout=0.1)
+CAMERA_TOPONET = dataclasses.replace(
+    WITH_TRAFFIC, encoder=CAMERA, elements=ELEMENTS,
+    decoder=dataclasses.replace(BASELINE.decoder, refine="fixed", dropout=0.1),
+)  # fmt: skip
+CAMERA_DETR = BevFormerDetrConfig(
+    CAMERA, dataclasses.replace(CAMERA_TOPONET.decoder, points=11), ELEMENTS, control_points=5
+)
+
+
+def make_camera_example(seed: int = 0, instances: int = 9, lanes: int = 4, elements: int = 2) -> Example:
+    """Return an example with random images of two cameras, to the front and to the back, the second one smaller."""
+    rng = np.random.default_rng(seed)
+    size = np.array([[96, 64], [80, 48]], np.int32)
+    image = rng.integers(0, 256, (2, 64, 96, 3), dtype=np.uint8)
+    ahead = np.array([[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]], np.float32)
+    back = ahead @ np.diag([-1, -1, 1, 1]).astype(np.float32)
+    intrinsics = np.array([[[40, 0, w / 2], [0, 40, h / 2], [0, 0, 1]] for w, h in size], np.float32)
+    truth = TrafficElements.empty(3, 8)
+    for i in range(elements):
+        truth.box[i] = [[10.0 + 20 * i, 8.0], [22.0 + 20 * i, 20.0 + i]]
+        truth.attribute[i], truth.lane[i, i], truth.valid[i] = 1 + i, True, True
+    return make_example(seed, instances, lanes).replace(
+        bev=None, hidden=None, traffic_elements=truth,
+        cameras=CameraViews(image, size, intrinsics, np.stack([ahead, back]), np.ones(2, bool)),
+    )  # fmt: skip

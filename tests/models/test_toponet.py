@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
+from tflane_jax.errors import UserError
 from tflane_jax.scene import TrafficFlow
 from tflane_jax.training.lane_graph import LaneGraphTask
 
@@ -132,7 +133,7 @@ def test_same_key_same_parameters():
 
 def test_no_bev_is_an_error(fitted):
     task, params, _ = fitted["baseline"]
-    with pytest.raises(ValueError, match="bev is None"):
+    with pytest.raises(UserError, match="bev is None"):
         task.predict(params, make_example().replace(bev=None))
 
 

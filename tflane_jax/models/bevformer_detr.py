@@ -12,16 +12,27 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_basis
-from tflane_jax.models.element_decoder import ElementDecoderConfig, ElementOutput
+from tflane_jax.models.bev_encoder import BevMemory
+from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig, look, make_encoder
+from tflane_jax.models.element_decoder import (
+    PAPER_ELEMENT_DECODER,
+    ElementDecoder,
+    ElementDecoderConfig,
+    ElementOutput,
+)
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
+    PAPER_LANE_DECODER,
     LaneDecoderConfig,
     LaneDecoderLayer,
     LaneHeads,
     LaneQueries,
+    check_elements,
     make_prediction,
 )
-from tflane_jax.scene import Prediction
+from tflane_jax.scene import Example, Prediction
 
 
 @dataclass(frozen=True)
@@ -29,25 +40,55 @@ class BevFormerDetrConfig:
     """The model.
 
     Attributes:
+        encoder: BEV features from cameras or from BEV evidence.
         decoder: lane decoder; references never move (`refine="fixed"`).
-        elements: traffic elements in the front view, or None.
+        elements: traffic elements in the front view, or None. They need cameras, and as many layers as the decoder.
         control_points: a lane is a Bezier curve of so many control points, read at `decoder.points` points; None: a
             lane is its points. Goes with the loss's setting of the same name.
     """
 
+    encoder: CameraEncoderConfig | EvidenceEncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
     control_points: int | None = None
 
     def build(self) -> BevFormerDetr:
-        """Return the Linen module."""
+        """Return the Linen module; raises UserError where its parts do not fit each other."""
+        check_elements(self.encoder, self.decoder, self.elements)
+        if self.decoder.refine != "fixed":
+            raise UserError('the references of BEVFormer-DETR never move: set task.model.decoder.refine to "fixed"')
         return BevFormerDetr(self)
+
+
+def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
+    """Return the sizes of OpenLane-V2's large baseline; its copy in SMERF has `control_points=None`."""
+    decoder = replace(PAPER_LANE_DECODER, queries=100)
+    return BevFormerDetrConfig(PAPER_CAMERA_ENCODER, decoder, PAPER_ELEMENT_DECODER, control_points)
 
 
 class BevFormerDetr(nn.Module):
     """One example in, the predictions of every decoder layer out."""
 
     config: BevFormerDetrConfig
+
+    def setup(self):
+        self.encoder = make_encoder(self.config.encoder)
+        if self.config.elements is not None:
+            self.elements = ElementDecoder(self.config.elements)
+
+    def __call__(self, example: Example, memory: BevMemory | None = None, *, train: bool = False) -> Prediction:
+        """Return predictions with a leading axis over decoder layers; the last one is the answer."""
+        return self.step(example, memory, train=train)[0]
+
+    def step(
+        self, example: Example, memory: BevMemory | None = None, *, train: bool = False
+    ) -> tuple[Prediction, BevMemory | None]:
+        """Return what `__call__` does, and the memory for the next frame; see `TopoNet.step`."""
+        seen = look(self.encoder, example, memory, train=train)
+        elements = None
+        if self.config.elements is not None and seen.front is not None:
+            elements = self.elements(*seen.front, deterministic=not train)
+        return self.decode(seen.bev, elements, deterministic=not train), seen.memory
 
     @nn.compact
     def decode(

@@ -28,7 +28,7 @@ ATTRIBUTES = 13
 
 @dataclass(frozen=True)
 class ElementDecoderConfig:
-    """Sizes; the defaults train on two CPU cores (`toponet.paper_config` has the paper's).
+    """Sizes; the defaults train on two CPU cores, `PAPER_ELEMENT_DECODER` holds TopoNet's.
 
     Attributes:
         dim: channels of features and queries.
@@ -43,13 +43,18 @@ class ElementDecoderConfig:
 
     dim: int = 64
     heads: int = 8
-    levels: int = 3
+    levels: int = 2
     encoder_layers: int = 1
     layers: int = 3
     queries: int = 16
     sampling_points: int = 4
     hidden: int = 128
     dropout: float = 0.0
+
+
+PAPER_ELEMENT_DECODER = ElementDecoderConfig(
+    dim=256, levels=4, encoder_layers=6, layers=6, queries=100, hidden=512, dropout=0.1
+)
 
 
 @struct.dataclass

@@ -20,19 +20,21 @@ from jax import lax
 from jaxtyping import Array, Float
 from scipy.stats import qmc
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention, sample_bilinear
 from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGraphFeedForward
 from tflane_jax.layers.positions import inverse_sigmoid
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
-from tflane_jax.models.element_decoder import ElementOutput
+from tflane_jax.models.camera_encoder import CameraEncoderConfig, EncoderConfig
+from tflane_jax.models.element_decoder import ElementDecoderConfig, ElementOutput
 from tflane_jax.scene import ElementPrediction, LanePrediction, Prediction
 
 
 @dataclass(frozen=True)
 class LaneDecoderConfig:
-    """Sizes of the decoder; the defaults train on two CPU cores (`toponet.paper_config` has the paper's).
+    """Sizes of the decoder; the defaults train on two CPU cores, `PAPER_LANE_DECODER` holds TopoNet's.
 
     Attributes:
         dim: channels of a query.
@@ -63,6 +65,11 @@ class LaneDecoderConfig:
     refine: Literal["fixed", "iterative"] = "iterative"
     range: PerceptionRange = BevGrid().range
     dropout: float = 0.0
+
+
+PAPER_LANE_DECODER = LaneDecoderConfig(
+    dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed", dropout=0.1
+)
 
 
 class LaneQueries(nn.Module):
@@ -250,6 +257,21 @@ class LaneHeads(nn.Module):
             if elements is not None:
                 element_lane = RelationshipHead(config.relation, name="element_lane")(queries, elements)
         return LaneOutput(config.range.denormalise(unit), unit, logits, successor, element_lane)
+
+
+def check_elements(
+    encoder: EncoderConfig, decoder: LaneDecoderConfig, elements: ElementDecoderConfig | None
+) -> None:
+    """Raise UserError where traffic elements have no front view, or not a layer for each of the lane decoder's."""
+    if elements is None:
+        return
+    if not isinstance(encoder, CameraEncoderConfig):
+        raise UserError("traffic elements are found in the front camera's image: give the model an encoder of cameras")
+    if elements.layers != decoder.layers:
+        raise UserError(
+            f"the decoders of elements and lanes go layer by layer, and have {elements.layers} and {decoder.layers}: "
+            "set elements.layers and decoder.layers to one number"
+        )
 
 
 def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -> Prediction:

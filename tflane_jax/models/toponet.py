@@ -1,8 +1,9 @@
-"""TopoNet's lane branch on BEV evidence, with or without the traffic-flow module.
+"""TopoNet (Li et al. 2023), with or without the traffic-flow module; specs/modules.md section 5.
 
-BEV evidence -> BEV features -> lane queries -> (TFM) -> decoder layers -> centerlines, scores, lane-lane topology.
-The camera version exchanges the encoder and adds the traffic-element half of the scene graph; decoder, graph, heads and
-losses stay.
+Images -> BEV features -> lane queries -> (TFM) -> decoder layers -> centerlines, scores, lane-lane topology;
+front view -> traffic elements, which join the decoder's scene graph -> lane-element topology.
+The small version reads BEV evidence instead of images and knows no traffic elements; decoder, graph, heads and losses
+are the same.
 """
 
 from __future__ import annotations
@@ -18,14 +19,28 @@ from jaxtyping import Array, Float
 from tflane_jax.layers.graph import ElementNodes, Mlp, edge_probabilities
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.models.element_decoder import ElementDecoderConfig, ElementOutput
-from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
+from tflane_jax.models.bev_encoder import BevMemory
+from tflane_jax.models.camera_encoder import (
+    PAPER_CAMERA_ENCODER,
+    CameraEncoderConfig,
+    look,
+    make_encoder,
+)
+from tflane_jax.models.element_decoder import (
+    PAPER_ELEMENT_DECODER,
+    ElementDecoder,
+    ElementDecoderConfig,
+    ElementOutput,
+)
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
+    PAPER_LANE_DECODER,
     ElementEmbedding,
     LaneDecoderConfig,
     LaneDecoderLayer,
     LaneHeads,
     LaneQueries,
+    check_elements,
     make_prediction,
     next_reference,
 )
@@ -59,20 +74,27 @@ class TopoNetConfig:
     """The model; `traffic_flow=None` is the vision-only baseline.
 
     Attributes:
-        encoder: BEV features.
+        encoder: BEV features from BEV evidence or from cameras.
         decoder: lane decoder.
         traffic_flow: the TFM and its prior, or None.
-        elements: traffic elements in the front view and in the scene graph, or None.
+        elements: traffic elements in the front view and in the scene graph, or None. They need cameras, and as many
+            layers as the decoder.
     """
 
-    encoder: EvidenceEncoderConfig = EvidenceEncoderConfig()
+    encoder: EvidenceEncoderConfig | CameraEncoderConfig = EvidenceEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig()
     traffic_flow: TrafficFlowConfig | None = None
     elements: ElementDecoderConfig | None = None
 
     def build(self) -> TopoNet:
-        """Return the Linen module."""
+        """Return the Linen module; raises UserError where encoder, decoder and elements do not fit each other."""
+        check_elements(self.encoder, self.decoder, self.elements)
         return TopoNet(self)
+
+
+def paper_config() -> TopoNetConfig:
+    """Return the paper's sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 lane and 100 element queries."""
+    return TopoNetConfig(PAPER_CAMERA_ENCODER, PAPER_LANE_DECODER, elements=PAPER_ELEMENT_DECODER)
 
 
 class TopoNet(nn.Module):
@@ -81,15 +103,34 @@ class TopoNet(nn.Module):
     config: TopoNetConfig
 
     def setup(self):
-        self.encoder = EvidenceEncoder(self.config.encoder)
+        self.encoder = make_encoder(self.config.encoder)
+        if self.config.elements is not None:
+            self.elements = ElementDecoder(self.config.elements)
 
-    def __call__(self, example: Example, *, train: bool = False) -> Prediction:
+    def __call__(self, example: Example, memory: BevMemory | None = None, *, train: bool = False) -> Prediction:
         """Return predictions with a leading axis over decoder layers; the last one is the answer."""
-        if example.bev is None:
-            raise ValueError("this model reads BEV evidence, and the example has none (bev is None)")
+        return self.step(example, memory, train=train)[0]
+
+    def step(
+        self, example: Example, memory: BevMemory | None = None, *, train: bool = False
+    ) -> tuple[Prediction, BevMemory | None]:
+        """Return what `__call__` does, and the memory for the next frame (None for a model without cameras).
+
+        Args:
+            example: one frame.
+            memory: of the frame before it; None is a frame on its own. No gradient flows through it.
+            train: dropout, which needs the key `dropout`, and the batch's own statistics.
+
+        Raises:
+            UserError: the example lacks what the model reads.
+        """
+        seen = look(self.encoder, example, memory, train=train)
+        elements = None
+        if self.config.elements is not None and seen.front is not None:
+            elements = self.elements(*seen.front, deterministic=not train)
         traffic = self.config.traffic_flow
         tokens = None if traffic is None else traffic_flow_tokens(example, traffic.prior)
-        return self.decode(self.encoder(example.bev), None, tokens, deterministic=not train)
+        return self.decode(seen.bev, elements, tokens, deterministic=not train), seen.memory
 
     @nn.compact
     def decode(

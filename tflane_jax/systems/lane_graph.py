@@ -98,7 +98,7 @@ class LaneGraphSystem:
 
     def inference_variants(self, task: Any) -> dict[str, Any]:
         """Return a model with traffic flow once more without any (TF-Lane, Table 7)."""
-        if task.model.traffic_flow is None:
+        if task.traffic_flow is None:
             return {}
         return {"no traffic flow at inference": limit_instances(task, 0)}
 
@@ -148,13 +148,13 @@ def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
 
     The parameters stay the same. Raises UserError where the model takes no traffic flow or has fewer slots.
     """
-    traffic = task.model.traffic_flow
+    traffic = task.traffic_flow
     if traffic is None:
         raise UserError("this run is a baseline without traffic flow: --max-instances has nothing to limit")
     if not 0 <= count <= traffic.prior.max_instances:
         raise UserError(f"--max-instances {count} is outside 0 to {traffic.prior.max_instances}, the model's slots")
     prior = replace(traffic.prior, top_instances=count)
-    return replace(task, model=replace(task.model, traffic_flow=replace(traffic, prior=prior)))
+    return replace(task, model=replace(task.model, traffic_flow=replace(traffic, prior=prior)))  # pyright: ignore
 
 
 def predict_examples(

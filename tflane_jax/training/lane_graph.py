@@ -11,22 +11,30 @@ from jaxtyping import Array, Float
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss
-from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.bev_encoder import BevMemory
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.camera_encoder import empty_memory
+from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.scene import Example, Prediction
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
 
 
 @dataclass(frozen=True)
 class LaneGraphTask:
-    """A TopoNet-family host with the lane-graph loss; hashable, so that jit takes it as a static argument.
+    """A host with the lane-graph loss; hashable, so that jit takes it as a static argument.
 
     Attributes:
         model: the host, with or without priors.
         losses: weights of costs and losses.
     """
 
-    model: TopoNetConfig = TopoNetConfig()
+    model: TopoNetConfig | BevFormerDetrConfig = TopoNetConfig()
     losses: LaneGraphLossConfig = LaneGraphLossConfig()
+
+    @property
+    def traffic_flow(self) -> TrafficFlowConfig | None:
+        """How the host uses traffic flow; None for a host without."""
+        return self.model.traffic_flow if isinstance(self.model, TopoNetConfig) else None
 
     def init(self, key: jax.Array, example: Example) -> Params:
         """Return fresh parameters; `example` gives shapes only."""
@@ -57,7 +65,22 @@ class LaneGraphTask:
         return loss, terms | updated
 
     def predict(self, params: Params, example: Example) -> Prediction:
-        """Return the last decoder layer's answer for one example."""
+        """Return the last decoder layer's answer for one example, a frame on its own."""
+        return self.step(params, None, example)[1]
+
+    def start(self) -> BevMemory | None:
+        """Return the memory before the first frame of a sequence; None for a host without cameras."""
+        return empty_memory(self.model.encoder)
+
+    def step(
+        self, params: Params, memory: BevMemory | None, example: Example
+    ) -> tuple[BevMemory | None, Prediction]:
+        """Return the memory for the next frame, and the answer for this one.
+
+        The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a
+        leading axis, `lax.scan(partial(task.step, params), task.start(), examples)`.
+        """
         learned, statistics = split_statistics(params)
-        outputs = self.model.build().apply({"params": learned} | statistics, example)
-        return jax.tree.map(lambda layers: layers[-1], outputs)
+        module = self.model.build()
+        outputs, memory = module.apply({"params": learned} | statistics, example, memory, method=type(module).step)
+        return memory, jax.tree.map(lambda layers: layers[-1], outputs)

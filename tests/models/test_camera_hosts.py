@@ -1,0 +1,200 @@
+"""TopoNet and BEVFormer-DETR on cameras: what must not matter does not, memory, dropout, losses."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
+from tflane_jax.errors import UserError
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.scene import TrafficFlow, stack_examples
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.task import split_statistics
+
+TASKS = {
+    "toponet": LaneGraphTask(CAMERA_TOPONET),
+    "detr": LaneGraphTask(CAMERA_DETR, LaneGraphLossConfig(points_weight=0.0075, control_points=5)),
+}
+
+
+class Fitted:
+    """A task, random parameters, and its compiled prediction step and training step."""
+
+    def __init__(self, task):
+        self.task = task
+        # Compiling the initialisation would take as long as the rest of a test.
+        rng, shapes = np.random.default_rng(0), jax.eval_shape(task.init, jax.random.key(0), make_camera_example())
+        self.params = jax.tree.map_with_path(lambda path, leaf: random_leaf(rng, path[-1].key, leaf.shape), shapes)
+        self.step = jax.jit(task.step)
+
+        @jax.jit
+        def train(params, batch, key):
+            learned, statistics = split_statistics(params)
+            return jax.value_and_grad(lambda p: task.loss(p | statistics, batch, key), has_aux=True)(learned)
+
+        self.train = train
+
+    def predict(self, example):
+        return self.step(self.params, self.task.start(), example)[1]
+
+
+def random_leaf(rng, name, shape):
+    if name in ("scale", "var"):
+        return jnp.asarray(rng.uniform(0.8, 1.2, shape), jnp.float32)
+    return jnp.asarray(rng.normal(0, 0.05 if name == "bias" else 0.3, shape), jnp.float32)
+
+
+@functools.cache
+def fit(name):
+    return Fitted(TASKS[name])
+
+
+@pytest.fixture(params=TASKS)
+def fitted(request):
+    return fit(request.param)
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def batch_of(*examples):
+    return jax.tree.map(jnp.asarray, stack_examples(list(examples)))
+
+
+def test_predicts_lanes_elements_and_both_topologies(fitted):
+    answer = fitted.predict(make_camera_example())
+    chex.assert_shape(answer.lanes.points, (6, 11, 3))
+    chex.assert_shape(answer.lanes.successor_logits, (6, 6))
+    chex.assert_shape(answer.elements.box, (5, 2, 2))
+    chex.assert_shape(answer.elements.lane_logits, (6, 5))
+    assert np.abs(np.asarray(answer.lanes.points)[..., 0]).max() <= 51.2
+    centre = np.asarray(answer.elements.box).mean(1)
+    assert ((centre >= 0) & (centre <= [96, 64])).all()
+    other = fitted.predict(make_camera_example(1))
+    for before, after in zip(jax.tree.leaves(answer), jax.tree.leaves(other), strict=True):
+        assert not np.array_equal(before, after)
+
+
+def soiled(example):
+    """Fill what is not valid: pixels beside the smaller image, elements, lanes."""
+    elements, lanes, image = example.traffic_elements, example.lanes, example.cameras.image.copy()
+    image[1, 48:], image[1, :, 80:] = 255, 255
+    box = np.where(elements.valid[:, None, None], elements.box, np.nan)
+    attribute = np.where(elements.valid, elements.attribute, 10**6).astype(np.int32)
+    relation = elements.lane | ~elements.valid | ~lanes.valid[:, None]
+    points = np.where(lanes.valid[:, None, None], lanes.points, np.nan)
+    return example.replace(
+        cameras=example.cameras.replace(image=image), lanes=lanes.replace(points=points),
+        traffic_elements=elements.replace(box=box, attribute=attribute, lane=relation),
+    )  # fmt: skip
+
+
+def test_what_stands_in_padding_changes_nothing(fitted):
+    clean, dirty = make_camera_example(2), soiled(make_camera_example(2))
+    same(fitted.predict(clean), fitted.predict(dirty))
+    key = jax.random.key(0)
+    results = [fitted.train(fitted.params, batch_of(e, make_camera_example(3)), key) for e in (clean, dirty)]
+    same(*results)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(results[0]))
+
+
+def test_a_broken_camera_may_show_anything(fitted):
+    example = make_camera_example(4)
+    for camera in (0, 1):
+        valid = np.arange(2) != camera
+        intrinsics = np.where(valid[:, None, None], example.cameras.intrinsics, np.nan)
+        image = np.where(valid[:, None, None, None], example.cameras.image, 77).astype(np.uint8)
+        silent = example.replace(cameras=example.cameras.replace(valid=valid))
+        broken = example.replace(cameras=example.cameras.replace(valid=valid, intrinsics=intrinsics, image=image))
+        answer = fitted.predict(silent)
+        same(answer, fitted.predict(broken))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(answer))
+
+
+def test_loss_reports_every_term_for_any_number_of_targets(fitted):
+    terms = {"class", "points", "successor", "element_class", "element_box", "element_iou", "element_lane"}
+    for lanes, elements in ((4, 2), (0, 0), (1, 1)):
+        batch = batch_of(*[make_camera_example(5, lanes=lanes, elements=elements)] * 2)
+        (loss, report), gradient = fitted.train(fitted.params, batch, jax.random.key(0))
+        learned, statistics = split_statistics(report)
+        assert set(learned) == terms | {"matching/lanes", "matching/elements"}
+        assert float(learned["matching/elements"]) == elements
+        assert jax.tree.structure(statistics) == jax.tree.structure(split_statistics(fitted.params)[1])
+        assert np.isfinite(loss)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+        assert float(learned["element_box"] > 0) == float(elements > 0)
+    assert fitted.train._cache_size() == 1
+
+
+def test_every_parameter_of_a_part_learns(fitted):
+    batch = batch_of(make_camera_example(6), make_camera_example(7))
+    gradient = fitted.train(fitted.params, batch, jax.random.key(0))[1]
+    silent = {
+        jax.tree_util.keystr(path, simple=True, separator="/")
+        for path, leaf in jax.tree.leaves_with_path(gradient)
+        if not np.asarray(leaf).any()
+    }
+    # A frame on its own has no motion, and the first layer knows of no edges.
+    expected = {"encoder/bev/motion/hidden/kernel"}
+    if fitted is fit("toponet"):
+        graph = ("lane_lane/forward", "lane_lane/backward", "lane_element")
+        expected |= {f"layer_0/scene_graph/{name}/kernel" for name in graph}
+    # Softmax does not feel what is added to all its keys; rounding may.
+    assert {name for name in silent if not name.endswith("/key/bias")} == expected
+
+
+def test_dropout_follows_the_key(fitted):
+    batch = batch_of(make_camera_example(8), make_camera_example(9))
+    losses = [float(fitted.train(fitted.params, batch, jax.random.key(k))[0][0]) for k in (0, 0, 1)]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_a_stream_equals_the_scan_over_its_sequence(fitted):
+    task, params = fitted.task, fitted.params
+    frames = [make_camera_example(s).replace(has_previous=np.asarray(s not in (0, 2))) for s in range(4)]
+    move = np.eye(4, dtype=np.float32)
+    move[:2, 3] = 3.0, 0.4
+    frames = [frame.replace(previous_from_ego=move) for frame in frames]
+    memory, answers = task.start(), []
+    for frame in frames:
+        memory, answer = fitted.step(params, memory, frame)
+        answers.append(answer)
+    scan = jax.jit(lambda p, m, f: lax.scan(functools.partial(task.step, p), m, f))
+    scanned = scan(params, task.start(), batch_of(*frames))
+    same(scanned, (memory, jax.tree.map(lambda *leaves: jnp.stack(leaves), *answers)))
+    # The third frame begins a scene, so it forgets; the fourth remembers.
+    same(answers[2], fitted.predict(frames[2]))
+    assert not np.array_equal(answers[3].lanes.points, fitted.predict(frames[3]).lanes.points)
+
+
+def test_nobody_there_is_no_traffic_flow():
+    fitted = fit("toponet")
+    example = make_camera_example(10)
+    absent = fitted.predict(example.replace(traffic_flow=None))
+    same(absent, fitted.predict(example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
+    assert not np.array_equal(absent.lanes.points, fitted.predict(example).lanes.points)
+
+
+def test_what_does_not_fit_is_an_error():
+    task, key = TASKS["toponet"], jax.random.key(0)
+    with pytest.raises(UserError, match="choose data with cameras"):
+        jax.eval_shape(task.init, key, make_example())
+    with pytest.raises(UserError, match="give the model an encoder of cameras"):
+        TopoNetConfig(elements=CAMERA_TOPONET.elements).build()
+    with pytest.raises(UserError, match=r"have 3 and 2: set elements\.layers"):
+        dataclasses.replace(CAMERA_TOPONET, elements=dataclasses.replace(CAMERA_TOPONET.elements, layers=3)).build()
+    with pytest.raises(UserError, match='refine to "fixed"'):
+        dataclasses.replace(
+            CAMERA_DETR, decoder=dataclasses.replace(CAMERA_DETR.decoder, refine="iterative")
+        ).build()
+    unlabelled = batch_of(make_camera_example().replace(traffic_elements=None))
+    with pytest.raises(UserError, match=r"set task\.model\.elements to None"):
+        jax.eval_shape(lambda: task.loss(task.init(key, make_camera_example()), unlabelled, key))

@@ -1,0 +1,118 @@
+"""What a host sees before it looks for lanes: BEV features from cameras or from an evidence raster, and the front view.
+
+Camera images -> image encoder -> feature maps of all cameras -> BEVFormer -> BEV features; the maps of the front camera
+go on to the traffic elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
+from tflane_jax.models.bevformer import BevFormer
+from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
+from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER, ImageEncoder, ImageEncoderConfig
+from tflane_jax.scene import Example
+
+
+@dataclass(frozen=True)
+class CameraEncoderConfig:
+    """The encoder of cameras; the defaults train on two CPU cores, `PAPER_CAMERA_ENCODER` holds TopoNet's sizes.
+
+    Attributes:
+        images: from images to feature maps.
+        bev: from feature maps to BEV features; as many levels and channels.
+    """
+
+    images: ImageEncoderConfig = ImageEncoderConfig()
+    bev: BevFormerConfig = SMALL_BEVFORMER
+
+
+PAPER_CAMERA_ENCODER = CameraEncoderConfig(PAPER_IMAGE_ENCODER, BevFormerConfig())
+
+
+class FrontView(NamedTuple):
+    """The image in which traffic elements are sought.
+
+    Attributes:
+        features: levels (h, w, C), finest first.
+        size: width and height of the image, pixels; zeros where the camera delivered none.
+        padded: (rows, columns) of the array that it lies in.
+    """
+
+    features: Sequence[Float[Array, "h w c"]]
+    size: Int[Array, " 2"]
+    padded: tuple[int, int]
+
+
+class Seen(NamedTuple):
+    """What an encoder makes of an example.
+
+    Attributes:
+        bev: BEV features, row 0 at the least y, column 0 at the least x.
+        front: None without cameras.
+        memory: for the next frame of the sequence; None without cameras.
+    """
+
+    bev: Float[Array, "h w c"]
+    front: FrontView | None = None
+    memory: BevMemory | None = None
+
+
+class CameraEncoder(nn.Module):
+    """Images of one frame, and the memory of the frame before it, to BEV features."""
+
+    config: CameraEncoderConfig
+
+    @nn.compact
+    def __call__(self, example: Example, memory: BevMemory | None, *, train: bool) -> Seen:
+        """Return what the cameras show; raises UserError where the example has no images."""
+        cameras = example.cameras
+        if cameras is None:
+            raise UserError("the model reads camera images, and these data have none: choose data with cameras")
+        levels = ImageEncoder(self.config.images, name="images")(cameras, train=train)
+        if memory is not None:
+            # No gradient through time, as in the reference; a new scene begins without memory.
+            memory = BevMemory(lax.stop_gradient(memory.features), memory.valid & example.has_previous)
+        bev = BevFormer(self.config.bev, name="bev")(
+            levels, cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train
+        )
+        size = jnp.where(cameras.valid[0], cameras.size[0], 0)
+        padded = cameras.image.shape[1], cameras.image.shape[2]
+        front = FrontView([level[0] for level in levels], size, padded)
+        return Seen(bev, front, BevMemory(bev, jnp.ones((), bool)))
+
+
+EncoderConfig = EvidenceEncoderConfig | CameraEncoderConfig
+
+
+def make_encoder(config: EncoderConfig) -> EvidenceEncoder | CameraEncoder:
+    """Return the encoder of a host."""
+    return EvidenceEncoder(config) if isinstance(config, EvidenceEncoderConfig) else CameraEncoder(config)
+
+
+def look(
+    encoder: EvidenceEncoder | CameraEncoder, example: Example, memory: BevMemory | None, *, train: bool
+) -> Seen:
+    """Return what a host's encoder makes of an example; raises UserError where the example lacks what it reads."""
+    if isinstance(encoder, CameraEncoder):
+        return encoder(example, memory, train=train)
+    if example.bev is None:
+        raise UserError(
+            "the model reads BEV evidence, and these data have none (bev is None): choose data with evidence, or a "
+            "model with cameras"
+        )
+    return Seen(encoder(example.bev))
+
+
+def empty_memory(config: EncoderConfig) -> BevMemory | None:
+    """Return the memory at the start of a sequence; None for an encoder that keeps none."""
+    return BevMemory.empty(config.bev) if isinstance(config, CameraEncoderConfig) else None

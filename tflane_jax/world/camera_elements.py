@@ -105,9 +105,7 @@ def element_bodies(elements: Sequence[MapElement], attribute: Int[np.ndarray, " 
     return pack(solids, boxes).placed(pose[:, :2], pose[:, 2])
 
 
-def mast_bodies(
-    elements: Sequence[MapElement], boundaries: Sequence[Float[np.ndarray, "_ 3"]]
-) -> Bodies:
+def mast_bodies(elements: Sequence[MapElement], boundaries: Sequence[Float[np.ndarray, "_ 3"]]) -> Bodies:
     """Return what the elements hang from: posts of low ones, masts beside the road with an arm of high ones."""
     solids: list[Solid] = []
     boxes: list[Box] = []

@@ -24,9 +24,7 @@ _LOWEST, _HIGHEST = -0.05, 0.95
 _STEEPEST_SHADOW = 0.35
 
 
-def log_weather(
-    rng: np.random.Generator, config: FrontWeatherConfig, *, weather: float, severity: float
-) -> Weather:
+def log_weather(rng: np.random.Generator, config: FrontWeatherConfig, *, weather: float, severity: float) -> Weather:
     """Return light and weather of a log.
 
     Args:

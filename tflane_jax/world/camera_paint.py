@@ -110,9 +110,7 @@ def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int
     if not middles:
         return _quads(np.zeros((2, 0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)))
     number = np.concatenate(numbers)
-    quads = _quads(
-        np.concatenate(middles, 1), np.concatenate(normals), np.concatenate(widths), np.concatenate(colours)
-    )
+    quads = _quads(np.concatenate(middles, 1), np.concatenate(normals), np.concatenate(widths), np.concatenate(colours))
     left = paint_left(number, np.concatenate(stations), len(lines), paint_wear, log_seed)
     return Paint(quads.corners, quads.width, quads.length, quads.colour, left)
 

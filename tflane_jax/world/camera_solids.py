@@ -221,8 +221,10 @@ def _with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
     up = np.cross(right, away)
     angle = np.linspace(0.0, 2.0 * np.pi, _OUTLINE + 1)[:-1]
     # Ragged like leaves, the same for the same place in the world whatever the direction of view.
-    ragged = 1.0 + 0.13 * np.sin(5.0 * angle + 90.0 * bodies.blobs[:, 3:]) + 0.1 * np.sin(
-        8.0 * angle + 230.0 * bodies.blobs[:, 2:3]
+    ragged = (
+        1.0
+        + 0.13 * np.sin(5.0 * angle + 90.0 * bodies.blobs[:, 3:])
+        + 0.1 * np.sin(8.0 * angle + 230.0 * bodies.blobs[:, 2:3])
     )
     reach = (bodies.blobs[:, 3:] * ragged)[..., None]
     ring = np.cos(angle)[:, None] * right[:, None] + np.sin(angle)[:, None] * up[:, None]

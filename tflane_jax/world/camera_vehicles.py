@@ -179,15 +179,13 @@ def _bus(solid: Solid, length: float, width: float, height: float, look: np.ndar
     _lamps(solid, x1 + 0.01, half, (0.55, 0.75), False, night)
 
 
-def _two_wheeler(
-    solid: Solid, length: float, height: float, look: np.ndarray, night: float, motor: bool
-) -> None:
+def _two_wheeler(solid: Solid, length: float, height: float, look: np.ndarray, night: float, motor: bool) -> None:
     """Add a machine with its rider; wheels are discs seen from the sides and slats seen along the road."""
     x0, x1 = -0.5 * length, 0.5 * length
     paint, coat = _pick(PAINTS, look[0]), _pick(_CLOTHES, look[1])
     radius, thick = (0.31, 0.08) if motor else (0.34, 0.025)
     for x in (x0 + radius, x1 - radius):
-        box(solid, np.array([x, 0.0]), 0.0, (2.0 * radius - 0.1, 2.0 * thick), (0.0, 1.9 * radius), RUBBER)
+        box(solid, np.array([x, 0.0]), 0.0, (0.3, 2.0 * thick), (0.0, 1.9 * radius), RUBBER)
     wheels(solid, (x0 + radius, x1 - radius), thick + 0.01, radius)
     seat = 0.52 * height
     if motor:

@@ -2,15 +2,21 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
+from tests.fakes import FakeConfig, FakeDataset
 from tests.shared import shared_path
+from tflane_jax.cli import build_parser
+from tflane_jax.commands.sources import lane_graph_source
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
+from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_frames import list_frames
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
@@ -219,6 +225,32 @@ def test_it_is_training_data(whole):
     nothing = RunConfig(data=OpenLaneV2Data(whole, augmentation=None))
     assert system.prepare(nothing) is None
     assert data.augmentation == PhotometricConfig()
+
+
+def test_the_command_line_names_it(whole):
+    def chosen(*arguments, config=None):
+        options = build_parser().parse_args(["eval", "run", "--split", "val", *arguments])
+        return lane_graph_source(config or RunConfig(), options)
+
+    source = chosen("--data", "openlane-v2", "--root", str(whole))
+    assert (source.root, source.split, source.subset, source.image) == (whole, "val", "B", TOPONET_SUBSET_B)
+    own = RunConfig(data=OpenLaneV2Data(whole, val="train", image=NATIVE))
+    assert chosen(config=own) == own.data.source("val")
+    assert chosen("--root", "elsewhere", config=own) == replace(own.data.source("val"), root=Path("elsewhere"))
+    with pytest.raises(UserError, match="needs --root"):
+        chosen("--data", "openlane-v2")
+
+
+def test_a_world_too_large_for_memory_is_streamed(tmp_path, monkeypatch):
+    kept = cached(FakeDataset(FakeConfig(5)), root=tmp_path, workers=1, progress=False)
+    monkeypatch.setattr("tflane_jax.systems.lane_graph.open_dataset", lambda source, progress: kept)
+    system, source = system_of(RunConfig()), RunConfig().data.source("train")
+    whole = system.load(source)
+    monkeypatch.setattr("tflane_jax.systems.lane_graph.IN_MEMORY", 1000)
+    large = system.load(source)
+    assert isinstance(large, Streamed)
+    for one, other in zip(*(batches(data, (3,), range(4), 2) for data in (whole, large)), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def test_shapes_need_no_data():

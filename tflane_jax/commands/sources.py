@@ -10,9 +10,11 @@ from typing import Any
 from tflane_jax.config import LaneCurveSource, LaneGraphSource, RunConfig, Source, load_config
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
 from tflane_jax.datasets.front_views import FrontViewConfig
+from tflane_jax.datasets.openlane_frames import subset_of
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.systems.lane_graph import limit_instances
@@ -63,7 +65,9 @@ def lane_graph_source(config: RunConfig, options: argparse.Namespace) -> LaneGra
             raise UserError("--data openlane-v2 needs --root PATH, its folder")
         if isinstance(configured, OpenLaneV2Config):
             return replace(configured, root=Path(options.root))
-        return OpenLaneV2Config(Path(options.root), options.split, example=configured.example)
+        subset = subset_of(Path(options.root))
+        image = TOPONET_SUBSET_A if subset == "A" else TOPONET_SUBSET_B
+        return OpenLaneV2Config(Path(options.root), options.split, subset, image=image, example=configured.example)
     if options.data == "argoverse2" or real:
         if options.root is None:
             raise UserError("--data argoverse2 needs --root PATH, a log or a folder of logs")

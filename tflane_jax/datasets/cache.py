@@ -184,6 +184,10 @@ class CachedDataset:
                     )
         return read
 
+    def nbytes(self, parts: Collection[str]) -> int:
+        """Return how much memory these fields of all examples take."""
+        return sum(array.nbytes for name, array in self._leaves().items() if name.split(".")[0] in parts)
+
     def _leaves(self) -> dict[str, np.ndarray]:
         return {name: array for name, array in self._arrays.items() if not name.startswith("info.")}
 

@@ -13,7 +13,7 @@ import numpy as np
 from tflane_jax.config import LaneGraphSource, RunConfig
 from tflane_jax.datasets.argoverse2 import Argoverse2Dataset
 from tflane_jax.datasets.base import Dataset
-from tflane_jax.datasets.cache import cached
+from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
@@ -29,6 +29,8 @@ from tflane_jax.training.records import Record
 from tflane_jax.training.task import Params
 
 _COMPARED_EXAMPLES = 6
+IN_MEMORY = 6 * 2**30
+"""Bytes of training examples that are held in memory; more are read from the disk while training."""
 
 
 class LaneGraphSystem:
@@ -44,10 +46,13 @@ class LaneGraphSystem:
     )  # fmt: skip
 
     def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example | Streamed:
-        """Return the examples of a source, stacked; those of OpenLane-V2 are read while they are used."""
+        """Return the examples of a source, stacked; those of OpenLane-V2, and of a large world, are read while used."""
         dataset = open_dataset(source, progress=progress)
+        select = partial(keep, parts=TRAINING_PARTS)
         if isinstance(source, OpenLaneV2Config):
-            return Streamed(dataset, source.loading, partial(keep, parts=TRAINING_PARTS))
+            return Streamed(dataset, source.loading, select)
+        if isinstance(dataset, CachedDataset) and dataset.nbytes(TRAINING_PARTS) > IN_MEMORY:
+            return Streamed(dataset, select=select)
         return load_arrays(dataset, parts=TRAINING_PARTS, progress=progress)
 
     def examples(self, data: Example | Streamed) -> Example | Streamed:

@@ -95,10 +95,11 @@ def size_text(shape: tuple[int, ...] | None) -> str:
 
 
 def below(prefix: str, name: str, rules: Rules) -> tuple[Rule, ...]:
-    """Return the rules of a part that stands below a name; groups of the prefix come first."""
+    """Return the rules of a part that stands below a name, "" for none; groups of the prefix come first."""
     shift = re.compile(prefix).groups
     moved = [(p, re.sub(r"\\(\d)", lambda m: f"\\{int(m[1]) + shift}", ours), kind) for p, ours, kind in rules]
-    return tuple((prefix + pattern, f"{name}/{ours}", kind) for pattern, ours, kind in moved)
+    above = f"{name}/" if name else ""
+    return tuple((prefix + pattern, above + ours, kind) for pattern, ours, kind in moved)
 
 
 def renamed_params(state: Mapping[str, AnyArray], rules: Rules) -> dict[str, Any]:

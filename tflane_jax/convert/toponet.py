@@ -1,16 +1,30 @@
 """Weights of the reference TopoNet and of BEVFormer-DETR (OpenLane-V2's baseline) as parameters of our hosts.
 
 Names and layouts: shared specs/modules.md sections 1, 5 and 9. Decoders are built from mmcv's layers: attentions and
-norms are numbered in the order in which a layer runs them.
+norms are numbered in the order in which a layer runs them. Both detectors call their encoder `bev_constructor`, the
+head of traffic elements `bbox_head` and that of lanes `pts_bbox_head`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from tflane_jax.convert.renaming import Rule, below, convert, renamed_params
+import jax
+import jax.numpy as jnp
+
+from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
+from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, convert, renamed_params
+from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.scene import CameraViews, Example
+from tflane_jax.training.task import STATISTICS, Params
 
 _DEFORMABLE = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
 _ATTENTION = (
@@ -121,3 +135,57 @@ def toponet_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
 def baseline_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
     """Return the parameters of `BevFormerDetr.decode`, less relationship heads, from those of LCDeformableDETRHead."""
     return convert(state, BASELINE_LANES, "the baseline's lane head").variables["params"]
+
+
+def convert_host(state: Mapping[str, AnyArray], model: TopoNetConfig | BevFormerDetrConfig) -> Converted:
+    """Return the variables of a whole host with cameras, and an account of every tensor.
+
+    Args:
+        state: tensors of the reference's detector, with or without the prefix `module.`.
+        model: decides how many layers there are, and whether the backbone's norms are constants.
+
+    Raises:
+        UserError: a tensor that the detector does not have.
+    """
+    is_toponet = isinstance(model, TopoNetConfig)
+    last = f"heads_{model.decoder.layers - 1}"
+    rules = (
+        *below("", "encoder/images", IMAGE_ENCODER),
+        *below(r"bev_constructor\.", "encoder/bev", BEV_CONSTRUCTER),
+        *below(r"bbox_head\.", "elements", ELEMENTS),
+        *below(r"pts_bbox_head\.", "", TOPONET_LANES if is_toponet else BASELINE_LANES),
+        *(() if is_toponet else below(r"lclc_head\.", f"{last}/successor", RELATIONSHIP)),
+        *(() if is_toponet else below(r"lcte_head\.", f"{last}/element_lane", RELATIONSHIP)),
+    )
+    frozen = isinstance(model.encoder, CameraEncoderConfig) and model.encoder.images.backbone.frozen_norms
+    norms = r"encoder/images/backbone/(.*/)?\w*bn\d?/.*" if frozen else "(?!)"
+    return convert(state, rules, "TopoNet" if is_toponet else "BEVFormer-DETR", frozen=norms)
+
+
+def load_host(path: Path, model: TopoNetConfig | BevFormerDetrConfig) -> tuple[Params, list[dict[str, str]]]:
+    """Return a task's parameters from the reference's checkpoint (.pth, .pkl, .npz), and the account of its tensors.
+
+    Raises:
+        UserError: the file cannot be read, or its tensors are not exactly those of the model.
+    """
+    if not isinstance(model.encoder, CameraEncoderConfig):
+        raise UserError("published weights are those of models with cameras: give the model an encoder of cameras")
+    converted = convert_host(read_state_dict(path), model)
+    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), _camera_example(model.encoder)))
+    check_fits(converted.variables, {"batch_stats": {}} | expected, path)
+    variables = converted.variables
+    return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
+
+
+def _camera_example(encoder: CameraEncoderConfig) -> Any:
+    """Return the shapes of an example; parameters do not depend on the size of its images."""
+    count, side = encoder.bev.cameras, 128
+    shape = jax.ShapeDtypeStruct
+    cameras = CameraViews(
+        image=shape((count, side, side, 3), jnp.uint8), size=shape((count, 2), jnp.int32),
+        intrinsics=shape((count, 3, 3), jnp.float32), camera_from_ego=shape((count, 4, 4), jnp.float32),
+        valid=shape((count,), jnp.bool_),
+    )  # fmt: skip
+    nothing = dict.fromkeys(field.name for field in dataclasses.fields(Example))
+    pose, flag = shape((4, 4), jnp.float32), shape((), jnp.bool_)
+    return Example(**nothing | {"cameras": cameras, "previous_from_ego": pose, "has_previous": flag})  # pyright: ignore

@@ -1,0 +1,83 @@
+"""Checkpoints of whole detectors: names of the fixtures, every tensor accounted for, nothing missing."""
+
+import numpy as np
+import pytest
+
+from tests.golden import golden_entries, load_module_case
+from tflane_jax.convert.toponet import load_host
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import BevGrid
+from tflane_jax.layers.fpn import FeaturePyramidConfig
+from tflane_jax.layers.resnet import ResNetConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.element_decoder import ElementDecoderConfig
+from tflane_jax.models.image_encoder import ImageEncoderConfig
+from tflane_jax.models.lane_decoder import LaneDecoderConfig
+from tflane_jax.models.toponet import TopoNetConfig
+
+ENCODER = CameraEncoderConfig(
+    ImageEncoderConfig(
+        ResNetConfig((2, 2, 2, 2), (4, 8, 16, 32), stem_channels=4, frozen_norms=True),
+        pyramid=FeaturePyramidConfig(16, 2),
+    ),
+    BevFormerConfig(BevGrid(rows=5, columns=8), dim=16, heads=4, layers=1, hidden=32, levels=2, cameras=3),
+)
+ELEMENTS = ElementDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24)
+DECODER = LaneDecoderConfig(dim=16, heads=4, layers=2, queries=8, hidden=24, relation=128, refine="fixed")
+TOPONET = TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS)
+BASELINE = BevFormerDetrConfig(
+    ENCODER, LaneDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24, relation=128, refine="fixed"),
+    ELEMENTS, control_points=5,
+)  # fmt: skip
+
+
+def fixture(name, prefix):
+    path = golden_entries().get(f"modules/{name}")
+    if path is None:
+        pytest.skip("needs the golden files under $TFLANE_SHARED")
+    return {prefix + key: value for key, value in load_module_case(path).params.items()}
+
+
+def checkpoint(lanes, relations=()):
+    """Return a detector's tensors, named as its parts name them; the pyramid's sizes are those of the backbone."""
+    state = fixture("resnet18_eval", "img_backbone.")
+    for i, channels in enumerate((16, 32)):
+        for kind, inputs, size in (("lateral", channels, 1), ("fpn", 16, 3)):
+            state[f"img_neck.{kind}_convs.{i}.conv.weight"] = np.ones((16, inputs, size, size), np.float32)
+            state[f"img_neck.{kind}_convs.{i}.conv.bias"] = np.ones(16, np.float32)
+    state |= fixture("bev_constructer_toponet_noprev", "bev_constructor.") | fixture("toponet_te_head", "bbox_head.")
+    state |= fixture(lanes, "pts_bbox_head.")
+    for head in relations:
+        state |= fixture("toponet_relationship_head", f"{head}.")
+    return state
+
+
+CASES = {
+    "toponet": (TOPONET, "toponet_head", ()),
+    "baseline": (BASELINE, "olv2_lc_head", ("lclc_head", "lcte_head")),
+}
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("name", CASES)
+def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
+    model, lanes, relations = CASES[name]
+    state, path = checkpoint(lanes, relations), tmp_path / "weights.npz"
+    np.savez(path, **{f"module.{key}": value for key, value in state.items()})
+    _, table = load_host(path, model)
+    assert [row["tensor"] for row in table] == [f"module.{key}" for key in state]
+    leaves = [leaf for row in table for leaf in row["becomes"].split(", ")]
+    unused = [leaf for leaf in leaves if "not needed" in leaf or leaf.startswith("a ")]
+    assert unused == ["a constant of the loss", "not needed"]
+    assert len(set(leaves)) == len(leaves)
+
+    incomplete = dict(state)
+    del incomplete["pts_bbox_head.cls_branches.1.6.bias"]
+    np.savez(path, **incomplete)
+    with pytest.raises(UserError, match="heads_1/class_out/bias is absent in the file and 1 in the model"):
+        load_host(path, model)
+    np.savez(path, **state, **{"pts_bbox_head.surplus.weight": np.zeros(3)})
+    with pytest.raises(UserError, match="is no tensor of"):
+        load_host(path, model)

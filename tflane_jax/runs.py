@@ -20,7 +20,6 @@ from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.errors import UserError
 from tflane_jax.systems import system_of
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
-from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
@@ -97,13 +96,11 @@ def open_weights(config: RunConfig) -> Run:
 
     Raises UserError where it names none, or a file that does not hold this very model.
     """
-    from tflane_jax.convert.lstr import load_lstr
+    from tflane_jax.convert.published import load_weights
 
     if config.weights is None:
         raise UserError("this configuration names no published weights (weights): give a trained run instead")
-    if not isinstance(config.task, LaneCurveTask):
-        raise UserError("published weights can be read for LSTR only")
-    params, _ = load_lstr(config.weights, config.task.model)
+    params, _ = load_weights(config.weights, config.task)
     return Run(str(config.weights), replace(config, training=replace(config.training, seeds=(0,))), 0, (params,))
 
 

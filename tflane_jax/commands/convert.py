@@ -6,11 +6,10 @@ import argparse
 from dataclasses import replace
 
 from tflane_jax.config import load_config
-from tflane_jax.convert.lstr import load_lstr
+from tflane_jax.convert.published import load_weights
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import save_weights
-from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -21,9 +20,7 @@ def run(options: argparse.Namespace) -> int:
     weights = options.weights or config.weights
     if weights is None:
         raise UserError(f"{options.config} names no weights: add --weights FILE")
-    if not isinstance(config.task, LaneCurveTask):
-        raise UserError(f"{options.config}: published weights can be read for LSTR only")
-    params, table = load_lstr(weights, config.task.model)
+    params, table = load_weights(weights, config.task)
     save_weights(replace(config, weights=weights), params, options.out)
     title = f"{weights}: every tensor and what becomes of it"
     print(format_table(table, title=title))

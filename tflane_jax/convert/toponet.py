@@ -171,13 +171,13 @@ def load_host(path: Path, model: TopoNetConfig | BevFormerDetrConfig) -> tuple[P
     if not isinstance(model.encoder, CameraEncoderConfig):
         raise UserError("published weights are those of models with cameras: give the model an encoder of cameras")
     converted = convert_host(read_state_dict(path), model)
-    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), _camera_example(model.encoder)))
+    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), camera_shapes(model.encoder)))
     check_fits(converted.variables, {"batch_stats": {}} | expected, path)
     variables = converted.variables
     return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
 
 
-def _camera_example(encoder: CameraEncoderConfig) -> Any:
+def camera_shapes(encoder: CameraEncoderConfig) -> Any:
     """Return the shapes of an example; parameters do not depend on the size of its images."""
     count, side = encoder.bev.cameras, 128
     shape = jax.ShapeDtypeStruct

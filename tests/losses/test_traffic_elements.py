@@ -1,0 +1,161 @@
+"""Losses of traffic elements against plain loops; lane-element topology of the last layers only; Bezier lanes."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+
+from tests.losses.test_lane_graph import BATCH, LAYERS, QUERIES, focal, make_case
+from tflane_jax.geometry.bezier import bezier_fit
+from tflane_jax.losses.costs import generalised_iou
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss, matching_cost
+from tflane_jax.scene import ElementPrediction, Prediction, TrafficElements, stack_examples
+
+ELEMENTS, FOUND = 3, 4
+SIZES = np.array([[96, 64], [80, 48], [64, 64]], np.int32)
+
+
+@partial(jax.jit, static_argnums=4)
+def value_and_gradient(prediction, lanes, elements, sizes, config):
+    return jax.value_and_grad(lambda p: lane_graph_loss(p, lanes, config, elements, sizes), has_aux=True)(prediction)
+
+
+def make_elements(seed, counts, related):
+    """Return predicted and true elements, and lanes that some of them govern."""
+    rng = np.random.default_rng(seed)
+    lanes, truth = make_case(seed)
+    elements = []
+    for count in counts:
+        one = TrafficElements.empty(ELEMENTS, truth.valid.shape[1])
+        low = rng.uniform(0, 30, (ELEMENTS, 2))
+        box = np.stack([low, low + rng.uniform(4, 18, (ELEMENTS, 2))], 1).astype(np.float32)
+        elements.append(one.replace(
+            box=box, attribute=rng.integers(0, 13, ELEMENTS).astype(np.int32),
+            lane=rng.random(one.lane.shape) < 0.5, valid=rng.permutation(ELEMENTS) < count,
+        ))  # fmt: skip
+    low = rng.uniform(0, 30, (BATCH, LAYERS, FOUND, 2))
+    found = ElementPrediction(
+        box=np.stack([low, low + rng.uniform(4, 18, low.shape)], -2).astype(np.float32),
+        logits=rng.normal(size=(BATCH, LAYERS, FOUND, 13)).astype(np.float32),
+        lane_logits=rng.normal(size=(BATCH, related, QUERIES, FOUND)).astype(np.float32),
+    )
+    lanes = lanes.replace(successor_logits=lanes.successor_logits[:, LAYERS - related :])
+    return Prediction(lanes, jax.tree.map(jnp.asarray, found)), truth, stack_examples(elements)
+
+
+def overlap(a, b):
+    """Generalised IoU of two boxes by counting: areas of union and hull."""
+    side = np.clip(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0, None)
+    union = np.prod(a[1] - a[0]) + np.prod(b[1] - b[0]) - np.prod(side)
+    hull = np.prod(np.maximum(a[1], b[1]) - np.minimum(a[0], b[0]))
+    return np.prod(side) / union - (hull - union) / hull
+
+
+def shares(box, size):
+    return np.concatenate([box.mean(0) / size, (box[1] - box[0]) / size])
+
+
+def assign(cost):
+    rows, columns = linear_sum_assignment(cost)
+    return dict(zip(columns.tolist(), rows.tolist(), strict=True))
+
+
+def loop_terms(prediction, lanes, elements, layer):
+    """Return the four terms of one layer as specs/modules.md section 5 words them, one number at a time."""
+    found, positives = prediction.elements, 0
+    classes = boxes = apart = edges = 0.0
+    for b in range(BATCH):
+        real = np.flatnonzero(elements.valid[b])
+        box, logits = np.asarray(found.box[b, layer], np.float64), np.asarray(found.logits[b, layer], np.float64)
+        cost = np.zeros((FOUND, len(real)))
+        for q in range(FOUND):
+            for j, e in enumerate(real):
+                logit = logits[q, elements.attribute[b, e]]
+                p, truth = 1 / (1 + np.exp(-logit)), elements.box[b, e]
+                cost[q, j] = -np.log(p) * 0.25 * (1 - p) ** 2 + np.log(1 - p) * 0.75 * p**2
+                cost[q, j] += 2.5 * np.abs(shares(box[q], SIZES[b]) - shares(truth, SIZES[b])).sum()
+                cost[q, j] -= overlap(box[q], truth)
+        owner = {q: real[j] for j, q in assign(cost).items()}
+        positives += len(owner)
+        for q in range(FOUND):
+            for k in range(13):
+                classes += focal(logits[q, k], q in owner and elements.attribute[b, owner[q]] == k)
+            if q in owner:
+                truth = elements.box[b, owner[q]]
+                boxes += np.abs(shares(box[q], SIZES[b]) - shares(truth, SIZES[b])).sum()
+                apart += 1 - overlap(box[q], truth)
+        one = jax.tree.map(lambda leaf, b=b: leaf[b], (prediction.lanes, lanes))
+        visible = np.flatnonzero(lanes.valid[b])
+        lane_cost = np.asarray(matching_cost(*one, LaneGraphLossConfig()))[layer][:, visible]
+        lane_of = {q: visible[j] for j, q in assign(lane_cost).items()}
+        relation = np.asarray(found.lane_logits[b, layer - LAYERS], np.float64)
+        for q in range(QUERIES):
+            for r in range(FOUND):
+                joined = q in lane_of and r in owner and elements.lane[b, lane_of[q], owner[r]]
+                edges += focal(relation[q, r], joined)
+    many = max(positives, 1)
+    return classes / many, 2.5 * boxes / many, apart / many, 5.0 * edges / (BATCH * QUERIES * FOUND)
+
+
+@pytest.mark.parametrize("counts", [(2, 3, 0), (1, 1, 1), (0, 0, 0)])
+def test_terms_match_plain_loops(counts):
+    prediction, lanes, elements = make_elements(1, counts, related=LAYERS)
+    (total, report), _ = value_and_gradient(prediction, lanes, elements, SIZES, LaneGraphLossConfig())
+    layers = [loop_terms(prediction, lanes, elements, layer) for layer in range(LAYERS)]
+    for name, expected in zip(("class", "box", "iou", "lane"), layers[-1], strict=True):
+        assert float(report[f"element_{name}"]) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
+    alone = lane_graph_loss(prediction.replace(elements=None), lanes, LaneGraphLossConfig())[0]
+    assert float(total - alone) == pytest.approx(np.sum(layers), rel=1e-4)
+    assert float(report["matching/elements"]) == pytest.approx(np.mean(counts))
+
+
+def test_topology_of_the_last_layer_alone():
+    prediction, lanes, elements = make_elements(2, (2, 3, 1), related=1)
+    (_, report), gradient = value_and_gradient(prediction, lanes, elements, SIZES, LaneGraphLossConfig())
+    assert float(report["element_lane"]) == pytest.approx(loop_terms(prediction, lanes, elements, 1)[3], rel=1e-4)
+    assert gradient.elements.lane_logits.shape == (BATCH, 1, QUERIES, FOUND)
+    whole, _, _ = make_elements(2, (2, 3, 1), related=LAYERS)
+    (_, all_layers), _ = value_and_gradient(whole, lanes, elements, SIZES, LaneGraphLossConfig())
+    assert float(all_layers["successor"]) == pytest.approx(float(report["successor"]), rel=1e-6)
+
+
+def test_padding_changes_nothing():
+    prediction, lanes, elements = make_elements(3, (2, 0, 1), related=LAYERS)
+    hole = ~elements.valid
+    dirty = elements.replace(
+        box=np.where(hole[..., None, None], np.nan, elements.box),
+        attribute=np.where(hole, -7, elements.attribute).astype(np.int32),
+        lane=elements.lane | hole[:, None, :] | ~lanes.valid[:, :, None],
+    )
+    clean, soiled = (value_and_gradient(prediction, lanes, e, SIZES, LaneGraphLossConfig()) for e in (elements, dirty))
+    jax.tree.map(np.testing.assert_array_equal, clean, soiled)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(clean))
+
+
+def test_control_points_are_compared_where_asked_for():
+    prediction, lanes, _ = make_elements(4, (0, 0, 0), related=LAYERS)
+    one = jax.tree.map(lambda leaf: leaf[0], (prediction.lanes, lanes))
+    config = LaneGraphLossConfig(class_weight=0.0, points_weight=1.0, control_points=3)
+    cost = matching_cost(*one, config)
+    fit = bezier_fit(one[1].points.shape[1], 3)
+    expected = np.abs(fit @ np.asarray(one[0].points[1, 2]) - fit @ one[1].points[4]).sum()
+    assert float(cost[1, 2, 4]) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("shift", [0.0, 5.0, 30.0])
+def test_overlap_of_boxes(shift):
+    a = np.array([[2.0, 3.0], [12.0, 9.0]], np.float32)
+    b = a + np.float32(shift)
+    assert float(generalised_iou(a, b)) == pytest.approx(overlap(a, b), abs=1e-5)
+    assert float(generalised_iou(a, a)) == pytest.approx(1.0, abs=1e-6)
+    empty = np.zeros((2, 2), np.float32)
+    assert np.isfinite(jax.grad(lambda x: generalised_iou(x, empty))(empty)).all()
+
+
+def test_missing_truth_is_an_error():
+    prediction, lanes, _ = make_elements(5, (1, 1, 1), related=LAYERS)
+    with pytest.raises(ValueError, match="needs the true ones"):
+        lane_graph_loss(prediction, lanes, LaneGraphLossConfig())

@@ -1,0 +1,64 @@
+"""Parameters and answers at the papers' sizes, from shapes alone (shared specs/modules.md section 13)."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from tflane_jax.convert.toponet import camera_shapes
+from tflane_jax.models import bevformer_detr, toponet
+
+BACKBONE, PYRAMID, BEV = 23_508_032, 3_278_592, 7_667_648
+ELEMENTS, RELATIONS = 8_381_032, 460_801
+# The reference counts a constant weight for each coordinate of a lane among its parameters.
+TOPONET_LANES, POINT_LANES, CURVE_LANES = 20_030_524 - 33, 5_792_816 - 33, 5_765_042 - 15
+MAP = jax.ShapeDtypeStruct((100, 200, 256), jnp.float32)
+
+
+def count(tree):
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+def test_toponet_is_as_large_as_the_reference():
+    config = toponet.paper_config()
+    module, example = config.build(), camera_shapes(config.encoder)
+    (answer, memory), variables = jax.eval_shape(
+        lambda key, e: module.init_with_output(key, e, method=module.step), jax.random.key(0), example
+    )
+    params = dict(variables["params"])
+    encoder, elements = params.pop("encoder"), params.pop("elements")
+    # Scale and bias of a frozen norm are parameters in the reference, and constants here.
+    assert count(encoder["images"]["backbone"]) == BACKBONE - 2 * 26_560
+    assert count(encoder["images"]["pyramid"]) == PYRAMID
+    assert count(encoder["bev"]) == BEV
+    assert count(elements) == ELEMENTS
+    assert count(params) == TOPONET_LANES
+
+    assert memory.features.shape == MAP.shape
+    assert answer.lanes.points.shape == (6, 200, 11, 3)
+    assert answer.lanes.successor_logits.shape == (6, 200, 200)
+    assert answer.elements.box.shape == (6, 100, 2, 2)
+    assert answer.elements.lane_logits.shape == (6, 200, 100)
+
+
+@pytest.mark.parametrize(("control_points", "expected"), [(None, POINT_LANES), (5, CURVE_LANES)])
+def test_baseline_is_as_large_as_the_reference(control_points, expected):
+    module = bevformer_detr.paper_config(control_points).build()
+    answer, variables = jax.eval_shape(
+        lambda key, bev: module.init_with_output(key, bev, method=module.decode), jax.random.key(0), MAP
+    )
+    assert count(variables["params"]) == expected + RELATIONS
+    assert answer.lanes.points.shape == (6, 100, 11, 3)
+    # Topology of the last layer alone.
+    assert answer.lanes.successor_logits.shape == (1, 100, 100)
+
+
+def test_lanes_may_move_at_the_papers_sizes_too():
+    config = toponet.paper_config()
+    config = dataclasses.replace(config, decoder=dataclasses.replace(config.decoder, refine="iterative"))
+    module = config.build()
+    answer, _ = jax.eval_shape(
+        lambda key, bev: module.init_with_output(key, bev, method=module.decode), jax.random.key(0), MAP
+    )
+    assert answer.lanes.points.shape == (6, 200, 11, 3)

@@ -1,0 +1,20 @@
+"""Published PyTorch weights for any task that can use them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tflane_jax.convert.lstr import load_lstr
+from tflane_jax.convert.toponet import load_host
+from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.task import Params
+
+
+def load_weights(path: Path, task: LaneCurveTask | LaneGraphTask) -> tuple[Params, list[dict[str, str]]]:
+    """Return a task's parameters from a checkpoint of its reference, and an account of the file's tensors.
+
+    Raises:
+        UserError: the file cannot be read, or its tensors are not exactly those of the model.
+    """
+    return load_lstr(path, task.model) if isinstance(task, LaneCurveTask) else load_host(path, task.model)

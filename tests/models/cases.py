@@ -63,6 +63,7 @@ CAMERA = CameraEncoderConfig(
         BevGrid(rows=4, columns=6), dim=16, heads=2, layers=1, hidden=16, dropout=0.1, spatial_points=4, anchors=2,
         levels=2, cameras=2,
     ),
+    cells=True,
 )  # fmt: skip
 ELEMENTS = ElementDecoderConfig(dim=16, heads=2, layers=2, queries=5, hidden=16, sampling_points=2, dropout=0.1)
 CAMERA_TOPONET = dataclasses.replace(

@@ -120,7 +120,7 @@ def test_a_broken_camera_may_show_anything(fitted):
 
 
 def test_loss_reports_every_term_for_any_number_of_targets(fitted):
-    terms = {"class", "points", "successor", "element_class", "element_box", "element_iou", "element_lane"}
+    terms = {"class", "points", "successor", "element_class", "element_box", "element_iou", "element_lane", "cells"}
     for lanes, elements in ((4, 2), (0, 0), (1, 1)):
         batch = batch_of(*[make_camera_example(5, lanes=lanes, elements=elements)] * 2)
         (loss, report), gradient = fitted.train(fitted.params, batch, jax.random.key(0))

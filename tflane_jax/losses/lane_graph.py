@@ -36,6 +36,7 @@ class LaneGraphLossConfig:
         control_points: compare Bezier control points fitted to the centerlines, so many, instead of their points
             (OpenLane-V2's baseline: 5).
         elements: weights of traffic elements.
+        cell_weight: of the auxiliary loss on BEV cells, where the encoder has it (`losses.lane_cells`).
     """
 
     class_weight: float = 1.5
@@ -47,6 +48,7 @@ class LaneGraphLossConfig:
     element_lane_weight: float = 5.0
     control_points: int | None = None
     elements: ElementLossConfig = ElementLossConfig()
+    cell_weight: float = 1.0
 
 
 def lane_graph_loss(

@@ -18,11 +18,9 @@ from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.positions import image_sine_encoding
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
+from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import LaneCurvePrediction
-
-AUXILIARY = "auxiliary"
-"""Collection in which the network stores what only training looks at: `cells`, logits (h, w)."""
 
 # Of TuSimple images in [0, 1], blue, green, red: the order in which the published weights read them.
 MEAN_BGR = (0.40789654, 0.44719302, 0.47026115)

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.losses.lane_curve import LaneCurveLossConfig, cell_loss, lane_curve_loss, lane_curve_targets
-from tflane_jax.models.lstr import AUXILIARY, LstrConfig, normalise
+from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.lstr import LstrConfig, normalise
 from tflane_jax.scene import LaneCurvePrediction, RoadImage
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
 

@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import BATCH_AXIS
+from tflane_jax.losses.lane_cells import lane_cell_loss
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss
+from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import empty_memory
@@ -48,10 +50,13 @@ class LaneGraphTask:
 
         def one(example, key):
             variables, streams = {"params": learned} | statistics, {"dropout": key}
-            outputs, updated = module.apply(variables, example, train=True, mutable=[STATISTICS], rngs=streams)
-            return outputs, dict(updated)
+            kept = [STATISTICS, AUXILIARY]
+            outputs, state = module.apply(variables, example, train=True, mutable=kept, rngs=streams)
+            updated = {name: value for name, value in state.items() if name == STATISTICS}
+            return outputs, state.get(AUXILIARY, {}), updated
 
-        outputs, updated = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, None))(batch, keys)
+        train = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
+        outputs, auxiliary, updated = train(batch, keys)
         if outputs.elements is None:
             loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
         elif batch.traffic_elements is None or batch.cameras is None:
@@ -62,6 +67,11 @@ class LaneGraphTask:
         else:
             sizes = batch.cameras.size[:, 0]
             loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses, batch.traffic_elements, sizes)
+        for said in jax.tree.leaves(auxiliary):  # one, of an encoder with `cells`
+            area = self.model.encoder.bev.grid.range  # pyright: ignore[reportAttributeAccessIssue]
+            losses = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))(said, batch.lanes, area)
+            terms["cells"] = self.losses.cell_weight * losses.mean()
+            loss += terms["cells"]
         return loss, terms | updated
 
     def predict(self, params: Params, example: Example) -> Prediction:

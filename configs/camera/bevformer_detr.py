@@ -1,0 +1,22 @@
+"""BEVFormer-DETR, OpenLane-V2's baseline, from six cameras of the built-in world: the baseline of `toponet.py`.
+
+    tflane train --config configs/camera/bevformer_detr.py
+
+Encoder, traffic elements, data and training are those of `toponet.py`; the decoder has no graph, its references never
+move, and topology is read from the last layer alone.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.lane_decoder import LaneDecoderConfig
+
+
+def get_config() -> RunConfig:
+    """Return the small baseline."""
+    toponet = load_config(str(Path(__file__).with_name("toponet.py")))
+    encoder, elements = toponet.task.model.encoder, toponet.task.model.elements
+    model = BevFormerDetrConfig(encoder, LaneDecoderConfig(refine="fixed"), elements)
+    return replace(toponet, task=replace(toponet.task, model=model))

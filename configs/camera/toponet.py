@@ -1,0 +1,42 @@
+"""TopoNet from six cameras of the built-in world, at a size for two cores.
+
+    tflane train --config configs/camera/toponet.py
+    tflane compare configs/camera/bevformer_detr.py configs/camera/toponet.py --seeds 0 1 2 --out runs/camera
+"""
+
+from dataclasses import replace
+
+from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.layers.fpn import FeaturePyramidConfig
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.models.bev_encoder import SMALL_BEVFORMER
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.element_decoder import ElementDecoderConfig
+from tflane_jax.models.image_encoder import ImageEncoderConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.ring_cameras import CameraRigConfig
+
+# 240 x 144 pixels. A traffic light lower than 40 pixels of the native image is none that anybody could read in these.
+RIG = CameraRigConfig(scale=0.15, multiple=16, element_pixels=40.0)
+# Three levels from 1/8 on: lane paint is one pixel wide at 20 m.
+ENCODER = CameraEncoderConfig(
+    ImageEncoderConfig(stages=(1, 2, 3), pyramid=FeaturePyramidConfig(64, 3)),
+    replace(SMALL_BEVFORMER, levels=3, cameras=6, layers=2), cells=True,
+)  # fmt: skip
+ELEMENTS = ElementDecoderConfig(levels=3)
+
+
+def get_config() -> RunConfig:
+    """Return the small camera model."""
+    return RunConfig(
+        task=LaneGraphTask(
+            TopoNetConfig(ENCODER, elements=ELEMENTS), LaneGraphLossConfig(successor_weight=20.0)
+        ),
+        data=WorldData(train=1000, val=25, test=100, example=ExampleConfig(sensor=None, cameras=RIG)),
+        optim=OptimConfig(lr=1e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
+        training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),
+    )

@@ -1,0 +1,45 @@
+"""TopoNet at the paper's size, on OpenLane-V2 subset A: ResNet-50, seven cameras, 200 x 100 BEV cells, 200 queries.
+
+    tflane summary --config configs/camera/toponet_r50.py --no-compile          # needs no data
+    tflane train --config configs/camera/toponet_r50.py --data.root PATH
+
+The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each. `:bfloat16` computes in half precision
+and keeps less for the gradient; `:six_layers` has six encoder layers instead of TopoNet's three.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import OpenLaneV2Data, RunConfig
+from tflane_jax.models.toponet import paper_config
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+
+EPOCH = 22_477 // 8
+
+
+def get_config() -> RunConfig:
+    """Return the paper's configuration."""
+    return RunConfig(
+        task=LaneGraphTask(paper_config()),
+        data=OpenLaneV2Data(Path("data/OpenLane-V2")),
+        optim=OptimConfig(epoch_steps=EPOCH, ema_decay=0.0),
+        training=TrainingConfig(steps=24 * EPOCH, batch_size=8, eval_every=EPOCH, checkpoint_every=EPOCH),
+    )
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return variants of the encoder."""
+    config = get_config()
+
+    def with_encoder(encoder) -> RunConfig:
+        return replace(config, task=replace(config.task, model=replace(config.task.model, encoder=encoder)))
+
+    encoder = config.task.model.encoder
+    images = replace(encoder.images, precision="bfloat16", remat=True)
+    bev = replace(encoder.bev, precision="bfloat16", remat=True)
+    return {
+        "bfloat16": with_encoder(replace(encoder, images=images, bev=bev)),
+        "six_layers": with_encoder(replace(encoder, bev=replace(encoder.bev, layers=6))),
+    }

@@ -177,7 +177,7 @@ def _report(
     markdown, _ = save_table(out / "table", rows, {"protocol": protocol, "seeds": list(seeds)}, title=title)
     written = [markdown]
     if len(seeds) > 1:
-        rows = summarise(variants, metrics)
+        rows = summarise(variants, metrics, system.errors)
         title = f"{protocol}: paired differences to {variants[0].name}, two-sided t-test over {len(seeds)} seeds"
         print("\n" + format_table(rows, title=title, digits=4))
         written.append(save_table(out / "paired", rows, {"protocol": protocol}, title=title, digits=4)[0])

@@ -30,3 +30,10 @@ def test_compact_is_in_percent():
 def test_unequal_seeds_cannot_be_paired():
     with pytest.raises(UserError, match="base: 2, prior: 1"):
         summarise([variant("base", 0.1, 0.2), variant("prior", 0.2)], ["all/DET_l"])
+
+
+def test_of_errors_less_is_better():
+    variants = [variant("base", 0.1, 0.2, 0.3), variant("prior", 0.05, 0.1, 0.4)]
+    (_, row) = summarise(variants, ["all/DET_l"], errors=["all/DET_l"])
+    assert row["seeds better"] == "2 of 3"
+    assert row["difference"] == pytest.approx(-0.05 / 3)

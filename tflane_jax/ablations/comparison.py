@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,12 +28,15 @@ class Variant:
     scores: tuple[Scores, ...]
 
 
-def summarise(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[str, Any]]:
+def summarise(
+    variants: Sequence[Variant], metrics: Sequence[str], errors: Collection[str] = ()
+) -> list[dict[str, Any]]:
     """Return one row for each variant and metric: mean, standard deviation, and the difference to the first variant.
 
     Args:
         variants: the first one is what the others are compared with.
         metrics: names as in `Scores`.
+        errors: those of them of which less is better.
 
     Raises:
         UserError: variants have different numbers of seeds, so that nothing can be paired.
@@ -51,7 +54,8 @@ def summarise(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[
             if variant is not variants[0]:
                 test = paired_difference(values, control)
                 row |= {"difference": test.mean, "std of difference": test.std, "p": test.p_value}
-                row["seeds better"] = f"{test.better} of {test.seeds}"
+                better = paired_difference(control, values).better if metric in errors else test.better
+                row["seeds better"] = f"{better} of {test.seeds}"
             rows.append(row)
     return rows
 

@@ -58,6 +58,8 @@ class System(Protocol):
     """Of the evaluation's table, as far as an evaluation has them."""
     compared: tuple[str, ...]
     """Scores ("group/name") that a comparison tests, as far as all of its models have them."""
+    errors: tuple[str, ...]
+    """Those of them of which less is better."""
 
     def load(self, source: Any, *, progress: bool = True) -> Any:
         """Return a split, as `evaluate` takes it: in memory, or a `datasets.streaming.Streamed` of it."""

@@ -66,6 +66,7 @@ class LaneCurveSystem:
 
     columns: tuple[str, ...] = ("seed", "Accuracy", "FP", "FN", "loss", "frames")
     compared: tuple[str, ...] = ("all/Accuracy", "all/FP", "all/FN")
+    errors: tuple[str, ...] = ("all/FP", "all/FN")
 
     def load(self, source: LaneCurveSource, *, progress: bool = True) -> LabelledImages:
         """Return the images of a source, stacked, with their labels."""

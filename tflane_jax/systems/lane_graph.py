@@ -44,6 +44,7 @@ class LaneGraphSystem:
         "all/OLS", "all/DET_t", "all/TOP_lt",
         *(f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in ("all", "occluded", "clear")),
     )  # fmt: skip
+    errors: tuple[str, ...] = ()
 
     def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example | Streamed:
         """Return the examples of a source, stacked; those of OpenLane-V2, and of a large world, are read while used."""

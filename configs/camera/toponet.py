@@ -36,7 +36,7 @@ def get_config() -> RunConfig:
         task=LaneGraphTask(
             TopoNetConfig(ENCODER, elements=ELEMENTS), LaneGraphLossConfig(successor_weight=20.0)
         ),
-        data=WorldData(train=1000, val=25, test=100, example=ExampleConfig(sensor=None, cameras=RIG)),
+        data=WorldData(train=600, val=20, test=75, example=ExampleConfig(sensor=None, cameras=RIG)),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),
     )

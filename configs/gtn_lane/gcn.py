@@ -2,6 +2,8 @@
 
     tflane train --config configs/gtn_lane/gcn.py
 
+Eleven minutes on one core. Test split, three seeds: accuracy 91.9 +- 0.7 percent (docs/gtn_lane.md).
+
 All but the encoder is that of `transformer.py`.
 """
 

@@ -2,6 +2,8 @@
 
     tflane train --config configs/gtn_lane/gtn.py
 
+Eleven minutes on one core. Test split, three seeds: accuracy 91.3 +- 1.1 percent (docs/gtn_lane.md).
+
 All but the encoder is that of `transformer.py`.
 """
 

@@ -2,6 +2,8 @@
 
     tflane train --config configs/gtn_lane/han.py
 
+Eleven minutes on one core. Test split, three seeds: accuracy 91.8 +- 0.5 percent (docs/gtn_lane.md).
+
 All but the encoder is that of `transformer.py`.
 """
 

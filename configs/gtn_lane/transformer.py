@@ -2,6 +2,9 @@
 
     tflane train --config configs/gtn_lane/transformer.py
     tflane compare configs/gtn_lane/{transformer,gtn,gcn,han}.py --seeds 0 1 2 --out runs/table1
+
+Eleven minutes on one core. Test split, three seeds: accuracy 74.6 +- 13.6 percent, two of them still at the start
+(docs/gtn_lane.md).
 """
 
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig

@@ -25,7 +25,8 @@ RIG = CameraRigConfig(scale=0.15, multiple=16, element_pixels=40.0)
 # Three levels from 1/8 on: lane paint is one pixel wide at 20 m.
 ENCODER = CameraEncoderConfig(
     ImageEncoderConfig(stages=(1, 2, 3), pyramid=FeaturePyramidConfig(64, 3)),
-    replace(SMALL_BEVFORMER, levels=3, cameras=6, layers=2), cells=True,
+    # A camera sees at most 469 of the 1,250 cells.
+    replace(SMALL_BEVFORMER, levels=3, cameras=6, capacity=480), cells=True,
 )  # fmt: skip
 ELEMENTS = ElementDecoderConfig(levels=3)
 
@@ -38,5 +39,5 @@ def get_config() -> RunConfig:
         ),
         data=WorldData(train=600, val=20, test=75, example=ExampleConfig(sensor=None, cameras=RIG)),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
-        training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),
+        training=TrainingConfig(steps=3000, batch_size=4, eval_every=1000, checkpoint_every=500),
     )

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
-from tflane_jax.layers.deformable import deformable_attention
+from tflane_jax.layers.sampling import deformable_attention
 from tflane_jax.training.runtime import configure_jax
 
 OURS, TORCH = "ours", "PyTorch"

@@ -34,7 +34,7 @@ CLAIMS = {
     "modules/mha_*": "tests/layers/test_attention.py",
     "modules/mmdet_losses*": "tests/losses/test_costs.py",
     "modules/mmdet_match_costs*": "tests/losses/test_costs.py",
-    "modules/msda_func*": "tests/layers/test_deformable.py",
+    "modules/msda_func*": "tests/layers/test_sampling.py",
     "modules/msda_module*": "tests/layers/test_deformable.py",
     "modules/olv2_lc_head*": "tests/models/test_bevformer_detr.py",
     "modules/pe_sine2d*": "tests/layers/test_positions.py",

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.geometry.poses import transform_points
-from tflane_jax.layers.deformable import sample_bilinear
+from tflane_jax.layers.sampling import sample_bilinear
 
 
 def warp(

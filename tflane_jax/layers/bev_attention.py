@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from tflane_jax.layers.deformable import cell_units, deformable_attention, offsets_and_logits
+from tflane_jax.layers.deformable import cell_units, offsets_and_logits
+from tflane_jax.layers.sampling import deformable_attention
 
 _INIT = nn.initializers.xavier_uniform()
 

@@ -1,0 +1,123 @@
+"""Weighted sums of bilinear samples against the reference's numbers, plain formulas, and at their edges."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tflane_jax.layers import sampling
+from tflane_jax.layers.sampling import deformable_attention, sample_bilinear
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("msda_func*"), ids=case_id)
+def test_core_matches_the_reference(path):
+    case = load_module_case(path)
+    shapes = [tuple(int(n) for n in row) for row in case.inputs.pop("spatial_shapes")]
+    batched = jax.vmap(lambda v, s, w: deformable_attention(v, shapes, s, w))
+
+    def scalar(arrays):
+        out = batched(arrays["value"], arrays["sampling_locations"], arrays["attention_weights"])
+        return (out * case.weights["output"]).sum(), out
+
+    (_, out), gradient = jax.jit(jax.value_and_grad(scalar, has_aux=True))(case.inputs)
+    assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
+    assert_gradients_close({f"in/{k}": v for k, v in gradient.items()}, case.gradients)
+
+
+def loop_sample(grid, x, y):
+    """Bilinear sample of one (h, w) channel by hand, zero outside."""
+    h, w = grid.shape
+    px, py = x * w - 0.5, y * h - 0.5
+    total = 0.0
+    for row in (int(np.floor(py)), int(np.floor(py)) + 1):
+        for column in (int(np.floor(px)), int(np.floor(px)) + 1):
+            if 0 <= row < h and 0 <= column < w:
+                total += grid[row, column] * (1 - abs(px - column)) * (1 - abs(py - row))
+    return total
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(-0.3, 1.3, allow_subnormal=False), st.floats(-0.3, 1.3, allow_subnormal=False))
+def test_sample_matches_a_loop(x, y):
+    grid = np.random.default_rng(0).normal(size=(3, 5)).astype(np.float32)
+    got = sample_bilinear(jnp.asarray(grid.reshape(-1, 1)), (3, 5), jnp.array([x, y], jnp.float32))
+    assert float(got[0]) == pytest.approx(loop_sample(grid, np.float32(x), np.float32(y)), abs=2e-5)
+
+
+def test_sample_reproduces_a_plane_and_its_slope():
+    """A bilinear sample of a linear function is that function, and the gradient is its slope."""
+    h, w = 6, 8
+    rows, columns = np.mgrid[:h, :w]
+    plane = jnp.asarray((3.0 * (columns + 0.5) / w - 2.0 * (rows + 0.5) / h).reshape(-1, 1), jnp.float32)
+    at = jnp.array([0.37, 0.61])
+    value, slope = jax.value_and_grad(lambda p: sample_bilinear(plane, (h, w), p)[0])(at)
+    assert float(value) == pytest.approx(3 * 0.37 - 2 * 0.61, abs=1e-5)
+    np.testing.assert_allclose(slope, [3.0, -2.0], rtol=1e-4)
+
+
+SHAPES = ((5, 7), (3, 2))
+
+
+def plain_attention(value, locations, weights):
+    """The definition for all cells at once: a cell's weight is the product of two hats."""
+    total, begin = 0.0, 0
+    for level, (h, w) in enumerate(SHAPES):
+        grid = value[begin : begin + h * w].reshape(h, w, *value.shape[1:])
+        begin += h * w
+        x, y = locations[:, :, level, :, 0] * w - 0.5, locations[:, :, level, :, 1] * h - 0.5
+        across = jax.nn.relu(1.0 - jnp.abs(x[..., None] - jnp.arange(w)[None, None, None]))
+        down = jax.nn.relu(1.0 - jnp.abs(y[..., None] - jnp.arange(h)[None, None, None]))
+        total = total + jnp.einsum("qnp,qnpy,qnpx,yxnd->qnd", weights[:, :, level], down, across, grid)
+    return total.reshape(len(total), -1)
+
+
+def arrays(queries=5, heads=2, points=3, channels=4):
+    rng = np.random.default_rng(0)
+    locations = rng.uniform(-0.2, 1.2, (queries, heads, 2, points, 2))
+    made = rng.normal(size=(41, heads, channels)), locations, rng.normal(size=(queries, heads, 2, points))
+    return tuple(jnp.asarray(array, jnp.float32) for array in made)
+
+
+def pulled(attend, *given):
+    out, pull = jax.vjp(attend, *given)
+    return out, pull(jnp.cos(jnp.arange(out.size, dtype=jnp.float32)).reshape(out.shape))
+
+
+@pytest.mark.parametrize("steps", ["one step", "many steps"])
+def test_outputs_and_gradients_are_those_of_the_definition(steps, monkeypatch):
+    """Five queries in several steps: the last is padded."""
+    if steps == "many steps":
+        monkeypatch.setattr(sampling, "_FORWARD_STEP", 300)
+        monkeypatch.setattr(sampling, "_BACKWARD_STEP", 200)
+    attend = lambda *given: deformable_attention(given[0], SHAPES, *given[1:])  # noqa: E731
+    ours, plain = (jax.jit(lambda *given, f=f: pulled(f, *given))(*arrays()) for f in (attend, plain_attention))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5), ours, plain)
+    assert all(np.abs(leaf).max() > 0.1 for leaf in jax.tree.leaves(ours))
+
+
+def test_each_view_has_its_own_value_as_if_mapped():
+    one = arrays()
+    given = [jnp.stack([array, array[::-1]]) for array in one]
+    attend = lambda *given: deformable_attention(given[0], SHAPES, *given[1:])  # noqa: E731
+    stacked, mapped = (jax.jit(lambda *given, f=f: pulled(f, *given))(*given) for f in (attend, jax.vmap(attend)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), stacked, mapped)
+    np.testing.assert_allclose(stacked[0][0], attend(*one), atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_place_that_is_none_gives_nothing_and_stops_no_gradient(bad):
+    value, locations, weights = arrays()
+    spoiled = locations.at[2, 1, 0, 1].set(bad).at[4].set(bad)
+    masked = weights.at[2, 1, 0, 1].set(0.0).at[4].set(0.0)
+    attend = jax.jit(lambda *given: pulled(lambda *x: deformable_attention(x[0], SHAPES, *x[1:]), *given))
+    out, (by_value, by_location, by_weight) = attend(value, spoiled, weights)
+    clean, (clean_value, clean_location, _) = attend(value, locations, masked)
+    np.testing.assert_array_equal(out, clean)
+    np.testing.assert_array_equal(by_value, clean_value)
+    np.testing.assert_array_equal(by_location, clean_location)
+    assert not np.asarray(by_weight[4]).any()
+    assert np.isfinite(by_weight).all()

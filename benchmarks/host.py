@@ -24,7 +24,7 @@ from tflane_jax.config import load_config
 from tflane_jax.datasets.loading import for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.lane_decoder import LaneDecoderConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
 from tflane_jax.scene import Example

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.lane_decoder import LaneDecoderConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig
 
 
 def get_config() -> RunConfig:

@@ -14,7 +14,7 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.image_encoder import ImageEncoderConfig
-from tflane_jax.models.lane_decoder import LaneDecoderConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig

@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.golden import assert_gradients_close, assert_outputs_close, named_gradients
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.models.lane_decoder import LaneDecoderConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import LaneGraph, stack_examples
 
 

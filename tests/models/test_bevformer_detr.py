@@ -17,7 +17,7 @@ from tflane_jax.models.bevformer_detr import BevFormerDetr, BevFormerDetrConfig
 def test_lane_head_matches_the_reference(path):
     case = load_module_case(path)
     sizes, weights = case.meta["config"], LaneGraphLossConfig(points_weight=0.0075)
-    module = BevFormerDetr(BevFormerDetrConfig(decoder_config(sizes, sizes["npts"])))
+    module = BevFormerDetr(BevFormerDetrConfig(decoder=decoder_config(sizes, sizes["npts"])))
     lanes = truth(case, sizes["npts"])
     # The fixture has no relationship heads; ours get some, which nothing else depends on.
     bev = np.zeros((*sizes["bev"], sizes["C"]), np.float32)

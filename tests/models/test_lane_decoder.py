@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.models.cases import BASELINE
-from tflane_jax.models.lane_decoder import PointwiseRefinement, directions, smooth_basis, spread_lanes
+from tflane_jax.models.lane_decoder import PointwiseRefinement, directions, smooth_basis
+from tflane_jax.models.lane_queries import spread_lanes
 
 
 @pytest.mark.parametrize("points", [2, 3, 11, 20])

@@ -15,7 +15,13 @@ from jaxtyping import Array, Float
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_basis
 from tflane_jax.models.bev_encoder import BevMemory
-from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig, look, make_encoder
+from tflane_jax.models.camera_encoder import (
+    PAPER_CAMERA_ENCODER,
+    CameraEncoderConfig,
+    check_elements,
+    look,
+    make_encoder,
+)
 from tflane_jax.models.element_decoder import (
     PAPER_ELEMENT_DECODER,
     ElementDecoder,
@@ -24,14 +30,11 @@ from tflane_jax.models.element_decoder import (
 )
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
-    PAPER_LANE_DECODER,
-    LaneDecoderConfig,
     LaneDecoderLayer,
     LaneHeads,
-    LaneQueries,
-    check_elements,
     make_prediction,
 )
+from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig, LaneQueries
 from tflane_jax.scene import Example, Prediction
 
 
@@ -54,7 +57,7 @@ class BevFormerDetrConfig:
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit each other."""
-        check_elements(self.encoder, self.decoder, self.elements)
+        check_elements(self.encoder, self.decoder.layers, self.elements)
         if self.decoder.refine != "fixed":
             raise UserError('the references of BEVFormer-DETR never move: set task.model.decoder.refine to "fixed"')
         return BevFormerDetr(self)

@@ -19,6 +19,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
 from tflane_jax.models.bevformer import BevFormer
+from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER, ImageEncoder, ImageEncoderConfig
 from tflane_jax.scene import Example
@@ -122,3 +123,16 @@ def look(
 def empty_memory(config: EncoderConfig) -> BevMemory | None:
     """Return the memory at the start of a sequence; None for an encoder that keeps none."""
     return BevMemory.empty(config.bev) if isinstance(config, CameraEncoderConfig) else None
+
+
+def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoderConfig | None) -> None:
+    """Raise UserError where traffic elements have no front view, or not a layer for each of the lane decoder's."""
+    if elements is None:
+        return
+    if not isinstance(encoder, CameraEncoderConfig):
+        raise UserError("traffic elements are found in the front camera's image: give the model an encoder of cameras")
+    if elements.layers != layers:
+        raise UserError(
+            f"the decoders of elements and lanes go layer by layer, and have {elements.layers} and {layers}: "
+            "set elements.layers and decoder.layers to one number"
+        )

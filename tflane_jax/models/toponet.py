@@ -23,6 +23,7 @@ from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.camera_encoder import (
     PAPER_CAMERA_ENCODER,
     CameraEncoderConfig,
+    check_elements,
     look,
     make_encoder,
 )
@@ -34,16 +35,13 @@ from tflane_jax.models.element_decoder import (
 )
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_decoder import (
-    PAPER_LANE_DECODER,
     ElementEmbedding,
-    LaneDecoderConfig,
     LaneDecoderLayer,
     LaneHeads,
-    LaneQueries,
-    check_elements,
     make_prediction,
     next_reference,
 )
+from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig, LaneQueries
 from tflane_jax.models.traffic_flow_module import (
     SpatialEncoder,
     TemporalEncoder,
@@ -88,7 +86,7 @@ class TopoNetConfig:
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit each other."""
-        check_elements(self.encoder, self.decoder, self.elements)
+        check_elements(self.encoder, self.decoder.layers, self.elements)
         return TopoNet(self)
 
 

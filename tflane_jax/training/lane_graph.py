@@ -92,5 +92,7 @@ class LaneGraphTask:
         """
         learned, statistics = split_statistics(params)
         module = self.model.build()
-        outputs, memory = module.apply({"params": learned} | statistics, example, memory, method=type(module).step)
-        return memory, jax.tree.map(lambda layers: layers[-1], outputs)
+        variables = {"params": learned} | statistics
+        result: Any = module.apply(variables, example, memory, method=type(module).step)
+        outputs, following = result
+        return following, jax.tree.map(lambda layers: layers[-1], outputs)

@@ -1,0 +1,95 @@
+"""The sizes of the lane decoder, and the learned queries that it begins with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.stats import qmc
+
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.layers.positions import inverse_sigmoid
+
+
+@dataclass(frozen=True)
+class LaneDecoderConfig:
+    """Sizes of the decoder; the defaults train on two CPU cores, `PAPER_LANE_DECODER` holds TopoNet's.
+
+    Attributes:
+        dim: channels of a query.
+        heads: attention heads.
+        layers: decoder layers.
+        queries: lane queries Q.
+        points: points P of a centerline.
+        sampling_points: deformable sampling points per head.
+        hidden: channels inside the feed-forward block.
+        relation: channels of a side of the relationship head.
+        edge_weight: share of neighbours in the scene graph.
+        bands: frequencies per coordinate that tell where a refined lane is.
+        refine: see `models.lane_decoder`.
+        range: the box that normalised coordinates span.
+        dropout: of attention weights, hidden channels, messages and everything that is added to a residual.
+    """
+
+    dim: int = 64
+    heads: int = 8
+    layers: int = 3
+    queries: int = 48
+    points: int = 11
+    sampling_points: int = 4
+    hidden: int = 128
+    relation: int = 16
+    edge_weight: float = 0.6
+    bands: int = 6
+    refine: Literal["fixed", "iterative"] = "iterative"
+    range: PerceptionRange = BevGrid().range
+    dropout: float = 0.0
+
+
+PAPER_LANE_DECODER = LaneDecoderConfig(
+    dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed", dropout=0.1
+)
+
+
+class LaneQueries(nn.Module):
+    """The learned queries: content, position and the reference point that the position stands for."""
+
+    config: LaneDecoderConfig
+
+    @nn.compact
+    def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
+        """Return content, position and initial reference points in [0, 1].
+
+        "fixed": all points of a lane on one spot that the position decides; "iterative": learned anchor lanes.
+        """
+        config = self.config
+        embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
+        position, content = jnp.split(embedding, 2, -1)
+        if config.refine == "iterative":
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config))))
+            return content, position, nn.sigmoid(anchors)
+        spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
+        shape = (config.queries, config.points, 3)
+        return content, position, jnp.broadcast_to(spot[:, None], shape)
+
+
+def spread_lanes(config: LaneDecoderConfig, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:
+    """Return straight lanes spread evenly over the range, in [0, 1]: the anchors before training.
+
+    Middles and headings follow a Halton sequence: three lanes in five run along the ego's own axis, half of them
+    against it, and the others anywhere. `length` is in metres.
+    """
+    sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
+    middle = np.asarray(config.range.low(2)) + sample[:, :2] * np.asarray(config.range.size(2))
+    share = sample[:, 2] / 0.6
+    heading = np.where(share < 1.0, np.pi * (share < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
+    along = np.linspace(-length / 2, length / 2, config.points)
+    direction = np.stack([np.cos(heading), np.sin(heading)], -1)
+    lanes = np.zeros((config.queries, config.points, 3), np.float32)
+    lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
+    # Off the border, where the sigmoid that the points go through is flat.
+    return np.clip(config.range.normalise(lanes), 0.02, 0.98)

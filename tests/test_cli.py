@@ -279,3 +279,9 @@ def test_a_comparison_trains_tests_and_is_not_done_twice(config, tmp_path, capsy
 def test_a_comparison_needs_different_names(config, tmp_path, capsys):
     assert main(["compare", str(config), str(config), "--out", str(tmp_path / "c")]) == 2
     assert "same name" in capsys.readouterr().err
+
+
+def test_the_worlds_cameras_can_be_looked_at(tmp_path, capsys):
+    assert main(["data", "show", "--data", "world-cameras", "--count", "1", "--out", str(tmp_path / "world.png")]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"world.png", "world-cameras.png"}
+    assert "traffic lights and signs" in capsys.readouterr().out

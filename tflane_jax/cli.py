@@ -130,7 +130,8 @@ def _split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
 
 
 def _source_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", choices=("procedural", "argoverse2", "openlane-v2", "front-views", "tusimple"),
+    parser.add_argument("--data", choices=("procedural", "world-cameras", "argoverse2", "openlane-v2", "front-views",
+                                           "tusimple"),
                         help="take other data than the configuration's")  # fmt: skip
     parser.add_argument("--root", metavar="PATH",
                         help="folder of --data argoverse2 (a log, or logs), openlane-v2 or tusimple")  # fmt: skip

@@ -17,7 +17,7 @@ from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
-from tflane_jax.plots import dataset_summary, format_table, save_table, show_dataset
+from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.scene import stack_examples
 from tflane_jax.systems import spread, system_of
 from tflane_jax.systems.lane_curve import open_images
@@ -41,9 +41,13 @@ def show(options: argparse.Namespace) -> int:
         dataset, options.count, options.out, ground=source.example.ground, view=source.example.range
     )
     indices = spread(len(dataset), options.count)
-    rows = dataset_summary(stack_examples([dataset.example(index) for index in indices]))
-    print(format_table(rows, title=f"{source_name(source)}: the {len(indices)} examples drawn"))
-    print(f"\nwritten to {picture}")
+    examples = stack_examples([dataset.example(index) for index in indices])
+    written = [picture]
+    if examples.cameras is not None:
+        path = options.out.with_stem(f"{options.out.stem}-cameras")
+        written.append(save_camera_views(path, examples, ground=source.example.ground, view=source.example.range))
+    print(format_table(dataset_summary(examples), title=f"{source_name(source)}: the {len(indices)} examples drawn"))
+    print("\nwritten to", *written)
     return 0
 
 

@@ -31,7 +31,7 @@ from scipy.special import expit
 from tflane_jax.commands.sources import lane_graph_source, limited_task, make_folder
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.errors import UserError
-from tflane_jax.plots import save_examples
+from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
 from tflane_jax.systems import spread
 from tflane_jax.systems.lane_graph import open_dataset, predict_examples, titles
@@ -70,13 +70,19 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     ]
     head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
+    names, ground, view = titles(dataset, indices), source.example.ground, source.example.range
     save_examples(
         options.out / "pictures.png", examples, {f"{Path(trained.name).name}, step {trained.step}": lanes},
-        titles=titles(dataset, indices), ground=source.example.ground, view=source.example.range,
-        threshold=options.threshold,
+        titles=names, ground=ground, view=view, threshold=options.threshold,
     )  # fmt: skip
-    print(f"{len(indices)} frames written to {options.out}: predictions.npz, truth.npz, predictions.json, "
-          "pictures.png")  # fmt: skip
+    written = ["predictions.npz", "truth.npz", "predictions.json", "pictures.png"]
+    if examples.cameras is not None:
+        save_camera_views(
+            options.out / "cameras.png", examples, lanes, elements, titles=names, ground=ground, view=view,
+            threshold=options.threshold,
+        )  # fmt: skip
+        written.append("cameras.png")
+    print(f"{len(indices)} frames written to {options.out}: {', '.join(written)}")
     return 0
 
 

@@ -20,6 +20,7 @@ from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.systems.lane_graph import limit_instances
 from tflane_jax.training.lane_curve import LaneCurveTask
 from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.world.ring_cameras import CameraRigConfig
 
 
 def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
@@ -68,6 +69,10 @@ def lane_graph_source(config: RunConfig, options: argparse.Namespace) -> LaneGra
         subset = subset_of(Path(options.root))
         image = TOPONET_SUBSET_A if subset == "A" else TOPONET_SUBSET_B
         return OpenLaneV2Config(Path(options.root), options.split, subset, image=image, example=configured.example)
+    if options.data == "world-cameras":
+        rig = configured.example.cameras or CameraRigConfig(scale=0.3)
+        example = replace(configured.example, cameras=rig)
+        return ProceduralConfig(split=options.split, scenes=100, example=example)
     if options.data == "argoverse2" or real:
         if options.root is None:
             raise UserError("--data argoverse2 needs --root PATH, a log or a folder of logs")

@@ -84,8 +84,8 @@ class LaneGraphSystem:
         return Evaluation(metrics.protocol, metrics.compute())
 
     def drawing(self, config: RunConfig) -> Draw:
-        """Return the function that draws a few validation examples from above."""
-        from tflane_jax.plots import save_examples
+        """Return the function that draws a few validation examples from above and in their camera images."""
+        from tflane_jax.plots import save_camera_views, save_examples
 
         source = _source(config, "val")
         dataset = open_dataset(source)
@@ -93,12 +93,13 @@ class LaneGraphSystem:
 
         def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
             if indices:
-                examples, lanes, _ = predict_examples(config.task, params, dataset, indices)
-                save_examples(
-                    folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": lanes},
-                    titles=titles(dataset, indices), ground=source.example.ground,
-                    view=source.example.range,
-                )  # fmt: skip
+                examples, lanes, elements = predict_examples(config.task, params, dataset, indices)
+                path, names = folder / "pictures" / f"step_{step:08d}.png", titles(dataset, indices)
+                ground, view = source.example.ground, source.example.range
+                save_examples(path, examples, {f"step {step}": lanes}, titles=names, ground=ground, view=view)
+                if examples.cameras is not None:
+                    path = path.with_stem(f"{path.stem}_cameras")
+                    save_camera_views(path, examples, lanes, elements, titles=names, ground=ground, view=view)
 
         return draw
 

@@ -12,11 +12,15 @@ from pathlib import Path
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
 
 
 def get_config() -> RunConfig:
     """Return the small baseline."""
     toponet = load_config(str(Path(__file__).with_name("toponet.py")))
-    encoder, elements = toponet.task.model.encoder, toponet.task.model.elements
-    model = BevFormerDetrConfig(encoder, LaneDecoderConfig(refine="fixed"), elements)
+    host = toponet.task.model
+    assert isinstance(toponet.task, LaneGraphTask)
+    assert isinstance(host, TopoNetConfig)
+    model = BevFormerDetrConfig(host.encoder, LaneDecoderConfig(refine="fixed"), host.elements)
     return replace(toponet, task=replace(toponet.task, model=model))

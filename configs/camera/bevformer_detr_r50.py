@@ -7,15 +7,17 @@
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.bevformer_detr import paper_config
+from tflane_jax.training.lane_graph import LaneGraphTask
 
 
 def get_config() -> RunConfig:
     """Return the baseline's configuration."""
     toponet = load_config(str(Path(__file__).with_name("toponet_r50.py")))
     losses = LaneGraphLossConfig(points_weight=0.0075, control_points=5)
-    task = replace(toponet.task, model=paper_config(control_points=5), losses=losses)
+    assert isinstance(toponet.data, OpenLaneV2Data)
+    task = LaneGraphTask(paper_config(control_points=5), losses)
     return replace(toponet, task=task, data=replace(toponet.data, image=BASELINE_LARGE))

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig
+from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.toponet import paper_config
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -33,13 +34,14 @@ def ablations() -> dict[str, RunConfig]:
     """Return variants of the encoder."""
     config = get_config()
 
-    def with_encoder(encoder) -> RunConfig:
-        return replace(config, task=replace(config.task, model=replace(config.task.model, encoder=encoder)))
+    def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
+        return replace(config, task=LaneGraphTask(replace(paper_config(), encoder=encoder)))
 
-    encoder = config.task.model.encoder
-    images = replace(encoder.images, precision="bfloat16", remat=True)
-    bev = replace(encoder.bev, precision="bfloat16", remat=True)
+    images = replace(PAPER_CAMERA_ENCODER.images, precision="bfloat16", remat=True)
+    bev = replace(PAPER_CAMERA_ENCODER.bev, precision="bfloat16", remat=True)
     return {
-        "bfloat16": with_encoder(replace(encoder, images=images, bev=bev)),
-        "six_layers": with_encoder(replace(encoder, bev=replace(encoder.bev, layers=6))),
+        "bfloat16": with_encoder(CameraEncoderConfig(images, bev)),
+        "six_layers": with_encoder(
+            replace(PAPER_CAMERA_ENCODER, bev=replace(PAPER_CAMERA_ENCODER.bev, layers=6))
+        ),
     }

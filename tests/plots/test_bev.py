@@ -7,7 +7,10 @@ from tflane_jax.plots.bev import box_corners, draw_evidence, draw_lanes, draw_pr
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.scene import LanePrediction
 
-matplotlib = pytest.importorskip("matplotlib")
+# A submodule is an attribute of its package only once something has imported it.
+agg = pytest.importorskip("matplotlib.backends.backend_agg")
+collections = pytest.importorskip("matplotlib.collections")
+colors = pytest.importorskip("matplotlib.colors")
 
 
 @pytest.fixture
@@ -19,19 +22,19 @@ def pixels(draw) -> np.ndarray:
     """Return the picture that `draw(ax)` gives, as (H, W, 4) uint8."""
     figure, axes = new_figure()
     draw(axes[0, 0])
-    figure.canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    figure.canvas = agg.FigureCanvasAgg(figure)
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())
 
 
 def lines(ax) -> list:
     """Return every polyline of the axes, as (n, 2)."""
-    found = [c for c in ax.collections if isinstance(c, matplotlib.collections.LineCollection)]
+    found = [c for c in ax.collections if isinstance(c, collections.LineCollection)]
     return [segment for collection in found for segment in collection.get_segments()]
 
 
 def boxes(ax) -> list:
-    found = [c for c in ax.collections if isinstance(c, matplotlib.collections.PolyCollection)]
+    found = [c for c in ax.collections if isinstance(c, collections.PolyCollection)]
     return [path.vertices[:-1] for collection in found for path in collection.get_paths()]
 
 
@@ -58,7 +61,7 @@ def test_lanes_lie_where_they_are_and_show_their_visibility(ax):
     lanes = fake_example().lanes
     draw_lanes(ax, lanes)
     np.testing.assert_allclose(lines(ax), lanes.points[:2, :, :2], rtol=1e-6)
-    clear, hidden = (matplotlib.colors.to_rgb(c) for c in (style.LANE_CLEAR, style.LANE_HIDDEN))
+    clear, hidden = (colors.to_rgb(c) for c in (style.LANE_CLEAR, style.LANE_HIDDEN))
     colours = ax.collections[0].get_colors()
     np.testing.assert_allclose(colours[1, :3], clear, atol=0.01)
     np.testing.assert_allclose(colours[0, :3], 0.25 * np.asarray(clear) + 0.75 * np.asarray(hidden), atol=0.01)

@@ -11,6 +11,7 @@ import pytest
 from jax import lax
 
 from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
+from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.toponet import TopoNetConfig
@@ -29,9 +30,7 @@ class Fitted:
 
     def __init__(self, task):
         self.task = task
-        # Compiling the initialisation would take as long as the rest of a test.
-        rng, shapes = np.random.default_rng(0), jax.eval_shape(task.init, jax.random.key(0), make_camera_example())
-        self.params = jax.tree.map_with_path(lambda path, leaf: random_leaf(rng, path[-1].key, leaf.shape), shapes)
+        self.params = random_params(task.init, make_camera_example())
         self.step = jax.jit(task.step)
 
         @jax.jit
@@ -43,12 +42,6 @@ class Fitted:
 
     def predict(self, example):
         return self.step(self.params, self.task.start(), example)[1]
-
-
-def random_leaf(rng, name, shape):
-    if name in ("scale", "var"):
-        return jnp.asarray(rng.uniform(0.8, 1.2, shape), jnp.float32)
-    return jnp.asarray(rng.normal(0, 0.05 if name == "bias" else 0.3, shape), jnp.float32)
 
 
 @functools.cache

@@ -1,6 +1,7 @@
 """Networks of the LSTR family as tasks: padding, statistics, dropout, every encoder."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
+from tests.parameters import random_params
 from tflane_jax.losses.lane_curve import LaneCurveLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneCurveHeads, nearest, normalise, shrink
@@ -25,15 +27,34 @@ ENCODERS = {
 }
 
 
-@pytest.fixture(scope="module", params=ENCODERS)
+class Fitted:
+    """A task with random parameters and its compiled programs: what they start from, prediction, one update."""
+
+    def __init__(self, task):
+        optim = OptimConfig(lr=1e-2, warmup_steps=0, weight_decay=0.0)
+        self.params = random_params(task.init, road_image(0))
+        self.predict = jax.jit(task.predict)
+        self.init = jax.jit(lambda key, example: init_state(task, make_optimizer(optim, 10), key, example))
+        # The loss and its gradient take most of these tests' time: all of them read them off this one program.
+        self.update = make_update_step(task, optim, 10)
+
+    def start(self, key=0):
+        """Return a fresh state, whose buffers nobody else has: an update consumes them."""
+        return self.init(jax.random.key(key), road_image(0))
+
+    def updated(self, batch, key=0):
+        """Return the state and the metrics after one update of the random parameters."""
+        return self.update(self.start(key).replace(params=jax.tree.map(np.array, self.params)), batch)
+
+
+@cache
+def fit(name):
+    return Fitted(tiny_task(ENCODERS[name]))
+
+
+@pytest.fixture(params=ENCODERS)
 def fitted(request):
-    """Return a task, its parameters moved off their initial values, and its compiled prediction."""
-    task = tiny_task(ENCODERS[request.param])
-    params = jax.jit(task.init)(jax.random.key(0), road_image(0))
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    leaves = [leaf + 0.05 * jnp.abs(jax.random.normal(key, leaf.shape)) for key, leaf in zip(keys, leaves, strict=True)]
-    return task, jax.tree.unflatten(tree, leaves), jax.jit(task.predict)
+    return fit(request.param)
 
 
 def padded(example, fill):
@@ -46,49 +67,55 @@ def padded(example, fill):
     return example.replace(image=image, image_valid=valid, lines=example.lines.replace(points=points))
 
 
+def pair(example):
+    """Return a batch that holds an example twice."""
+    return jax.tree.map(lambda leaf: np.stack([leaf, leaf]), example)
+
+
+def numbers(tree):
+    return jax.device_get(jax.tree.map(lambda leaf: jax.random.key_data(leaf) if is_key(leaf) else leaf, tree))
+
+
+def is_key(leaf):
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
 def test_predicts_one_class_and_one_curve_for_each_query(fitted):
-    _, params, predict = fitted
-    answer = predict(params, road_image(0))
+    answer = fitted.predict(fitted.params, road_image(0))
     assert answer.logits.shape == (5, 2)
     assert answer.curves.shape == (5, 8)
     # k'', f'', m'' and n' belong to the image.
     assert np.ptp(answer.curves[:, 2:6], axis=0).max() < 1e-6
-    assert not np.array_equal(answer.logits, predict(params, road_image(1)).logits)
+    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).logits)
 
 
 def test_what_stands_in_padding_changes_nothing(fitted):
-    task, params, predict = fitted
     clean, soiled = (padded(road_image(0), fill) for fill in (0, 200))
-    jax.tree.map(np.testing.assert_array_equal, predict(params, clean), predict(params, soiled))
-    assert not np.array_equal(predict(params, clean).logits, predict(params, road_image(0)).logits)
+    answer = fitted.predict(fitted.params, clean)
+    jax.tree.map(np.testing.assert_array_equal, answer, fitted.predict(fitted.params, soiled))
+    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(0)).logits)
 
-    @jax.jit
-    def step(batch):
-        return jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(2))[0])(params)
-
-    both = (step(jax.tree.map(lambda leaf: np.stack([leaf, leaf]), example)) for example in (clean, soiled))
-    jax.tree.map(np.testing.assert_array_equal, *both)
+    # The optimiser's first moment is the gradient, scaled.
+    (state, metrics), other = (fitted.updated(pair(example)) for example in (clean, soiled))
+    assert metrics["finite"]
+    jax.tree.map(np.testing.assert_array_equal, (numbers(state), metrics), (numbers(other[0]), other[1]))
 
 
 def test_an_image_of_nothing_but_padding_stays_finite(fitted):
-    task, params, predict = fitted
     nothing = road_image(0, lines=0).replace(image_valid=np.zeros((HEIGHT, WIDTH), bool))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(predict(params, nothing)))
-    batch = jax.tree.map(lambda leaf: leaf[None], nothing)
-    loss, gradient = jax.jit(jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(2))[0]))(params)
-    assert np.isfinite(loss)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    answer = fitted.predict(fitted.params, nothing)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(answer))
+    state, metrics = fitted.updated(pair(nothing))
+    assert metrics["finite"]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((numbers(state), metrics)))
 
 
 def test_training_moves_everything_that_learns_and_the_statistics(fitted):
-    task, _, _ = fitted
-    optim = OptimConfig(lr=1e-2, warmup_steps=0, weight_decay=0.0)
-    batch = jax.device_put(road_images(3))
-    state = init_state(task, make_optimizer(optim, 10), jax.random.key(0), road_image(0))
+    batch = jax.device_put(road_images(2))
+    state, losses = fitted.start(), []
     before = jax.tree.map(np.asarray, state.params)
-    step, losses = make_update_step(task, optim, 10), []
     for _ in range(8):
-        state, metrics = step(state, batch)
+        state, metrics = fitted.update(state, batch)
         losses.append(float(metrics["loss"]))
         assert STATISTICS not in "".join(metrics)
     assert losses[-1] < losses[0]
@@ -102,10 +129,8 @@ def test_training_moves_everything_that_learns_and_the_statistics(fitted):
 
 
 def test_dropout_follows_its_key():
-    task, batch = tiny_task(), road_images(2)
-    params = jax.jit(task.init)(jax.random.key(0), road_image(0))
-    loss = jax.jit(lambda key: task.loss(params, batch, key)[0])
-    first, again, other = (float(loss(jax.random.key(seed))) for seed in (0, 0, 1))
+    batch = road_images(2)
+    first, again, other = (float(fit("transformer").updated(batch, seed)[1]["loss"]) for seed in (0, 0, 1))
     assert first == again
     assert first != other
 
@@ -142,18 +167,21 @@ def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
 @pytest.mark.parametrize("encoder", [None, GtnEncoderConfig(layers=1, hidden=16)])
 def test_cells_are_learned_beside_the_curves(encoder):
     task = LaneCurveTask(tiny_model(encoder, cells=True))
-    params = jax.jit(task.init)(jax.random.key(0), road_image(0))
-    batch = road_images(2)
-    (loss, terms), gradient = jax.jit(jax.value_and_grad(task.loss, has_aux=True))(params, batch, jax.random.key(0))
+    silent = dataclasses.replace(task, losses=LaneCurveLossConfig(cell_weight=0.0))
+    without = LaneCurveTask(tiny_model(encoder))
+    params = random_params(task.init, road_image(0))
+
+    @jax.jit
+    def run(params, example, batch, key):
+        rest = {name: value for name, value in params.items() if name != "cell_head"}
+        answers = task.predict(params, example), without.predict(rest, example)
+        return jax.value_and_grad(task.loss, has_aux=True)(params, batch, key), silent.loss(params, batch, key), answers
+
+    ((loss, terms), gradient), (rest, _), answers = run(params, road_image(0), road_images(2), jax.random.key(0))
     assert terms["cells"] > 0
     assert np.abs(gradient["cell_head"]["kernel"]).max() > 0
-    silent = dataclasses.replace(task, losses=LaneCurveLossConfig(cell_weight=0.0))
-    rest, _ = jax.jit(silent.loss)(params, batch, jax.random.key(0))
     np.testing.assert_allclose(loss - terms["cells"], rest, rtol=1e-5)
-    without = {name: value for name, value in params.items() if name != "cell_head"}
-    answer, same = (jax.jit(LaneCurveTask(tiny_model(encoder, cells=flag)).predict)(p, road_image(0))
-                    for flag, p in ((True, params), (False, without)))  # fmt: skip
-    jax.tree.map(np.testing.assert_array_equal, answer, same)
+    jax.tree.map(np.testing.assert_array_equal, *answers)
 
 
 def test_shrunk_images_are_means_of_blocks_and_valid_where_all_of_a_block_is():
@@ -167,11 +195,13 @@ def test_shrunk_images_are_means_of_blocks_and_valid_where_all_of_a_block_is():
         shrink(jnp.asarray(image), jnp.asarray(valid), 5)
 
 
+@cache
+def curves_of(**options):
+    """Return the curves that a network with some options predicts; parameters of one name have the same values."""
+    task = LaneCurveTask(tiny_model(**options))
+    return jax.jit(task.predict)(random_params(task.init, road_image(0)), road_image(0)).curves
+
+
 @pytest.mark.parametrize("changes", [{"shrink": 2}, {"located": True}, {"anchors": (0.4, 1.0)}])
 def test_options_predict_something_else(changes):
-    answers = []
-    for options in ({}, changes):
-        task = LaneCurveTask(tiny_model(**options))
-        params = jax.jit(task.init)(jax.random.key(0), road_image(0))
-        answers.append(jax.jit(task.predict)(params, road_image(0)))
-    assert not np.array_equal(answers[0].curves, answers[1].curves)
+    assert not np.array_equal(curves_of(), curves_of(**changes))

@@ -1,0 +1,24 @@
+"""Random parameters: a model's own initialisation compiles for longer than most of what a test compares."""
+
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def random_params(init, *arguments, spread=0.3):
+    """Return parameters shaped like those of `init(key, *arguments)`, none of them at a special value.
+
+    What has the same name and the same shape in two models has the same values in both. `spread` is the standard
+    deviation of weights.
+    """
+    shapes = jax.eval_shape(init, jax.random.key(0), *arguments)
+    return jax.tree.map_with_path(lambda path, leaf: _random_leaf(path, leaf, spread), shapes)
+
+
+def _random_leaf(path, leaf, spread):
+    rng = np.random.default_rng(zlib.crc32(jax.tree_util.keystr(path).encode()))
+    if path[-1].key in ("scale", "var"):
+        return jnp.asarray(rng.uniform(0.8, 1.2, leaf.shape), leaf.dtype)
+    return jnp.asarray(rng.normal(0, 0.05 if path[-1].key == "bias" else spread, leaf.shape), leaf.dtype)

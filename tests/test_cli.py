@@ -44,6 +44,9 @@ def ablations():
     return {"baseline": replace(get_config(), task=LaneGraphTask())}
 '''
 
+# Matplotlib takes most of the time of a training as short as these; one test looks at the pictures.
+FEW_PICTURES = ["--training.eval-every", "4", "--evaluation.pictures", "0"]
+
 
 @pytest.fixture(scope="module", autouse=True)
 def fakes():
@@ -166,14 +169,15 @@ def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
 
 def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):
     folder = tmp_path / "baseline"
-    assert main(["train", "--config", f"{config}:baseline", "--out", str(folder), "--training.steps", "2"]) == 0
+    command = ["train", "--config", f"{config}:baseline", "--out", str(folder), "--training.steps", "2"]
+    assert main([*command, *FEW_PICTURES]) == 0
     assert main(["eval", str(folder), "--max-instances", "0"]) == 2
     assert "without traffic flow" in capsys.readouterr().err
 
 
 def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
     folder = tmp_path / "seeds"
-    arguments = ["--training.seeds", "0", "1", "--training.steps", "2"]
+    arguments = ["--training.seeds", "0", "1", "--training.steps", "2", *FEW_PICTURES]
     assert main(["train", "--config", f"{config}:baseline", "--out", str(folder), *arguments]) == 0
     assert main(["eval", str(folder), "--out", str(tmp_path / "table")]) == 0
     rows = [r for r in json.loads((tmp_path / "table.json").read_text())["rows"] if r["lanes of"] == "all"]
@@ -260,6 +264,7 @@ def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
 def test_a_comparison_trains_tests_and_is_not_done_twice(config, tmp_path, capsys):
     out = tmp_path / "comparison"
     command = ["compare", f"baseline={config}:baseline", f"+TFM={config}", "--seeds", "0", "1", "--out", str(out)]
+    command += FEW_PICTURES
     assert main(command) == 0
     scores = json.loads((out / "scores.json").read_text())
     assert list(scores) == ["baseline", "+TFM", "+TFM, no traffic flow at inference"]

@@ -1,7 +1,10 @@
 """Settings of every test session, made before JAX starts."""
 
+import atexit
 import gc
 import os
+import shutil
+import tempfile
 
 # Tests compile many programs and run each a few times: unoptimised code halves the session, and XLA's older code
 # generator for fusions halves what is left, as it hands LLVM far less to do.
@@ -11,8 +14,16 @@ _FAST_COMPILE = (
 )
 os.environ["XLA_FLAGS"] = f"{_FAST_COMPILE} {os.environ.get('XLA_FLAGS', '')}".strip()
 
+import jax  # noqa: E402
+
 from tflane_jax.training.runtime import configure_jax  # noqa: E402
 
 configure_jax()
+# Programs that several tests make anew, such as a model's initialisation, are compiled once. Every process has a folder
+# of its own: JAX writes these files without a lock.
+_programs = tempfile.mkdtemp(prefix="tflane_tests_")
+atexit.register(shutil.rmtree, _programs, ignore_errors=True)
+jax.config.update("jax_compilation_cache_dir", _programs)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 # Tracing makes millions of objects, hardly any of them garbage: looking for it as often as by default costs a tenth.
 gc.set_threshold(100_000, 50, 100)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 
@@ -22,5 +21,5 @@ def get_config() -> RunConfig:
     host = toponet.task.model
     assert isinstance(toponet.task, LaneGraphTask)
     assert isinstance(host, TopoNetConfig)
-    model = BevFormerDetrConfig(host.encoder, LaneDecoderConfig(refine="fixed"), host.elements)
+    model = BevFormerDetrConfig(host.encoder, replace(host.decoder, refine="fixed"), host.elements)
     return replace(toponet, task=replace(toponet.task, model=model))

@@ -8,26 +8,32 @@ from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.fpn import FeaturePyramidConfig
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.image_encoder import ImageEncoderConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.ring_cameras import CameraRigConfig
 
-# 240 x 144 pixels. A traffic light lower than 40 pixels of the native image is none that anybody could read in these.
+# MapTR's range. At 240 x 144 pixels a lane line is less than a pixel wide at 20 m.
+TRUTH = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
+GRID = BevGrid(PerceptionRange((-30.72, 30.72), (-15.36, 15.36)), rows=25, columns=50)
+# A traffic light lower than 40 pixels of the native image is none that anybody could read in these.
 RIG = CameraRigConfig(scale=0.15, multiple=16, element_pixels=40.0)
-# Three levels from 1/8 on: lane paint is one pixel wide at 20 m.
 ENCODER = CameraEncoderConfig(
+    # Three levels from 1/8 on.
     ImageEncoderConfig(stages=(1, 2, 3), pyramid=FeaturePyramidConfig(64, 3)),
     # A camera sees at most 469 of the 1,250 cells.
-    replace(SMALL_BEVFORMER, levels=3, cameras=6, capacity=480), cells=True,
+    replace(SMALL_BEVFORMER, grid=GRID, levels=3, cameras=6, capacity=480), cells=True,
 )  # fmt: skip
+DECODER = LaneDecoderConfig(queries=32, groups=6, range=GRID.range)
 ELEMENTS = ElementDecoderConfig(levels=3)
 
 
@@ -35,9 +41,9 @@ def get_config() -> RunConfig:
     """Return the small camera model."""
     return RunConfig(
         task=LaneGraphTask(
-            TopoNetConfig(ENCODER, elements=ELEMENTS), LaneGraphLossConfig(successor_weight=20.0)
+            TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS), LaneGraphLossConfig(successor_weight=20.0)
         ),
-        data=WorldData(train=600, val=20, test=75, example=ExampleConfig(sensor=None, cameras=RIG)),
-        optim=OptimConfig(lr=1e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
+        data=WorldData(train=600, val=20, test=75, example=ExampleConfig(range=TRUTH, sensor=None, cameras=RIG)),
+        optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=3000, batch_size=4, eval_every=1000, checkpoint_every=500),
     )

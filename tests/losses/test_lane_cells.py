@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.losses.lane_cells import lane_cell_loss, lane_cells
+from tflane_jax.losses.lane_cells import CHANNELS, lane_cell_loss, lane_cells
 from tflane_jax.scene import LaneGraph
 
 RANGE = PerceptionRange((0.0, 8.0), (0.0, 4.0), (-1.0, 1.0))
@@ -23,27 +23,44 @@ def graph(*lines, capacity=3, garbage=np.nan):
 
 
 def test_a_lane_fills_the_cells_that_it_runs_through():
-    there, direction = lane_cells(graph([[0.2, 1.5, 0], [3.8, 1.5, 0]]), SHAPE, RANGE)
+    cells = lane_cells(graph([[0.2, 1.5, 0], [3.8, 1.5, 0]]), SHAPE, RANGE)
     expected = np.zeros(SHAPE, bool)
     expected[1, :4] = True
-    np.testing.assert_array_equal(there, expected)
-    np.testing.assert_allclose(np.asarray(direction)[expected], [[1.0, 0.0]] * 4, atol=1e-6)
-    np.testing.assert_array_equal(np.asarray(direction)[~expected], 0.0)
+    np.testing.assert_array_equal(cells.inside, expected)
+    np.testing.assert_allclose(cells.direction[expected], [[1.0, 0.0]] * 4, atol=1e-6)
 
 
-def test_lanes_against_each_other_cancel_and_those_outside_write_nothing():
-    there, direction = lane_cells(
-        graph([[0.0, 0.5, 0], [8.0, 0.5, 0]], [[8.0, 0.5, 0], [0.0, 0.5, 0]], [[0.0, 4.5, 0], [-3.0, -1.0, 0]]),
+def test_cells_beside_a_lane_say_where_it_is():
+    cells = lane_cells(graph([[0.0, 1.75, 0], [8.0, 1.75, 0]]), SHAPE, RANGE)
+    np.testing.assert_array_equal(cells.near, [[True] * 8] * 3 + [[False] * 8])
+    np.testing.assert_allclose(cells.offset[:3, :, 1], np.repeat([[1.25], [0.25], [-0.75]], 8, 1), atol=1e-6)
+    np.testing.assert_allclose(cells.offset[..., 0], 0.0, atol=1e-6)
+    np.testing.assert_array_equal(cells.offset[3], 0.0)
+    np.testing.assert_array_equal(cells.direction[3], 0.0)
+
+
+def test_offsets_are_in_cells_and_directions_in_metres():
+    wide = PerceptionRange((0.0, 16.0), (0.0, 4.0), (-1.0, 1.0))  # cells of 2 m x 1 m
+    cells = lane_cells(graph([[0.0, 0.0, 0], [4.0, 4.0, 0]]), SHAPE, wide)
+    np.testing.assert_allclose(cells.direction[1, 0], np.sqrt([0.5, 0.5]), atol=1e-6)
+    # In cells the lane goes from (0, 0) to (2, 4), and passes (0.5, 1.5) at (0.7, 1.4).
+    np.testing.assert_allclose(cells.offset[1, 0], [0.2, -0.1], atol=1e-6)
+
+
+def test_the_nearer_of_two_lanes_speaks_and_those_outside_fill_nothing():
+    cells = lane_cells(
+        graph([[0.0, 0.5, 0], [8.0, 0.5, 0]], [[8.0, 3.0, 0], [0.0, 3.0, 0]], [[0.0, 4.5, 0], [-3.0, -1.0, 0]]),
         SHAPE, RANGE,
     )  # fmt: skip
-    np.testing.assert_array_equal(np.asarray(there)[0], True)
-    np.testing.assert_array_equal(np.asarray(there)[1:], False)
-    np.testing.assert_allclose(np.asarray(direction)[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(cells.direction[:2, 2:, 0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(cells.direction[2:, 2:, 0], -1.0, atol=1e-6)
+    np.testing.assert_array_equal(cells.inside[0], True)
+    np.testing.assert_array_equal(cells.inside[1], False)
 
 
 def test_padding_changes_nothing():
     line = [[0.0, 0.5, 0], [8.0, 3.5, 0]]
-    said = jax.random.normal(jax.random.key(0), (*SHAPE, 3))
+    said = jax.random.normal(jax.random.key(0), (*SHAPE, CHANNELS))
     gradient = jax.grad(lane_cell_loss)
     clean, dirty = (gradient(said, graph(line, garbage=garbage), RANGE) for garbage in (0.0, np.nan))
     np.testing.assert_array_equal(clean, dirty)
@@ -52,14 +69,14 @@ def test_padding_changes_nothing():
 
 @pytest.mark.parametrize("lanes", [graph(), graph(capacity=0)], ids=["none valid", "no room"])
 def test_no_lane_is_learned_too(lanes):
-    said = jnp.zeros((*SHAPE, 3))
+    said = jnp.zeros((*SHAPE, CHANNELS))
     assert lane_cell_loss(said, lanes, RANGE) == pytest.approx(0.5 * np.log(2.0))
     assert (jax.grad(lane_cell_loss)(said, lanes, RANGE)[..., 0] > 0).all()
 
 
 def test_the_truth_has_the_least_loss():
     lanes = graph([[0.0, 0.5, 0], [8.0, 3.5, 0]])
-    there, direction = lane_cells(lanes, SHAPE, RANGE)
-    perfect = jnp.concatenate([jnp.where(there, 20.0, -20.0)[..., None], direction], -1)
+    cells = lane_cells(lanes, SHAPE, RANGE)
+    perfect = jnp.concatenate([jnp.where(cells.inside, 20.0, -20.0)[..., None], cells.offset, cells.direction], -1)
     assert lane_cell_loss(perfect, lanes, RANGE) < 1e-6
     assert lane_cell_loss(perfect.at[..., 0].multiply(-1), lanes, RANGE) > 10.0

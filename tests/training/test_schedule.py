@@ -1,6 +1,7 @@
 """Learning rate, weight decay and clipping against formulas in numpy and the numbers of PyTorch and mmcv."""
 
 import math
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +61,29 @@ def test_first_update_is_adamw_with_clipping():
     # Norm 50, so gradients become 0.6 and 0.8; Adam's first step is g / (|g| + eps); decay adds 0.5 * 3 to the kernel.
     np.testing.assert_allclose(updates["kernel"], [[-0.1 * (1 + 1.5), -0.1 * 1.5]], rtol=1e-4)
     np.testing.assert_allclose(updates["bias"], [0.0, -0.1], rtol=1e-4)
+
+
+def test_muon_makes_the_updates_of_matrices_orthogonal_and_leaves_the_rest_to_adam():
+    rng = np.random.default_rng(0)
+    # Two thousand times as much of one direction as of another.
+    left, right = np.linalg.qr(rng.normal(size=(6, 6)))[0], np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    kernel = jnp.asarray(left[:, :4] @ np.diag([20.0, 1.0, 0.1, 0.01]) @ right.T, jnp.float32)
+    other = jnp.asarray(rng.normal(size=(6, 4)), jnp.float32)
+    grads = {"kernel": kernel, "embedding": other, "bias": other[0]}
+    params = jax.tree.map(jnp.zeros_like, grads)
+    config = OptimConfig(lr=0.1, warmup_steps=0, weight_decay=0.0, clip_norm=np.inf)
+    one, all_adam = (
+        jax.jit(o.update)(grads, o.init(params), params)[0]
+        for o in (make_optimizer(replace(config, matrices=kind), 10) for kind in ("muon", "adam"))
+    )
+    found, expected = -np.asarray(one["kernel"]), left[:, :4] @ right.T
+    # Newton's iterations leave singular values about one; root mean square 0.2 stands for sqrt(6) times that.
+    values = np.linalg.svd(found, compute_uv=False) / (0.1 * 0.2 * np.sqrt(6))
+    assert values[0] < 1.3
+    assert values[2] > 0.6
+    assert (found * expected).sum() > 0.8 * np.linalg.norm(found) * np.linalg.norm(expected)
+    for name in ("embedding", "bias"):
+        np.testing.assert_allclose(one[name], all_adam[name], rtol=1e-5)
 
 
 def test_new_settings_are_off_by_default():

@@ -1,10 +1,12 @@
-"""An auxiliary loss on BEV features: does a lane run through this cell, and which way?
+"""An auxiliary loss on BEV features: does a lane run through this cell, where exactly, and which way?
 
 Not part of any of the papers. A decoder's first thousands of steps teach the features in front of it little, because
 its queries do not know yet where to look; this loss asks every cell, so that small models learn to see first.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,47 +16,71 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.scene import LaneGraph
 
-CHANNELS = 3
-"""What a cell says: the logit that a lane is in it, and the x and y of the lane's direction."""
+CHANNELS = 5
+"""What a cell says: the logit that a lane is in it, the x and y of the way to the nearest lane, in cells, and of that
+lane's direction."""
 
-# Samples on each piece of a centerline; eleven points on 100 m are then a metre apart.
-_SAMPLES = 10
+# Cells as far as this from a lane, in cells, say where it is. Bilinear sampling beside a lane sees their features.
+_REACH = 1.5
 
 
-def lane_cells(
-    lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
-) -> tuple[Bool[Array, "h w"], Float[Array, "h w 2"]]:
-    """Return the cells that valid lanes run through, and the mean unit direction of the lanes there (0 elsewhere).
+class LaneCells(NamedTuple):
+    """What is true of the cells.
+
+    Attributes:
+        inside: a lane runs through the cell.
+        near: one is not farther from its middle than 1.5 cells.
+        offset: from the middle to the nearest point of a lane, in cells along x and y; 0 where none is near.
+        direction: unit direction of that lane, 0 where none is near.
+    """
+
+    inside: Bool[Array, "h w"]
+    near: Bool[Array, "h w"]
+    offset: Float[Array, "h w 2"]
+    direction: Float[Array, "h w 2"]
+
+
+def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange) -> LaneCells:
+    """Return what the valid lanes of one example make true of each cell.
 
     Args:
-        lanes: truth of one example; what stands in padding changes nothing.
+        lanes: truth; what stands in padding changes nothing.
         shape: rows (along y) and columns (along x) of the grid that spans `range_`.
     """
     h, w = shape
-    points = jnp.where(lanes.valid[:, None, None], lanes.points, 0.0)[..., :2]
-    step = points[:, 1:] - points[:, :-1]  # (N, P - 1, 2)
-    share = ((jnp.arange(_SAMPLES) + 0.5) / _SAMPLES).reshape(1, 1, _SAMPLES, 1)
-    unit = range_.normalise(points[:, :-1, None] + share * step[:, :, None])
-    column, row = jnp.floor(unit[..., 0] * w).astype(int), jnp.floor(unit[..., 1] * h).astype(int)
-    inside = (column >= 0) & (column < w) & (row >= 0) & (row < h) & lanes.valid[:, None, None]
-    cell = jnp.where(inside, row * w + column, h * w).reshape(-1)  # h w lies outside: nothing is written
-    direction = step / jnp.sqrt((step**2).sum(-1, keepdims=True) + 1e-6)
-    direction = jnp.broadcast_to(direction[:, :, None], (*inside.shape, 2)).reshape(-1, 2)
-    written = jnp.concatenate([jnp.ones((len(cell), 1)), direction], -1)
-    total = jnp.zeros((h * w, 3)).at[cell].add(written, mode="drop").reshape(h, w, 3)
-    count = total[..., :1]
-    return count[..., 0] > 0, total[..., 1:] / jnp.maximum(count, 1.0)
+    count = jnp.array([w, h], jnp.float32)
+    points = jnp.where(lanes.valid[:, None, None], lanes.points, 0.0)
+    unit = range_.normalise(points)[..., :2] * count[None, None]  # in cells
+    begin, step = unit[:, :-1].reshape(-1, 2), (unit[:, 1:] - unit[:, :-1]).reshape(-1, 2)  # (S, 2)
+    valid = jnp.repeat(lanes.valid, points.shape[1] - 1)
+    if not len(begin):
+        nothing = jnp.zeros((h, w), bool)
+        return LaneCells(nothing, nothing, jnp.zeros((h, w, 2)), jnp.zeros((h, w, 2)))
+    x, y = jnp.arange(w) + 0.5, jnp.arange(h) + 0.5
+    middle = jnp.stack(jnp.meshgrid(x, y), -1).reshape(-1, 1, 2)
+    # The nearest point of every piece.
+    share = ((middle - begin[None]) * step[None]).sum(-1) / jnp.maximum((step**2).sum(-1), 1e-9)[None]
+    offset = begin[None] + jnp.clip(share, 0.0, 1.0)[..., None] * step[None] - middle  # (hw, S, 2)
+    squared = jnp.where(valid[None], (offset**2).sum(-1), jnp.inf)
+    nearest = squared.argmin(-1)
+    near = squared.min(-1) <= _REACH**2
+    apart = jnp.where(valid[None], jnp.abs(offset).max(-1), jnp.inf).min(-1)
+    metres = step * jnp.asarray(range_.size(2), jnp.float32)[None] / count[None]
+    direction = metres / jnp.sqrt((metres**2).sum(-1, keepdims=True) + 1e-6)
+    offset = jnp.take_along_axis(offset, nearest[:, None, None], 1)[:, 0]
+    offset, direction = (jnp.where(near[:, None], value, 0.0) for value in (offset, direction[nearest]))
+    return LaneCells(*(value.reshape(h, w, *value.shape[1:]) for value in (apart < 0.5, near, offset, direction)))
 
 
-def lane_cell_loss(said: Float[Array, "h w 3"], lanes: LaneGraph, range_: PerceptionRange) -> Float[Array, ""]:
-    """Return the loss of one example: cross entropy, cells with and without a lane weighing alike, and the error of
-    the directions.
+def lane_cell_loss(said: Float[Array, "h w 5"], lanes: LaneGraph, range_: PerceptionRange) -> Float[Array, ""]:
+    """Return the loss of one example: cross entropy, cells with and without a lane weighing alike, and the errors of
+    the offsets and directions of the cells near a lane.
     """
     h, w, _ = said.shape
-    there, direction = lane_cells(lanes, (h, w), range_)
-    entropy = optax.sigmoid_binary_cross_entropy(said[..., 0], there.astype(said.dtype))
-    error = jnp.abs(said[..., 1:] - direction).sum(-1)
-    return 0.5 * (_mean(entropy, there) + _mean(entropy, ~there)) + _mean(error, there)
+    true = lane_cells(lanes, (h, w), range_)
+    entropy = optax.sigmoid_binary_cross_entropy(said[..., 0], true.inside.astype(said.dtype))
+    error = jnp.abs(said[..., 1:] - jnp.concatenate([true.offset, true.direction], -1)).sum(-1)
+    return 0.5 * (_mean(entropy, true.inside) + _mean(entropy, ~true.inside)) + _mean(error, true.near)
 
 
 def _mean(values: jax.Array, where: jax.Array) -> jax.Array:

@@ -14,28 +14,25 @@ from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_basis
-from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.camera_encoder import (
     PAPER_CAMERA_ENCODER,
     CameraEncoderConfig,
     check_elements,
-    look,
-    make_encoder,
 )
 from tflane_jax.models.element_decoder import (
     PAPER_ELEMENT_DECODER,
-    ElementDecoder,
     ElementDecoderConfig,
     ElementOutput,
 )
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.host import Host, decode_groups
 from tflane_jax.models.lane_decoder import (
     LaneDecoderLayer,
     LaneHeads,
     make_prediction,
 )
-from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig, LaneQueries
-from tflane_jax.scene import Example, Prediction
+from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
+from tflane_jax.scene import Prediction
 
 
 @dataclass(frozen=True)
@@ -69,29 +66,13 @@ def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
     return BevFormerDetrConfig(PAPER_CAMERA_ENCODER, decoder, PAPER_ELEMENT_DECODER, control_points)
 
 
-class BevFormerDetr(nn.Module):
+class BevFormerDetr(Host):
     """One example in, the predictions of every decoder layer out."""
 
     config: BevFormerDetrConfig
 
-    def setup(self):
-        self.encoder = make_encoder(self.config.encoder)
-        if self.config.elements is not None:
-            self.elements = ElementDecoder(self.config.elements)
-
-    def __call__(self, example: Example, memory: BevMemory | None = None, *, train: bool = False) -> Prediction:
-        """Return predictions with a leading axis over decoder layers; the last one is the answer."""
-        return self.step(example, memory, train=train)[0]
-
-    def step(
-        self, example: Example, memory: BevMemory | None = None, *, train: bool = False
-    ) -> tuple[Prediction, BevMemory | None]:
-        """Return what `__call__` does, and the memory for the next frame; see `TopoNet.step`."""
-        seen = look(self.encoder, example, memory, train=train)
-        elements = None
-        if self.config.elements is not None and seen.front is not None:
-            elements = self.elements(*seen.front, deterministic=not train)
-        return self.decode(seen.bev, elements, deterministic=not train), seen.memory
+    def decode_example(self, example, bev, elements, *, deterministic):
+        return self.decode(bev, elements, deterministic=deterministic)
 
     @nn.compact
     def decode(
@@ -101,10 +82,17 @@ class BevFormerDetr(nn.Module):
 
         Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
         """
-        controls, config = self.config.control_points, self.config.decoder
-        if controls is not None:
-            config = replace(config, points=controls)
-        queries, position, reference = LaneQueries(config, name="queries")()
+        return decode_groups(self, self._lines(), bev, elements, None, deterministic)
+
+    def _lines(self) -> LaneDecoderConfig:
+        """Return the decoder's sizes, with the points that it predicts."""
+        controls = self.config.control_points
+        return self.config.decoder if controls is None else replace(self.config.decoder, points=controls)
+
+    def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
+        """Return what one group of queries says."""
+        controls, config = self.config.control_points, self._lines()
+        queries, position, reference = start
         outputs = []
         for i in range(config.layers):
             last = i == config.layers - 1

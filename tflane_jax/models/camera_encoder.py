@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.auxiliary import LaneCellHead
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
 from tflane_jax.models.bevformer import BevFormer
 from tflane_jax.models.element_decoder import ElementDecoderConfig
@@ -32,7 +32,7 @@ class CameraEncoderConfig:
     Attributes:
         images: from images to feature maps.
         bev: from feature maps to BEV features; as many levels and channels.
-        cells: say of every BEV cell whether a lane runs through it, and which way, for the auxiliary loss
+        cells: say of every BEV cell whether a lane runs through it, where and which way, for the auxiliary loss
             `losses.lane_cells`. None of the papers has it; small models learn to see by it in minutes.
     """
 
@@ -90,8 +90,8 @@ class CameraEncoder(nn.Module):
         bev = BevFormer(self.config.bev, name="bev")(
             levels, cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train
         )
-        if self.config.cells and self.is_mutable_collection(AUXILIARY):
-            self.sow(AUXILIARY, "lane_cells", nn.Dense(3, name="cell_head")(bev))
+        if self.config.cells:
+            LaneCellHead(name="cells")(bev)
         size = jnp.where(cameras.valid[0], cameras.size[0], 0)
         padded = cameras.image.shape[1], cameras.image.shape[2]
         front = FrontView([level[0] for level in levels], size, padded)

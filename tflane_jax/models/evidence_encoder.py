@@ -8,6 +8,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
+from tflane_jax.models.auxiliary import LaneCellHead
+
 
 @dataclass(frozen=True)
 class EvidenceEncoderConfig:
@@ -17,11 +19,13 @@ class EvidenceEncoderConfig:
         dim: channels of the BEV features.
         cell: raster cells a side that become one feature cell.
         dilations: one residual block for each.
+        cells: see `CameraEncoderConfig.cells`.
     """
 
     dim: int = 32
     cell: int = 4
     dilations: tuple[int, ...] = (1, 2, 4, 1)
+    cells: bool = False
 
 
 class EvidenceEncoder(nn.Module):
@@ -42,6 +46,8 @@ class EvidenceEncoder(nn.Module):
         for i, dilation in enumerate(self.config.dilations):
             y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
             x = nn.relu(x + _norm(f"block_{i}_norm")(y))
+        if self.config.cells:
+            LaneCellHead(name="cells")(x)
         return x
 
 

@@ -19,21 +19,18 @@ from jaxtyping import Array, Float
 from tflane_jax.layers.graph import ElementNodes, Mlp, edge_probabilities
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.camera_encoder import (
     PAPER_CAMERA_ENCODER,
     CameraEncoderConfig,
     check_elements,
-    look,
-    make_encoder,
 )
 from tflane_jax.models.element_decoder import (
     PAPER_ELEMENT_DECODER,
-    ElementDecoder,
     ElementDecoderConfig,
     ElementOutput,
 )
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.host import Host, decode_groups
 from tflane_jax.models.lane_decoder import (
     ElementEmbedding,
     LaneDecoderLayer,
@@ -41,7 +38,7 @@ from tflane_jax.models.lane_decoder import (
     make_prediction,
     next_reference,
 )
-from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig, LaneQueries
+from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
 from tflane_jax.models.traffic_flow_module import (
     SpatialEncoder,
     TemporalEncoder,
@@ -95,40 +92,15 @@ def paper_config() -> TopoNetConfig:
     return TopoNetConfig(PAPER_CAMERA_ENCODER, PAPER_LANE_DECODER, elements=PAPER_ELEMENT_DECODER)
 
 
-class TopoNet(nn.Module):
+class TopoNet(Host):
     """One example in, the predictions of every decoder layer out."""
 
     config: TopoNetConfig
 
-    def setup(self):
-        self.encoder = make_encoder(self.config.encoder)
-        if self.config.elements is not None:
-            self.elements = ElementDecoder(self.config.elements)
-
-    def __call__(self, example: Example, memory: BevMemory | None = None, *, train: bool = False) -> Prediction:
-        """Return predictions with a leading axis over decoder layers; the last one is the answer."""
-        return self.step(example, memory, train=train)[0]
-
-    def step(
-        self, example: Example, memory: BevMemory | None = None, *, train: bool = False
-    ) -> tuple[Prediction, BevMemory | None]:
-        """Return what `__call__` does, and the memory for the next frame (None for a model without cameras).
-
-        Args:
-            example: one frame.
-            memory: of the frame before it; None is a frame on its own. No gradient flows through it.
-            train: dropout, which needs the key `dropout`, and the batch's own statistics.
-
-        Raises:
-            UserError: the example lacks what the model reads.
-        """
-        seen = look(self.encoder, example, memory, train=train)
-        elements = None
-        if self.config.elements is not None and seen.front is not None:
-            elements = self.elements(*seen.front, deterministic=not train)
+    def decode_example(self, example, bev, elements, *, deterministic):
         traffic = self.config.traffic_flow
         tokens = None if traffic is None else traffic_flow_tokens(example, traffic.prior)
-        return self.decode(seen.bev, elements, tokens, deterministic=not train), seen.memory
+        return self.decode(bev, elements, tokens, deterministic=deterministic)
 
     @nn.compact
     def decode(
@@ -143,8 +115,11 @@ class TopoNet(nn.Module):
 
         Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
         """
-        config = self.config.decoder
-        queries, position, reference = LaneQueries(config, name="queries")()
+        return decode_groups(self, self.config.decoder, bev, elements, tokens, deterministic)
+
+    def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
+        """Return what one group of queries says."""
+        config, (queries, position, reference) = self.config.decoder, start
         enhance = self._traffic_flow(tokens)
         # The first layer knows of no edges.
         adjacency = jnp.zeros((config.queries, config.queries))

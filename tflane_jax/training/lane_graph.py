@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from flax.traverse_util import flatten_dict
+from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import BATCH_AXIS
@@ -17,7 +19,7 @@ from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import empty_memory
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.scene import Example, Prediction
+from tflane_jax.scene import Example, LaneGraph, Prediction, TrafficElements
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
 
 
@@ -53,23 +55,27 @@ class LaneGraphTask:
             kept = [STATISTICS, AUXILIARY]
             outputs, state = module.apply(variables, example, train=True, mutable=kept, rngs=streams)
             updated = {name: value for name, value in state.items() if name == STATISTICS}
-            return outputs, state.get(AUXILIARY, {}), updated
+            # Flax keeps what is sown in a tuple.
+            flat: Any = flatten_dict(state.get(AUXILIARY, {}))
+            said = {path[-1]: values[0] for path, values in flat.items()}
+            return outputs, said, updated
 
-        train = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
-        outputs, auxiliary, updated = train(batch, keys)
+        train: Any = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
+        outputs, said, updated = train(batch, keys)
+        truth = Truth.of(batch)
+        if "lane_groups" in said:
+            outputs, truth = fold_groups(outputs, said["lane_groups"], truth)
         if outputs.elements is None:
-            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
-        elif batch.traffic_elements is None or batch.cameras is None:
+            truth = Truth(truth.lanes, None, None)
+        elif truth.elements is None:
             raise UserError(
                 "the model predicts traffic elements, and these data label none: choose data with front images and "
                 "traffic elements, or set task.model.elements to None"
             )
-        else:
-            sizes = batch.cameras.size[:, 0]
-            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses, batch.traffic_elements, sizes)
-        for said in jax.tree.leaves(auxiliary):  # one, of an encoder with `cells`
-            area = self.model.encoder.bev.grid.range  # pyright: ignore[reportAttributeAccessIssue]
-            losses = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))(said, batch.lanes, area)
+        loss, terms = lane_graph_loss(outputs, truth.lanes, self.losses, truth.elements, truth.size)
+        if "lane_cells" in said:
+            each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
+            losses = each(said["lane_cells"], batch.lanes, self.model.decoder.range)
             terms["cells"] = self.losses.cell_weight * losses.mean()
             loss += terms["cells"]
         return loss, terms | updated
@@ -96,3 +102,29 @@ class LaneGraphTask:
         result: Any = module.apply(variables, example, memory, method=type(module).step)
         outputs, following = result
         return following, jax.tree.map(lambda layers: layers[-1], outputs)
+
+
+class Truth(NamedTuple):
+    """What the loss of a batch compares with; see `lane_graph_loss`."""
+
+    lanes: LaneGraph
+    elements: TrafficElements | None
+    size: Int[Array, "b 2"] | None
+
+    @classmethod
+    def of(cls, batch: Example) -> Truth:
+        """Return the truth of a batch; without cameras nobody can say where its traffic elements are."""
+        if batch.cameras is None:
+            return cls(batch.lanes, None, None)
+        return cls(batch.lanes, batch.traffic_elements, batch.cameras.size[:, 0])
+
+
+def fold_groups(first: Prediction, others: Prediction, truth: Truth) -> tuple[Prediction, Truth]:
+    """Return the predictions of all groups of queries as those of a larger batch, and that batch's truth.
+
+    Leading axes are (batch, layer) of `first` and (batch, group, layer) of `others`.
+    """
+    every = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], 1), first, others)
+    groups = jax.tree.leaves(every)[0].shape[1]
+    folded = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
+    return folded, jax.tree.map(lambda leaf: jnp.repeat(leaf, groups, 0), truth)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, tiny_task
+from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.export import export_model, image_program, latencies, load_program
 
@@ -15,7 +16,7 @@ from tflane_jax.export import export_model, image_program, latencies, load_progr
 @pytest.fixture(scope="module")
 def model():
     task = tiny_task()
-    return task, jax.jit(task.init)(jax.random.key(0), road_image(0))
+    return task, random_params(task.init, road_image(0))
 
 
 @pytest.fixture(scope="module")

@@ -271,7 +271,7 @@ def test_capacity_and_rematerialisation_change_no_number(encode, variables, memo
 def test_levels_and_cameras_must_fit_the_configuration(variables):
     for features, views in ((levels()[:1], ring()), (levels(cameras=4), ring(4))):
         with pytest.raises(UserError, match="2 levels of at most 3 cameras"):
-            MODEL.apply(variables, features, views, None, np.eye(4, dtype=np.float32))
+            jax.eval_shape(MODEL.apply, variables, features, views, None, np.eye(4, dtype=np.float32))
 
 
 def test_smaller_images_lie_in_the_corner_of_their_array():

@@ -1,11 +1,14 @@
 """BEVFormer-DETR's lane head against the reference's numbers, and Bezier lanes."""
 
+from functools import partial
+
 import jax
 import numpy as np
 import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.models.golden_lanes import bev_maps, check, check_matching, decoder_config, layers_first, queries_of, truth
+from tests.parameters import random_params
 from tflane_jax.convert.toponet import baseline_lane_params
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_losses, matching_cost
 from tflane_jax.matching import match
@@ -21,7 +24,7 @@ def test_lane_head_matches_the_reference(path):
     lanes = truth(case, sizes["npts"])
     # The fixture has no relationship heads; ours get some, which nothing else depends on.
     bev = np.zeros((*sizes["bev"], sizes["C"]), np.float32)
-    heads = module.init(jax.random.key(0), bev, method=BevFormerDetr.decode)["params"]
+    heads = random_params(partial(module.init, method=BevFormerDetr.decode), bev)["params"]
 
     def outputs(torch_params, inputs):
         params = baseline_lane_params(torch_params)

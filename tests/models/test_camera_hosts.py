@@ -212,4 +212,4 @@ def test_what_does_not_fit_is_an_error():
         ).build()
     unlabelled = batch_of(make_camera_example().replace(traffic_elements=None))
     with pytest.raises(UserError, match=r"set task\.model\.elements to None"):
-        jax.eval_shape(lambda: task.loss(task.init(key, make_camera_example()), unlabelled, key))
+        jax.eval_shape(task.loss, fit("toponet").params, unlabelled, key)

@@ -13,6 +13,7 @@ from tests.golden import (
     load_module_case,
     named_gradients,
 )
+from tests.parameters import random_params
 from tflane_jax.convert.toponet import element_decoder_params
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, element_losses
 from tflane_jax.losses.traffic_elements import element_cost
@@ -95,12 +96,8 @@ def test_what_shows_padding_changes_nothing():
     # An image of 64 x 40 in an array of 96 x 64 pixels covers 5 rows and 8 columns of the first level.
     size = np.array([64, 40], np.int32)
     module = ElementDecoder(config)
-    params = jax.jit(lambda key: module.init(key, levels, size, (64, 96)))(jax.random.key(0))
     # Off the start, where boxes do not depend on anything.
-    keys = jax.random.split(jax.random.key(1), len(jax.tree.leaves(params)))
-    leaves, tree = jax.tree.flatten(params)
-    noisy = [leaf + 0.1 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=True)]
-    params = jax.tree.unflatten(tree, noisy)
+    params = random_params(lambda key: module.init(key, levels, size, (64, 96)))
 
     @jax.jit
     def step(params, levels):

@@ -1,7 +1,7 @@
 """Graph encoders against explicit dense products, and what they promise about padding, sizes and looking inside."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.layers.test_image_graph import dense_stack
+from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph_transformer import GTN_2022, meta_path_graphs
@@ -85,11 +86,10 @@ def test_gtn_equals_dense_meta_path_products(similarity):
     x, position, valid = scene()
     x, position = jnp.where(valid[..., None], x, 0.0), jnp.where(valid[..., None], position, 0.0)
     module = MetaPathConvolution(config)
-    params = jax.jit(module.init)(jax.random.key(0), x, position, valid)["params"]
+    params = random_params(module.init, x, position, valid)["params"]
     selection = random_array(3, *params["selection"].shape)
-    out, state = module.apply(
-        {"params": params | {"selection": selection}}, x, position, valid, mutable="intermediates"
-    )
+    apply = jax.jit(partial(module.apply, mutable="intermediates"))
+    out, state = apply({"params": params | {"selection": selection}}, x, position, valid)
 
     stack = dense_stack(config.relations, np.asarray(valid))
     if similarity is not None:
@@ -103,9 +103,9 @@ def test_gtn_equals_dense_meta_path_products(similarity):
     # The hop that acts first stands last in the product; normalising changes nothing, since rows sum to 1.
     graphs = meta_path_graphs(stack, selection[::-1], GTN_2022)
     np.testing.assert_allclose(graphs.sum(-1), np.broadcast_to(valid.reshape(1, -1), graphs.shape[:2]), atol=1e-5)
-    value = (x @ params["value"]["kernel"]).reshape(-1, DIM)
+    value = (x @ params["value"]["kernel"]).reshape(-1, DIM) + params["value"]["bias"][None]
     heard = jnp.concatenate([graph @ half for graph, half in zip(graphs, jnp.split(value, 2, axis=1), strict=True)], 1)
-    expected = (heard @ params["output"]["kernel"]).reshape(x.shape)
+    expected = (heard @ params["output"]["kernel"] + params["output"]["bias"][None]).reshape(x.shape)
     np.testing.assert_allclose(out[valid], expected[valid], rtol=1e-4, atol=1e-5)
 
 
@@ -115,7 +115,7 @@ def test_a_gtn_that_selects_similarity_is_the_transformers_attention(heads):
     x, position, valid = scene()
     x, position = jnp.where(valid[..., None], x, 0.0), jnp.where(valid[..., None], position, 0.0)
     module = MetaPathConvolution(config)
-    params = jax.jit(module.init)(jax.random.key(0), x, position, valid)["params"]
+    params = random_params(module.init, x, position, valid)["params"]
     selection = jnp.full_like(params["selection"], -1e9).at[0, :, 0].set(0.0).at[1, :, -1].set(0.0)
     out = jax.jit(module.apply)({"params": params | {"selection": selection}}, x, position, valid)
     attention = MultiHeadAttention(DIM, heads)

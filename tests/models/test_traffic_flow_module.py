@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.models.traffic_flow_module import (
@@ -43,14 +44,14 @@ def spatial(config, seed=0, valid=None, lane_mask=None):
     valid = jnp.arange(5) < 3 if valid is None else valid
     module = SpatialEncoder(config, DIM)
     arguments = (lanes, position, traffic, SpatialMask.from_validity(LANES, valid, lane_mask))
-    return module, jax.jit(module.init)(jax.random.key(seed), *arguments), arguments
+    return module, random_params(module.init, *arguments), arguments
 
 
 @pytest.mark.parametrize("depth", [0, 1, 3])
 def test_token_depends_on_valid_frames_only(depth):
     module = TemporalEncoder(dataclasses.replace(CONFIG, depth=depth), DIM)
     clean = tokens(1)
-    params = jax.jit(module.init)(jax.random.key(0), clean)
+    params = random_params(module.init, clean)
     hole = ~clean.frame_valid[..., None]
     dirty = clean.replace(position=jnp.where(hole, 99.0, clean.position), heading=jnp.where(hole, -7.0, clean.heading))
     a, b = (np.asarray(apply(module, params, t))[np.asarray(clean.valid)] for t in (clean, dirty))
@@ -61,7 +62,7 @@ def test_token_depends_on_valid_frames_only(depth):
 def test_token_sees_the_order_of_frames():
     module = TemporalEncoder(CONFIG, DIM)
     forward = tokens(2, occluded_frames="keep")
-    params = jax.jit(module.init)(jax.random.key(0), forward)
+    params = random_params(module.init, forward)
     whole = forward.replace(frame_valid=jnp.ones_like(forward.frame_valid))
     back = whole.replace(position=whole.position[:, ::-1], heading=whole.heading[:, ::-1])
     assert not np.allclose(apply(module, params, whole), apply(module, params, back))

@@ -39,7 +39,7 @@ def opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise UserError("reading photos needs OpenCV: pip install 'tflane_jax[images]'") from error
+        raise UserError("images need OpenCV: pip install 'tflane_jax[images]'") from error
     return cv2
 
 

@@ -33,7 +33,7 @@ ENCODER = CameraEncoderConfig(
     # A camera sees at most 469 of the 1,250 cells.
     replace(SMALL_BEVFORMER, grid=GRID, levels=3, cameras=6, capacity=480), cells=True,
 )  # fmt: skip
-DECODER = LaneDecoderConfig(queries=32, groups=6, range=GRID.range)
+DECODER = LaneDecoderConfig(queries=32, range=GRID.range)
 ELEMENTS = ElementDecoderConfig(levels=3)
 
 

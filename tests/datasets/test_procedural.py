@@ -1,4 +1,6 @@
 import pickle
+import re
+import sys
 from dataclasses import replace
 
 import jax
@@ -6,10 +8,12 @@ import numpy as np
 import pytest
 
 from tflane_jax.datasets import procedural
+from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.loading import count, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
+from tflane_jax.world.ring_cameras import CameraRigConfig
 
 CONFIG = ProceduralConfig(split="val", scenes=2, first=5)
 
@@ -17,6 +21,13 @@ CONFIG = ProceduralConfig(split="val", scenes=2, first=5)
 @pytest.fixture(scope="module")
 def dataset():
     return ProceduralDataset(CONFIG)
+
+
+def test_cameras_without_opencv_are_refused(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    ProceduralDataset(CONFIG)
+    with pytest.raises(UserError, match=re.escape("tflane_jax[images]")):
+        ProceduralDataset(replace(CONFIG, example=ExampleConfig(cameras=CameraRigConfig())))
 
 
 def test_splits_own_disjoint_ranges_of_scene_ids():

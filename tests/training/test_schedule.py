@@ -63,6 +63,16 @@ def test_first_update_is_adamw_with_clipping():
     np.testing.assert_allclose(updates["bias"], [0.0, -0.1], rtol=1e-4)
 
 
+def test_what_never_has_a_gradient_does_not_decay():
+    params = {"frozen": {"kernel": jnp.ones((2, 2))}, "learned": {"kernel": jnp.ones((2, 2))}}
+    grads = {"frozen": {"kernel": jnp.zeros((2, 2))}, "learned": {"kernel": jnp.array([[1.0, 0.0], [0.0, 0.0]])}}
+    for decay in ("decoupled", "coupled"):
+        optimizer = make_optimizer(OptimConfig(lr=0.1, warmup_steps=0, weight_decay=0.5, decay=decay), 10)
+        updates, _ = optimizer.update(grads, optimizer.init(params), params)
+        np.testing.assert_array_equal(updates["frozen"]["kernel"], 0.0)
+        assert (updates["learned"]["kernel"] < -0.01).all()
+
+
 def test_muon_makes_the_updates_of_matrices_orthogonal_and_leaves_the_rest_to_adam():
     rng = np.random.default_rng(0)
     # Two thousand times as much of one direction as of another.

@@ -13,6 +13,7 @@ from typing import Literal
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
+from tflane_jax.images import opencv
 from tflane_jax.logs import Log
 from tflane_jax.scene import Example
 from tflane_jax.world.simulate import WorldConfig, simulate
@@ -44,7 +45,8 @@ class ProceduralConfig:
 class ProceduralDataset:
     """Examples made when they are asked for, in order of scene and time.
 
-    Raises UserError where the scenes do not lie in the split's range of ids.
+    Raises UserError where the scenes do not lie in the split's range of ids, or cameras are asked for and OpenCV, which
+    draws their images, is not installed.
     """
 
     def __init__(self, config: ProceduralConfig):
@@ -53,6 +55,8 @@ class ProceduralDataset:
                 f"{config.split} has scenes 0 to {SCENES_PER_SPLIT - 1}, not {config.first} to "
                 f"{config.first + config.scenes - 1}: change `first` or `scenes`"
             )
+        if config.example.cameras is not None:
+            opencv()
         self.config = config
         self.name = f"procedural-{config.split}"
 

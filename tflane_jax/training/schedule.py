@@ -119,12 +119,27 @@ def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformat
     Raises UserError where a setting cannot work, see `make_schedule` and `RestartsConfig`.
     """
     _check(config, steps)
-    decay = optax.add_decayed_weights(config.weight_decay, is_decayed)
+    decay = optax.masked(_decay_what_learns(config.weight_decay), is_decayed)
     adam = _preconditioner(config)
     return optax.chain(
         optax.clip_by_global_norm(config.clip_norm),
         optax.chain(*((adam, decay) if config.decay == "decoupled" else (decay, adam)), _scale_by_rate(config, steps)),
     )
+
+
+def _decay_what_learns(rate: float) -> optax.GradientTransformation:
+    """Add `rate` times the parameters, except to those that have no gradient and never had one.
+
+    Frozen parts of a backbone are such; PyTorch does not hand them to the optimiser at all.
+    """
+
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        def decayed(change: jax.Array, leaf: jax.Array) -> jax.Array:
+            return change + jnp.where(jnp.any(change != 0), rate, 0.0).astype(leaf.dtype) * leaf
+
+        return jax.tree.map(decayed, updates, params), state
+
+    return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
 def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:

@@ -53,7 +53,9 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     """
     check_start(folder, start)  # before data is made, which may take long
     system = system_of(config)
-    arrays = system.examples(system.load(config.data.source("train"), progress=progress))
+    data = system.load(config.data.source("train"), progress=progress)
+    system.check(config, data)
+    arrays = system.examples(data)
     validation = system.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:

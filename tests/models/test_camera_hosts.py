@@ -12,10 +12,12 @@ from jax import lax
 
 from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
 from tests.parameters import random_params
+from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import TrafficFlow, stack_examples
+from tflane_jax.systems import system_of
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.task import split_statistics
 
@@ -213,3 +215,14 @@ def test_what_does_not_fit_is_an_error():
     unlabelled = batch_of(make_camera_example().replace(traffic_elements=None))
     with pytest.raises(UserError, match=r"set task\.model\.elements to None"):
         jax.eval_shape(task.loss, fit("toponet").params, unlabelled, key)
+
+
+def test_a_camera_that_sees_too_many_cells_is_named_before_training():
+    examples = stack_examples([make_camera_example()])
+    config = RunConfig(task=TASKS["toponet"])
+    encoder = CAMERA_TOPONET.encoder
+    tight = dataclasses.replace(encoder, bev=dataclasses.replace(encoder.bev, capacity=1))
+    task = dataclasses.replace(config.task, model=dataclasses.replace(CAMERA_TOPONET, encoder=tight))
+    system_of(config).check(config, examples)
+    with pytest.raises(UserError, match="`capacity` of BevFormerConfig is 1"):
+        system_of(config).check(dataclasses.replace(config, task=task), examples)

@@ -27,7 +27,7 @@ class ImageEncoderConfig:
         stages: of the backbone whose features go on, from 0; 1, 2, 3 are C3 to C5.
         pyramid: sizes of the feature pyramid.
         frozen_stages: parts of the backbone that never learn: 1 the stem, 2 the first stage as well. Their gradient is
-            zero, but weight decay, where the optimiser has any, still shrinks them.
+            zero, and weight decay leaves them alone.
         remat: compute each stage of the backbone anew for the gradient instead of keeping what lies in between.
         precision: of the computation; parameters and what comes out are float32.
     """

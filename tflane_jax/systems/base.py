@@ -73,6 +73,10 @@ class System(Protocol):
         """Return shapes and types of one example of a configuration, as far as can be told without its data."""
         ...
 
+    def check(self, config: Any, data: Any) -> None:
+        """Raise UserError where the first example of a split shows that a configuration's model cannot serve it."""
+        ...
+
     def prepare(self, config: Any) -> Prepare | None:
         """Return the augmentation of training examples, None for none."""
         ...

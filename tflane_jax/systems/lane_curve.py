@@ -88,6 +88,9 @@ class LaneCurveSystem:
         size = (INPUT_HEIGHT, INPUT_WIDTH)
         return shapes_of(RoadImage(np.zeros((*size, 3), np.uint8), np.zeros(size, bool), lines))
 
+    def check(self, config: RunConfig, data: LabelledImages) -> None:
+        """Raise nothing: the model takes all images."""
+
     def prepare(self, config: RunConfig) -> Prepare | None:
         """Return the augmentation of the configuration's data."""
         augmentation = getattr(config.data, "augmentation", None)

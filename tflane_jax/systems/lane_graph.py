@@ -20,8 +20,11 @@ from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
+from tflane_jax.models.bevformer import check_capacity
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.scene import ElementPrediction, Example, LanePrediction, shapes_of, stack_examples
 from tflane_jax.systems.base import Evaluation, Model, spread
+from tflane_jax.training.batches import first_example
 from tflane_jax.training.evaluate import evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import Draw
@@ -70,6 +73,12 @@ class LaneGraphSystem:
             made = isinstance(source, ProceduralConfig)
             example = (ProceduralDataset(source) if made else open_dataset(source)).example(0)
         return shapes_of(keep(example, TRAINING_PARTS))
+
+    def check(self, config: RunConfig, data: Example | Streamed) -> None:
+        """Raise UserError where a camera sees more BEV cells than it can serve."""
+        encoder, cameras = config.task.model.encoder, first_example(data).cameras
+        if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
+            check_capacity(encoder.bev, cameras)
 
     def prepare(self, config: RunConfig) -> Prepare | None:
         """Return the photometric augmentation of the configuration's data, if it has one."""

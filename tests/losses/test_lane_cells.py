@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.losses.lane_cells import CHANNELS, lane_cell_loss, lane_cells
+from tflane_jax.losses.lane_cells import lane_cell_loss, lane_cells
+from tflane_jax.models.auxiliary import CELL_CHANNELS
 from tflane_jax.scene import LaneGraph
 
 RANGE = PerceptionRange((0.0, 8.0), (0.0, 4.0), (-1.0, 1.0))
@@ -60,7 +61,7 @@ def test_the_nearer_of_two_lanes_speaks_and_those_outside_fill_nothing():
 
 def test_padding_changes_nothing():
     line = [[0.0, 0.5, 0], [8.0, 3.5, 0]]
-    said = jax.random.normal(jax.random.key(0), (*SHAPE, CHANNELS))
+    said = jax.random.normal(jax.random.key(0), (*SHAPE, CELL_CHANNELS))
     gradient = jax.grad(lane_cell_loss)
     clean, dirty = (gradient(said, graph(line, garbage=garbage), RANGE) for garbage in (0.0, np.nan))
     np.testing.assert_array_equal(clean, dirty)
@@ -69,7 +70,7 @@ def test_padding_changes_nothing():
 
 @pytest.mark.parametrize("lanes", [graph(), graph(capacity=0)], ids=["none valid", "no room"])
 def test_no_lane_is_learned_too(lanes):
-    said = jnp.zeros((*SHAPE, CHANNELS))
+    said = jnp.zeros((*SHAPE, CELL_CHANNELS))
     assert lane_cell_loss(said, lanes, RANGE) == pytest.approx(0.5 * np.log(2.0))
     assert (jax.grad(lane_cell_loss)(said, lanes, RANGE)[..., 0] > 0).all()
 

@@ -16,10 +16,6 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.scene import LaneGraph
 
-CHANNELS = 5
-"""What a cell says: the logit that a lane is in it, the x and y of the way to the nearest lane, in cells, and of that
-lane's direction."""
-
 # Cells as far as this from a lane, in cells, say where it is. Bilinear sampling beside a lane sees their features.
 _REACH = 1.5
 

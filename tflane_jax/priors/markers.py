@@ -1,0 +1,96 @@
+"""The fiducial-marker prior (Wu and Hu, sections III-A and III-B), up to the learned part.
+
+What was observed in a frame becomes lane polylines of a fixed number of points with the confidence of the marker that
+each belongs to. The same lines run in numpy when data is loaded and under jit, whichever arrays come in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.geometry.namespace import namespace
+from tflane_jax.scene import MarkerObservations
+
+
+@dataclass(frozen=True)
+class MarkerPriorConfig:
+    """How marker observations become polylines with a confidence.
+
+    Attributes:
+        points: K, points of a polyline (paper: 11).
+        distance_scale: tau_d of Eq. (2), metres.
+        residual_scale: tau_r of Eq. (2), metres.
+        use_score: multiply the confidence by the detector's raw score, which the paper mentions as a supplement.
+    """
+
+    points: int = 11
+    distance_scale: float = 40.0
+    residual_scale: float = 10.0
+    use_score: bool = False
+
+
+@struct.dataclass
+class MarkerLanes:
+    """Lanes of all markers of one frame.
+
+    Attributes:
+        points: (L, K, 2) metres, ego frame; 0 where not valid.
+        confidence: (L,) of the marker that the lane belongs to; 0 where not valid.
+        successor: (L, L) directed connectivity, within a marker only.
+        valid: (L,).
+    """
+
+    points: Float[Array, "l k 2"]
+    confidence: Float[Array, " l"]
+    successor: Bool[Array, "l l"]
+    valid: Bool[Array, " l"]
+
+    @property
+    def frame_confidence(self) -> Float[Array, ""]:
+        """c_t, the scalar of a frame: that of its most trusted marker, 0 without any."""
+        return self.confidence.max(initial=0.0)
+
+
+def confidence(
+    distance: Float[Array, " m"], residual: Float[Array, " m"], config: MarkerPriorConfig
+) -> Float[Array, " m"]:
+    """Return Eq. (2), in (0, 1], from the distance of the marker and its short-term residual, both in metres."""
+    xp = namespace(distance, residual)
+    return xp.exp(-residual / config.residual_scale) * xp.exp(-distance / config.distance_scale)  # Eq. (2)
+
+
+def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) -> MarkerLanes:
+    """Return the lanes of one frame's markers; padding may hold anything.
+
+    Raises ValueError where the lanes have fewer points than the config asks for.
+    """
+    xp = namespace(markers.lanes, markers.valid)
+    count, lanes, points = markers.lanes.shape[:3]
+    if points < config.points:
+        raise ValueError(f"the markers' lanes have {points} points, the prior asks for {config.points}")
+    pose = xp.where(markers.valid[:, None, None], markers.pose, xp.eye(4, dtype=markers.pose.dtype)[None])
+    residual = xp.where(markers.valid, markers.residual, 0.0)
+    # The vertical coordinate is dropped here as everywhere in the prior (III-A).
+    trust = confidence(xp.sqrt((pose[:, :2, 3] ** 2).sum(-1)), residual, config)
+    if config.use_score:
+        trust = trust * xp.where(markers.valid, markers.score, 0.0)
+    valid = (markers.lane_valid & markers.valid[:, None]).reshape(-1)
+    flat = markers.lanes[..., :2].reshape(count * lanes, points, 2)[:, stride(points, config.points)]
+    same = np.repeat(np.eye(count, dtype=bool), lanes, 0).repeat(lanes, 1)
+    edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
+    edges = edges.reshape(count * lanes, count * lanes)
+    return MarkerLanes(
+        points=xp.where(valid[:, None, None], flat, 0.0),
+        confidence=xp.where(valid, xp.repeat(trust, lanes), 0.0),
+        successor=edges & same & valid[:, None] & valid[None, :],
+        valid=valid,
+    )
+
+
+def stride(points: int, kept: int) -> np.ndarray:
+    """Return which of `points` points a fixed stride keeps, the first and the last among them."""
+    return np.linspace(0, points - 1, kept).round().astype(int)

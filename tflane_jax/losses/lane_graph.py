@@ -123,6 +123,27 @@ def lane_losses(
     }
 
 
+def lane_denoising_losses(prediction: LanePrediction, lanes: LaneGraph, config: LaneGraphLossConfig) -> Terms:
+    """Return what `lane_losses` does, for noised lanes: query i belongs to lane i, so nothing is matched.
+
+    Args:
+        prediction: leading axes (batch, copy, layer); see `models.lane_denoising`.
+        lanes: truth of the batch; lanes beyond the number of queries are left out, padding may hold anything.
+        config: weights.
+    """
+    lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
+    batch, copies, layers, queries = prediction.logits.shape[:4]
+    capacity = lanes.valid.shape[1]
+    own = jnp.arange(capacity)
+    there = lanes.valid & (own < queries)[None]
+    assignment = Assignment(
+        query=jnp.broadcast_to(jnp.where(there, own[None], 0)[:, None, None], (batch, copies, layers, capacity)),
+        matched=jnp.broadcast_to(there[:, None, None], (batch, copies, layers, capacity)),
+    )
+    prediction, assignment = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (prediction, assignment))
+    return lane_losses(prediction, assignment, jax.tree.map(lambda leaf: jnp.repeat(leaf, copies, 0), lanes), config)
+
+
 def element_losses(
     prediction: ElementPrediction,
     assignment: Assignment,

@@ -25,14 +25,15 @@ from tflane_jax.models.element_decoder import (
     ElementOutput,
 )
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.host import Host, decode_groups
+from tflane_jax.models.host import Host, decode_lanes
 from tflane_jax.models.lane_decoder import (
     LaneDecoderLayer,
     LaneHeads,
     make_prediction,
 )
+from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
-from tflane_jax.scene import Prediction
+from tflane_jax.scene import LaneGraph, Prediction
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,14 @@ class BevFormerDetrConfig:
         elements: traffic elements in the front view, or None. They need cameras, and as many layers as the decoder.
         control_points: a lane is a Bezier curve of so many control points, read at `decoder.points` points; None: a
             lane is its points. Goes with the loss's setting of the same name.
+        denoising: noised lanes to train the decoder with, or None as in the baseline.
     """
 
     encoder: CameraEncoderConfig | EvidenceEncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
     control_points: int | None = None
+    denoising: DenoisingConfig | None = None
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit each other."""
@@ -72,17 +75,22 @@ class BevFormerDetr(Host):
     config: BevFormerDetrConfig
 
     def decode_example(self, example, bev, elements, *, deterministic):
-        return self.decode(bev, elements, deterministic=deterministic)
+        return self.decode(bev, elements, example.lanes, deterministic=deterministic)
 
     @nn.compact
     def decode(
-        self, bev: Float[Array, "h w e"], elements: ElementOutput | None = None, *, deterministic: bool = True
+        self,
+        bev: Float[Array, "h w e"],
+        elements: ElementOutput | None = None,
+        lanes: LaneGraph | None = None,
+        *,
+        deterministic: bool = True,
     ) -> Prediction:
         """Return lanes of every decoder layer and the topology of the last, from BEV features and traffic elements.
 
         Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
         """
-        return decode_groups(self, self._lines(), bev, elements, None, deterministic)
+        return decode_lanes(self, self._lines(), bev, elements, None, lanes, deterministic)
 
     def _lines(self) -> LaneDecoderConfig:
         """Return the decoder's sizes, with the points that it predicts."""
@@ -90,7 +98,7 @@ class BevFormerDetr(Host):
         return self.config.decoder if controls is None else replace(self.config.decoder, points=controls)
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return what one group of queries says."""
+        """Return what a set of queries says."""
         controls, config = self.config.control_points, self._lines()
         queries, position, reference = start
         outputs = []

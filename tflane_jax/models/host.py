@@ -6,14 +6,16 @@ from typing import Any
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.camera_encoder import look, make_encoder
 from tflane_jax.models.element_decoder import ElementDecoder, ElementOutput
+from tflane_jax.models.lane_denoising import NoisedQueries
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
-from tflane_jax.scene import Example, Prediction
+from tflane_jax.scene import Example, LaneGraph, Prediction
 
 
 class Host(nn.Module):
@@ -60,32 +62,35 @@ class Host(nn.Module):
         raise NotImplementedError
 
 
-def decode_groups(
+def decode_lanes(
     host: Any,
     config: LaneDecoderConfig,
     bev: Float[Array, "h w e"],
     elements: ElementOutput | None,
     priors: Any,
+    lanes: LaneGraph | None,
     deterministic: bool,
 ) -> Prediction:
-    """Return what the first group of learned queries says; what the others say goes to the loss, where that asks.
+    """Return what the learned queries say; what the denoising queries say goes to the loss, where that asks.
 
-    All groups go through one decoder and know nothing of each other.
+    Both go through one decoder and know nothing of each other.
 
     Args:
         host: has the decoder, `decode_queries(start, bev, elements, priors, deterministic)`, where `start` is what
-            `LaneQueries` returns without its axis of groups.
+            `LaneQueries` returns, and `config.denoising`.
         config: of the queries.
         bev, elements, priors, deterministic: handed on.
+        lanes: truth to denoise; nothing else looks at it.
     """
-    start = LaneQueries(config, name="queries")()
-    if config.groups == 1 or not host.is_mutable_collection(AUXILIARY):
-        first = jax.tree.map(lambda leaf: leaf[0], start)
-        return host.decode_queries(first, bev, elements, priors, deterministic)
+    start, noise = LaneQueries(config, name="queries")(), host.config.denoising
+    if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
+        return host.decode_queries(start, bev, elements, priors, deterministic)
+    noised = NoisedQueries(config, noise, name="noised")(lanes)
+    starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
     decode = nn.vmap(
         type(host).decode_queries, in_axes=(0, None, None, None, None),  # pyright: ignore[reportArgumentType]
         variable_axes={"params": None, "intermediates": 0}, split_rngs={"params": False, "dropout": True},
     )  # fmt: skip
-    every = decode(host, start, bev, elements, priors, deterministic)
-    host.sow(AUXILIARY, "lane_groups", jax.tree.map(lambda leaf: leaf[1:], every))
+    every = decode(host, starts, bev, elements, priors, deterministic)
+    host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], every.lanes))
     return jax.tree.map(lambda leaf: leaf[0], every)

@@ -31,8 +31,6 @@ class LaneDecoderConfig:
         edge_weight: share of neighbours in the scene graph.
         bands: frequencies per coordinate that tell where a refined lane is.
         refine: see `models.lane_decoder`.
-        groups: groups of `queries` that are trained, each matched on its own; only the first answers (Group DETR, Chen
-            et al. 2023). The papers have one; more teach small models more per image.
         range: the box that normalised coordinates span.
         dropout: of attention weights, hidden channels, messages and everything that is added to a residual.
     """
@@ -48,7 +46,6 @@ class LaneDecoderConfig:
     edge_weight: float = 0.6
     bands: int = 6
     refine: Literal["fixed", "iterative"] = "iterative"
-    groups: int = 1
     range: PerceptionRange = BevGrid().range
     dropout: float = 0.0
 
@@ -64,23 +61,20 @@ class LaneQueries(nn.Module):
     config: LaneDecoderConfig
 
     @nn.compact
-    def __call__(
-        self,
-    ) -> tuple[Float[Array, "g q c"], Float[Array, "g q c"], Float[Array, "g q p 3"]]:
-        """Return content, position and initial reference points in [0, 1] of every group.
+    def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
+        """Return content, position and initial reference points in [0, 1].
 
         "fixed": all points of a lane on one spot that the position decides; "iterative": learned anchor lanes.
         """
         config = self.config
-        count, shape = config.groups * config.queries, (config.groups, config.queries)
-        embedding = self.param("embedding", nn.initializers.normal(1.0), (count, 2 * config.dim))
-        position, content = jnp.split(embedding.reshape(*shape, -1), 2, -1)
+        embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
+        position, content = jnp.split(embedding, 2, -1)
         if config.refine == "iterative":
-            lanes = inverse_sigmoid(jnp.asarray(spread_lanes(config)))
-            anchors = self.param("anchors", lambda _: jnp.tile(lanes, (config.groups, 1, 1)))
-            return content, position, nn.sigmoid(anchors).reshape(*shape, config.points, 3)
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config))))
+            return content, position, nn.sigmoid(anchors)
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
-        return content, position, jnp.broadcast_to(spot[:, :, None], (*shape, config.points, 3))
+        shape = (config.queries, config.points, 3)
+        return content, position, jnp.broadcast_to(spot[:, None], shape)
 
 
 def spread_lanes(config: LaneDecoderConfig, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:

@@ -30,7 +30,7 @@ from tflane_jax.models.element_decoder import (
     ElementOutput,
 )
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.host import Host, decode_groups
+from tflane_jax.models.host import Host, decode_lanes
 from tflane_jax.models.lane_decoder import (
     ElementEmbedding,
     LaneDecoderLayer,
@@ -38,6 +38,7 @@ from tflane_jax.models.lane_decoder import (
     make_prediction,
     next_reference,
 )
+from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
 from tflane_jax.models.traffic_flow_module import (
     SpatialEncoder,
@@ -45,7 +46,7 @@ from tflane_jax.models.traffic_flow_module import (
     TrafficFlowModuleConfig,
 )
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
-from tflane_jax.scene import Example, Prediction, TrafficFlow
+from tflane_jax.scene import Example, LaneGraph, Prediction, TrafficFlow
 
 
 @dataclass(frozen=True)
@@ -74,12 +75,14 @@ class TopoNetConfig:
         traffic_flow: the TFM and its prior, or None.
         elements: traffic elements in the front view and in the scene graph, or None. They need cameras, and as many
             layers as the decoder.
+        denoising: noised lanes to train the decoder with, or None as in the paper.
     """
 
     encoder: EvidenceEncoderConfig | CameraEncoderConfig = EvidenceEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig()
     traffic_flow: TrafficFlowConfig | None = None
     elements: ElementDecoderConfig | None = None
+    denoising: DenoisingConfig | None = None
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit each other."""
@@ -100,7 +103,7 @@ class TopoNet(Host):
     def decode_example(self, example, bev, elements, *, deterministic):
         traffic = self.config.traffic_flow
         tokens = None if traffic is None else traffic_flow_tokens(example, traffic.prior)
-        return self.decode(bev, elements, tokens, deterministic=deterministic)
+        return self.decode(bev, elements, tokens, example.lanes, deterministic=deterministic)
 
     @nn.compact
     def decode(
@@ -108,6 +111,7 @@ class TopoNet(Host):
         bev: Float[Array, "h w e"],
         elements: ElementOutput | None = None,
         tokens: TrafficFlowTokens | None = None,
+        lanes: LaneGraph | None = None,
         *,
         deterministic: bool = True,
     ) -> Prediction:
@@ -115,10 +119,10 @@ class TopoNet(Host):
 
         Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
         """
-        return decode_groups(self, self.config.decoder, bev, elements, tokens, deterministic)
+        return decode_lanes(self, self.config.decoder, bev, elements, tokens, lanes, deterministic)
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return what one group of queries says."""
+        """Return what a set of queries says."""
         config, (queries, position, reference) = self.config.decoder, start
         enhance = self._traffic_flow(tokens)
         # The first layer knows of no edges.

@@ -67,12 +67,13 @@ class MarkerMemory:
     @classmethod
     def empty(cls, frames: int, lanes: int, points: int) -> MarkerMemory:
         """Return a bank that remembers nothing, for L lanes of K points a frame."""
-        return cls(
+        nothing: Any = cls(
             points=np.zeros((frames, lanes, points, 2), np.float32),
             confidence=np.zeros((frames, lanes), np.float32),
             successor=np.zeros((frames, lanes, lanes), bool),
             valid=np.zeros((frames, lanes), bool),
-        )
+        )  # pyright: ignore[reportArgumentType]
+        return nothing
 
 
 @struct.dataclass

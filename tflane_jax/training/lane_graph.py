@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 from flax.traverse_util import flatten_dict
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.losses.lane_cells import lane_cell_loss
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_denoising_losses, lane_graph_loss
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import empty_memory
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.scene import Example, LaneGraph, Prediction, TrafficElements
+from tflane_jax.scene import Example, Prediction
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
 
 
@@ -62,17 +61,20 @@ class LaneGraphTask:
 
         train: Any = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
         outputs, said, updated = train(batch, keys)
-        truth = Truth.of(batch)
-        if "lane_groups" in said:
-            outputs, truth = fold_groups(outputs, said["lane_groups"], truth)
         if outputs.elements is None:
-            truth = Truth(truth.lanes, None, None)
-        elif truth.elements is None:
+            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
+        elif batch.traffic_elements is None or batch.cameras is None:
             raise UserError(
                 "the model predicts traffic elements, and these data label none: choose data with front images and "
                 "traffic elements, or set task.model.elements to None"
             )
-        loss, terms = lane_graph_loss(outputs, truth.lanes, self.losses, truth.elements, truth.size)
+        else:
+            sizes = batch.cameras.size[:, 0]
+            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses, batch.traffic_elements, sizes)
+        if "denoised" in said:
+            every = lane_denoising_losses(said["denoised"], batch.lanes, self.losses)
+            terms |= {f"denoised_{name}": term[-1] for name, term in every.items()}
+            loss += sum(term.sum() for term in every.values())
         if "lane_cells" in said:
             each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
             losses = each(said["lane_cells"], batch.lanes, self.model.decoder.range)
@@ -102,29 +104,3 @@ class LaneGraphTask:
         result: Any = module.apply(variables, example, memory, method=type(module).step)
         outputs, following = result
         return following, jax.tree.map(lambda layers: layers[-1], outputs)
-
-
-class Truth(NamedTuple):
-    """What the loss of a batch compares with; see `lane_graph_loss`."""
-
-    lanes: LaneGraph
-    elements: TrafficElements | None
-    size: Int[Array, "b 2"] | None
-
-    @classmethod
-    def of(cls, batch: Example) -> Truth:
-        """Return the truth of a batch; without cameras nobody can say where its traffic elements are."""
-        if batch.cameras is None:
-            return cls(batch.lanes, None, None)
-        return cls(batch.lanes, batch.traffic_elements, batch.cameras.size[:, 0])
-
-
-def fold_groups(first: Prediction, others: Prediction, truth: Truth) -> tuple[Prediction, Truth]:
-    """Return the predictions of all groups of queries as those of a larger batch, and that batch's truth.
-
-    Leading axes are (batch, layer) of `first` and (batch, group, layer) of `others`.
-    """
-    every = jax.tree.map(lambda a, b: jnp.concatenate([a[:, None], b], 1), first, others)
-    groups = jax.tree.leaves(every)[0].shape[1]
-    folded = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), every)
-    return folded, jax.tree.map(lambda leaf: jnp.repeat(leaf, groups, 0), truth)

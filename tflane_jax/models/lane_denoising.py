@@ -1,0 +1,93 @@
+"""Denoising queries for training (DN-DETR, Li et al. 2022): lanes of the truth, moved and bent, to be put right.
+
+Not part of any of the papers. A learned query must find out by itself which lane is meant for it, and while that keeps
+changing it learns to stand between lanes. A noised lane belongs to one lane from the start, so that the decoder learns
+to see where that runs; small models need it to converge. In prediction there are none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.models.lane_queries import LaneDecoderConfig
+from tflane_jax.scene import LaneGraph
+
+
+@dataclass(frozen=True)
+class DenoisingConfig:
+    """How lanes are noised.
+
+    Attributes:
+        copies: groups of noised lanes.
+        shift: standard deviation of a whole lane's place along x and y, metres.
+        turn: of its angle about its middle, radians.
+        stretch: of the logarithm of its length.
+        straighten: largest share of its way to the straight line between its ends; a lane goes a uniform part of it.
+    """
+
+    copies: int = 2
+    shift: float = 1.5
+    turn: float = 0.1
+    stretch: float = 0.15
+    straighten: float = 1.0
+
+
+class NoisedQueries(nn.Module):
+    """Queries that stand on noised lanes; those without a lane stand anywhere, and are to say so."""
+
+    config: LaneDecoderConfig
+    noise: DenoisingConfig
+
+    @nn.compact
+    def __call__(
+        self, lanes: LaneGraph
+    ) -> tuple[Float[Array, "g q c"], Float[Array, "g q c"], Float[Array, "g q p 3"]]:
+        """Return content, position and reference points in [0, 1] of every copy; query i belongs to lane i."""
+        config, copies = self.config, self.noise.copies
+        keys = jax.random.split(self.make_rng("dropout"), copies)
+        lines = jax.vmap(lambda key: noised_lanes(key, lanes, config.queries, config.range, self.noise))(keys)
+        reference = jnp.clip(config.range.normalise(lines), 0.01, 0.99)
+        position = nn.Dense(config.dim, name="position")(reference.reshape(copies, config.queries, -1))
+        if config.refine == "fixed":
+            middle = config.points // 2
+            reference = jnp.broadcast_to(reference[:, :, middle : middle + 1], reference.shape)
+        content = self.param("content", nn.initializers.normal(1.0), (config.dim,))
+        return jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference)
+
+
+def noised_lanes(
+    key: jax.Array, lanes: LaneGraph, count: int, range_: PerceptionRange, noise: DenoisingConfig
+) -> Float[Array, "q p 3"]:
+    """Return the first `count` lanes noised, metres; where there is none, a straight one anywhere in the range."""
+    shift, turn, stretch, bend, place, way = jax.random.split(key, 6)
+    truth = jnp.where(lanes.valid[:, None, None], lanes.points, 0.0)[:count]
+    truth = jnp.pad(truth, ((0, count - len(truth)), (0, 0), (0, 0)))
+    valid = jnp.pad(lanes.valid[:count], (0, count - len(lanes.valid[:count])))
+    share = jnp.linspace(0.0, 1.0, truth.shape[1])[None, :, None]
+    # Partly straightened, or it would never learn to bend.
+    chord = truth[:, :1] + share * (truth[:, -1:] - truth[:, :1])
+    truth = truth + noise.straighten * jax.random.uniform(bend, (count, 1, 1)) * (chord - truth)
+    middle = truth.mean(1, keepdims=True)
+    size = jnp.exp(noise.stretch * jax.random.normal(stretch, (count, 1, 1)))
+    line = turned(size * (truth - middle), noise.turn * jax.random.normal(turn, (count,))) + middle
+    moved = line.at[..., :2].add(noise.shift * jax.random.normal(shift, (count, 1, 2)))
+    # A lane of 24 m.
+    along = jnp.concatenate([24.0 * (share - 0.5), jnp.zeros((1, truth.shape[1], 2))], -1)
+    heading = jax.random.uniform(way, (count,), maxval=2 * jnp.pi)
+    anywhere = range_.denormalise(jax.random.uniform(place, (count, 1, 3)))
+    elsewhere = turned(jnp.broadcast_to(along, truth.shape), heading) + anywhere
+    return jnp.where(valid[:, None, None], moved, elsewhere)
+
+
+def turned(lines: Float[Array, "q p 3"], angle: Float[Array, " q"]) -> Float[Array, "q p 3"]:
+    """Return polylines turned about the origin, in the plane."""
+    cos, sin = jnp.cos(angle)[:, None], jnp.sin(angle)[:, None]
+    x, y = lines[..., 0], lines[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y, lines[..., 2]], -1)

@@ -119,6 +119,21 @@ class KeyFrame:
 
 
 @dataclass(frozen=True)
+class PlacedMarkers:
+    """Fiducial markers that stand beside the road; `tflane_jax.markers` says what the frame of a marker is.
+
+    Attributes:
+        marker_id: (M,) int32, unique within a log.
+        pose: (M, 4, 4) float64 global_from_marker, metres.
+        size: side of the black square, metres.
+    """
+
+    marker_id: np.ndarray
+    pose: np.ndarray
+    size: float = 1.0
+
+
+@dataclass(frozen=True)
 class Log:
     """One drive.
 
@@ -137,6 +152,7 @@ class Log:
         weather: 0 (clear) to 1 (worst), dims the evidence.
         paint_wear: 0 (fresh) to 1 (gone), dims lane paint.
         seed: root of everything random that is drawn when this log is rendered.
+        markers: fiducial markers beside the road; None where nobody has put any up.
     """
 
     name: str
@@ -151,3 +167,4 @@ class Log:
     weather: float = 0.0
     paint_wear: float = 0.0
     seed: int = 0
+    markers: PlacedMarkers | None = None

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
 from tflane_jax.logs import KeyFrame, Log, Tracks
+from tflane_jax.world.markers import PlacementConfig, place_markers
 from tflane_jax.world.roads import RoadConfig, build_road_network
 from tflane_jax.world.signals import element_states, show_signals
 from tflane_jax.world.tracker import TrackerConfig, track, wrap_angle
@@ -40,6 +41,7 @@ class WorldConfig:
 
     Attributes:
         roads, traffic, tracker: its parts.
+        markers: where fiducial markers stand. They change nothing else in a scene.
         severity: 0 (clear) to 1 (worst): scales weather and worn paint, mildly also the density of traffic and the
             noise of the tracker.
         duration_s, rate_hz: length of a scene and its frame rate.
@@ -49,6 +51,7 @@ class WorldConfig:
     roads: RoadConfig = RoadConfig()
     traffic: TrafficConfig = TrafficConfig()
     tracker: TrackerConfig = TrackerConfig()
+    markers: PlacementConfig = PlacementConfig()
     severity: float = 0.5
     duration_s: float = 8.0
     rate_hz: float = 10.0
@@ -105,6 +108,7 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
         weather=float(weather),
         paint_wear=float(paint_wear),
         seed=scene_id,
+        markers=place_markers(network.map, scene_id, config.markers),
     )
 
 

@@ -1,0 +1,140 @@
+"""Where fiducial markers stand."""
+
+from dataclasses import fields, replace
+
+import jax
+import numpy as np
+import pytest
+
+from tests.datasets.small_logs import lane_map, segment
+from tflane_jax.geometry import invert_pose, transform_points
+from tflane_jax.logs import VectorMap
+from tflane_jax.world import simulate as simulate_module
+from tflane_jax.world.markers import PlacementConfig, place_markers
+from tflane_jax.world.road_config import RoadConfig, SceneKind
+from tflane_jax.world.simulate import WorldConfig, simulate
+from tflane_jax.world.traffic import TrafficConfig
+
+EMPTY = TrafficConfig(
+    vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0
+)
+EXACT = PlacementConfig(toe_in=0.0, jitter=0.0)
+
+
+def two_lanes(**other):
+    """Two lanes that drive along x into an intersection at x = 0: the right one is at y = -1.75."""
+    return lane_map(
+        segment(1, [(-50, 1.75), (0, 1.75)], [3]), segment(2, [(-50, -1.75), (0, -1.75)], [4]),
+        segment(3, [(0, 1.75), (20, 1.75)], is_intersection=True),
+        segment(4, [(0, -1.75), (20, -1.75)], is_intersection=True), **other,
+    )  # fmt: skip
+
+
+def test_a_marker_stands_right_of_the_approach_and_faces_its_traffic():
+    kerb = np.array([[-60.0, -4.5, 0.0], [30.0, -4.5, 0.0]])
+    placed = place_markers(two_lanes(road_boundaries=(kerb,)), 0, EXACT)
+    assert placed.pose.dtype == np.float64
+    assert placed.size == 1.0
+    (pose,) = placed.pose
+    np.testing.assert_allclose(pose[:3, 3], [0.0, -4.5 - 0.8, 3.0], atol=1e-12)
+    # Seen by a driver who comes along +x: right is -y, up is z, and the marker looks back at the driver.
+    np.testing.assert_allclose(pose[:3, :3].T, [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], atol=1e-12)
+    driver = transform_points(invert_pose(pose), np.array([[-20.0, -1.75, 1.5]]))[0]
+    assert driver[2] == pytest.approx(20.0)
+    assert (driver[:2] < 0.0).all()
+
+
+def test_boards_are_turned_towards_the_road():
+    straight, turned = (place_markers(two_lanes(), 0, PlacementConfig(toe_in=t, jitter=0.0)) for t in (0.0, 20.0))
+    assert straight.pose[0, 1, 2] == pytest.approx(0.0)
+    assert turned.pose[0, 1, 2] == pytest.approx(np.sin(np.deg2rad(20.0)))
+    drawn = [place_markers(two_lanes(), seed).pose[0, 1, 2] for seed in range(50)]
+    assert np.rad2deg(np.arcsin([min(drawn), max(drawn)])) == pytest.approx([2.0, 8.0], abs=0.6)
+
+
+def test_without_a_kerb_the_lane_ends_the_road_and_a_far_kerb_is_none():
+    far = np.array([[-60.0, -20.0, 0.0], [30.0, -20.0, 0.0]])
+    for boundaries in ((), (far,)):
+        placed = place_markers(two_lanes(road_boundaries=boundaries), 0, EXACT)
+        assert placed.pose[0, 1, 3] == pytest.approx(-3.5 - 0.5 - 0.8)
+
+
+@pytest.mark.parametrize(
+    ("segments", "count"),
+    [
+        ([], 0),
+        ([segment(1, [(0, 0), (50, 0)])], 0),
+        ([segment(1, [(0, 0), (50, 0)], [2]), segment(2, [(50, 0), (90, 0)])], 0),
+        # A split, a merge, and both of a road closed to motor vehicles.
+        ([segment(1, [(0, 0), (50, 0)], [2, 3]), segment(2, [(50, 0), (90, 0)]), segment(3, [(50, 0), (90, 20)])], 1),
+        ([segment(1, [(0, 0), (50, 0)], [3]), segment(2, [(0, 40), (50, 0)], [3]), segment(3, [(50, 0), (90, 0)])], 2),
+        ([segment(1, [(0, 0), (50, 0)], [2, 3], vehicle=False), segment(2, [(50, 0), (90, 0)]),
+          segment(3, [(50, 0), (90, 20)])], 0),
+        # A successor that the map does not hold.
+        ([segment(1, [(0, 0), (50, 0)], [7, 8])], 0),
+    ],
+)  # fmt: skip
+def test_approaches_end_where_intersections_splits_and_merges_begin(segments, count):
+    placed = place_markers(lane_map(*segments), 3)
+    assert placed.marker_id.shape == (count,)
+    assert placed.pose.shape == (count, 4, 4)
+
+
+def test_no_marker_stands_in_a_lane():
+    lanes = two_lanes()
+    beside = segment(5, [(-50, -5.0), (50, -5.0)])
+    assert len(place_markers(lanes, 0).marker_id) == 1
+    assert len(place_markers(VectorMap({**lanes.segments, 5: beside}), 0).marker_id) == 0
+
+
+def test_ids_are_unique_and_never_more_than_the_dictionary_holds():
+    crossroads = simulate(23, replace(WorldConfig(traffic=EMPTY), roads=RoadConfig(kinds=((SceneKind.FOUR_WAY, 1.0),))))
+    everywhere = place_markers(crossroads.map, 1, EXACT)
+    count = len(everywhere.marker_id)
+    assert count >= 3
+    assert len(set(everywhere.marker_id.tolist())) == count
+    small = place_markers(crossroads.map, 1, replace(EXACT, dictionary=2))
+    assert sorted(small.marker_id.tolist()) == [0, 1]
+    one = place_markers(crossroads.map, 1, replace(EXACT, per="scene"))
+    assert one.pose.shape == (1, 4, 4)
+    assert any(np.array_equal(one.pose[0], pose) for pose in everywhere.pose)
+
+
+@pytest.mark.parametrize("kind", list(SceneKind))
+def test_scenes_have_markers_where_their_roads_are_complex(kind):
+    config = replace(WorldConfig(traffic=EMPTY), roads=RoadConfig(kinds=((kind, 1.0),)))
+    log = simulate(5, config)
+    assert log.markers is not None
+    again = simulate(5, config).markers
+    assert again is not None
+    assert again.pose.tobytes() == log.markers.pose.tobytes()
+    assert again.marker_id.tobytes() == log.markers.marker_id.tobytes()
+    assert (len(log.markers.marker_id) > 0) == (kind is not SceneKind.ROAD)
+    rotation = log.markers.pose[:, :3, :3]
+    identity = np.broadcast_to(np.eye(3), rotation.shape)
+    np.testing.assert_allclose(rotation @ rotation.swapaxes(1, 2), identity, atol=1e-9)
+    assert (np.linalg.det(rotation) > 0).all()
+
+
+def test_markers_change_nothing_else(monkeypatch):
+    """Roads, traffic, tracks and weather are drawn from streams of their own."""
+    with_markers = simulate(7)
+    monkeypatch.setattr(simulate_module, "place_markers", lambda *_: None)
+    without = simulate(7)
+    assert without.markers is None
+    for field in fields(with_markers):
+        if field.name not in ("map", "keyframes", "tracks", "actors", "markers"):
+            a, b = getattr(with_markers, field.name), getattr(without, field.name)
+            assert np.asarray(a).tobytes() == np.asarray(b).tobytes(), field.name
+    for part in ("map", "tracks", "actors"):
+        a, b = (vars(getattr(log, part)) for log in (with_markers, without))
+        jax.tree.map(np.testing.assert_array_equal, _arrays(a), _arrays(b))
+
+
+def _arrays(part):
+    """Return nested containers with dataclasses opened."""
+    if hasattr(part, "__dataclass_fields__"):
+        return _arrays(vars(part))
+    if isinstance(part, dict):
+        return {str(k): _arrays(v) for k, v in part.items()}
+    return [_arrays(v) for v in part] if isinstance(part, (list, tuple)) else part

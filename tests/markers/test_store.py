@@ -1,0 +1,229 @@
+"""The on-board store of markers."""
+
+import datetime
+import json
+import os
+import re
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.datasets.small_logs import lane_map, segment
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import transform_points
+from tflane_jax.logs import PlacedMarkers
+from tflane_jax.markers.store import (
+    MarkerStore,
+    StaleMarkerWarning,
+    StoredMarker,
+    UnknownMarkerWarning,
+    load_store,
+    look_up,
+    save_store,
+    store_of,
+)
+from tflane_jax.world.markers import marker_pose
+
+DAY = datetime.date(2025, 7, 11)
+
+
+def placed(*places, ids=None):
+    place = np.array(places, float).reshape(-1, 3)
+    ids = np.arange(len(place)) if ids is None else np.array(ids)
+    return PlacedMarkers(ids, marker_pose(place, np.full(len(place), 2.0)))
+
+
+def in_map(marker: StoredMarker):
+    return transform_points(marker.global_from_marker, marker.lanes)
+
+
+def fork():
+    """A lane along x that forks at x = 0; its left branch leaves the circle around the origin and comes back."""
+    return lane_map(
+        segment(1, [(-80, 0), (-40, 0), (0, 0)], [2, 3]), segment(2, [(0, 0), (60, 0)]),
+        segment(3, [(0, 0), (0, 60), (10, 60), (10, 0)], [5]), segment(4, [(0, 200), (10, 200)]),
+        segment(5, [(10, 0), (20, 0)]),
+    ).segments  # fmt: skip
+
+
+def test_lanes_within_the_radius_are_cut_at_the_circle():
+    marker = store_of(fork(), placed((0, 0, 3)), radius=50.0, points=5).markers[0]
+    assert marker.lanes.shape == (5, 5, 3)
+    lines = in_map(marker)
+    np.testing.assert_allclose(lines[0, :, 0], [-50.0, -37.5, -25.0, -12.5, 0.0], atol=1e-9)
+    np.testing.assert_allclose(lines[1, [0, -1], 0], [0.0, 50.0], atol=1e-9)
+    back = np.sqrt(50.0**2 - 10.0**2)
+    np.testing.assert_allclose(lines[2, [0, -1], 1], [0.0, 50.0], atol=1e-9)
+    np.testing.assert_allclose(lines[3, [0, -1], 1], [back, 0.0], atol=1e-9)
+    np.testing.assert_allclose(lines[..., 2], 0.0, atol=1e-9)
+    # The lane that was cut in two is entered by its first piece and left by its last.
+    assert np.argwhere(marker.successor).tolist() == [[0, 1], [0, 2], [3, 4]]
+
+
+def test_lanes_are_in_the_frame_of_the_marker():
+    """In front of a marker is +z, to the right of one who looks at it +x, and the road lies below (-y)."""
+    facing_x = PlacedMarkers(np.array([3]), marker_pose(np.array([[10.0, 5.0, 3.0]]), np.array([0.0])))
+    lanes = lane_map(segment(1, [(12, 5), (30, 8)])).segments
+    (line,) = store_of(lanes, facing_x, points=2).markers[3].lanes
+    np.testing.assert_allclose(line, [[0.0, -3.0, 2.0], [3.0, -3.0, 20.0]], atol=1e-12)
+
+
+@given(st.floats(5.0, 120.0), st.floats(-60.0, 60.0), st.floats(-30.0, 30.0))
+@settings(max_examples=60, deadline=None)
+def test_no_stored_point_lies_outside_the_circle(radius, x, y):
+    marker = store_of(fork(), placed((x, y, 3)), radius=radius, points=9).markers[0]
+    distance = np.linalg.norm(in_map(marker)[..., :2] - [x, y], axis=-1)
+    assert (distance <= radius + 1e-6).all()
+    for i, j in np.argwhere(marker.successor):
+        np.testing.assert_allclose(marker.lanes[i, -1], marker.lanes[j, 0], atol=1e-9)
+
+
+def test_stores_of_nothing():
+    assert store_of(fork(), placed()).markers == {}
+    empty = store_of({}, placed((0, 0, 3))).markers[0]
+    assert empty.lanes.shape[0] == 0
+    assert empty.successor.shape == (0, 0)
+    far = store_of(fork(), placed((1000, 0, 3))).markers[0]
+    assert far.lanes.shape[0] == 0
+
+
+@pytest.mark.parametrize("frame", ["marker", "survey"])
+def test_a_file_holds_what_was_stored(tmp_path, frame):
+    far = placed((2000.25, -3000.5, 17), (2040, -3000, 17), (9000, 0, 0), ids=[7, 2, 5])
+    lanes = lane_map(segment(1, [(1990, -3010), (2030, -3000)], [2]), segment(2, [(2030, -3000), (2060, -2950)]))
+    store = store_of(lanes.segments, far, surveyed=DAY, expires=DAY + datetime.timedelta(30))
+    path = save_store(store, tmp_path / "deep" / "store.json", frame=frame)
+    assert os.listdir(path.parent) == ["store.json"]
+    read = load_store(path)
+    assert list(read.markers) == [2, 5, 7]
+    for number, marker in store.markers.items():
+        again = read.markers[number]
+        np.testing.assert_array_equal(again.global_from_marker, marker.global_from_marker)
+        np.testing.assert_array_equal(again.successor, marker.successor)
+        assert (again.size, again.surveyed, again.expires) == (1.0, DAY, DAY + datetime.timedelta(30))
+        assert len(again.lanes) == len(marker.lanes)
+        np.testing.assert_allclose(again.lanes, marker.lanes.reshape(again.lanes.shape), atol=1e-3)
+
+
+def test_a_file_may_be_in_other_units(tmp_path):
+    record = saved(tmp_path)
+    record["unit"] = "foot"
+    (tmp_path / "feet.json").write_text(json.dumps(record))
+    metres, feet = load_store(tmp_path / "store.json").markers[0], load_store(tmp_path / "feet.json").markers[0]
+    np.testing.assert_allclose(feet.lanes, 0.3048 * metres.lanes)
+    np.testing.assert_allclose(feet.global_from_marker[:3, 3], 0.3048 * metres.global_from_marker[:3, 3])
+    np.testing.assert_array_equal(feet.global_from_marker[:3, :3], metres.global_from_marker[:3, :3])
+    assert feet.size == pytest.approx(0.3048)
+
+
+def saved(tmp_path):
+    path = save_store(store_of(fork(), placed((0, 0, 3), (10, 0, 3))), tmp_path / "store.json")
+    return json.loads(path.read_text())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: r.pop("format"), "lacks the entry 'format'"),
+        (lambda r: r.update(format="other"), "this is no marker store"),
+        (lambda r: r.update(version=2), "version is 2, this program reads 1"),
+        (lambda r: r.update(unit="mile"), "unit is 'mile', expected one of metre"),
+        (lambda r: r.update(frame="ego"), "frame is 'ego'"),
+        (lambda r: r.update(markers={}), "markers is of type dict"),
+        (lambda r: r["markers"][1].pop("id"), "markers[1] lacks the entry 'id'"),
+        (lambda r: r["markers"][1].update(id=1.5), "markers[1]: id is 1.5"),
+        (lambda r: r["markers"][1].update(id=0), "marker 0: id occurs twice"),
+        (lambda r: r["markers"][1].update(size=0), "marker 1: size is 0"),
+        (lambda r: r["markers"][1].update(lanes=[[[0, 0, 0]]]), "marker 1: lanes have 1 points"),
+        (lambda r: r["markers"][1].update(lanes=[[[0, 0], [1, 1]]]), "marker 1: lanes has shape (1, 2, 2)"),
+        (lambda r: r["markers"][1]["lanes"][0].pop(), "marker 1: lanes is of type list"),
+        (lambda r: r["markers"][1]["lanes"][0][3].__setitem__(1, float("nan")), "lanes holds nan at [0, 3, 1]"),
+        (lambda r: r["markers"][1].update(successors=[[0, 5]]), "marker 1: successors holds 5, which is no lane"),
+        (lambda r: r["markers"][1].update(successors=[[0, -1]]), "marker 1: successors holds -1"),
+        (lambda r: r["markers"][1].update(successors=[[0.5, 1]]), "marker 1: successors holds 0.5"),
+        (lambda r: r["markers"][1].update(surveyed="July"), "marker 1: surveyed is 'July', expected a day"),
+        (lambda r: r["markers"][1].update(expires=20250711), "marker 1: expires is 20250711"),
+        (lambda r: r["markers"][1]["global_from_marker"][0].__setitem__(0, 2.0), "1: global_from_marker is no pose"),
+        (lambda r: r["markers"][1]["global_from_marker"].reverse(), "marker 1: global_from_marker is no pose"),
+        (lambda r: r["markers"].append(3), "markers[2] is of type int"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_a_file_is_named(tmp_path, change, message):
+    record = saved(tmp_path)
+    change(record)
+    path = tmp_path / "wrong.json"
+    path.write_text(json.dumps(record))
+    with pytest.raises(UserError, match=re.escape(message)) as error:
+        load_store(path)
+    assert str(path) in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(UserError, match="cannot read"):
+        load_store(tmp_path / "absent.json")
+    (tmp_path / "half.json").write_text(json.dumps(saved(tmp_path))[:400])
+    with pytest.raises(UserError, match="is no JSON file"):
+        load_store(tmp_path / "half.json")
+    (tmp_path / "list.json").write_text("[]")
+    with pytest.raises(UserError, match="expected a mapping"):
+        load_store(tmp_path / "list.json")
+
+
+def test_a_store_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
+    saved(tmp_path)
+    before = (tmp_path / "store.json").read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(UserError, match=r"store\.json: No space left"):
+        save_store(store_of({}, placed()), tmp_path / "store.json")
+    assert [p.name for p in tmp_path.iterdir()] == ["store.json"]
+    assert (tmp_path / "store.json").read_bytes() == before
+
+
+def dated(number, surveyed=None, expires=None):
+    return StoredMarker(number, np.eye(4), np.zeros((0, 2, 3)), np.zeros((0, 0), bool), 1.0, surveyed, expires)
+
+
+def test_unknown_ids_give_no_prior_and_are_counted():
+    store = MarkerStore({3: dated(3)}, "town.json")
+    with pytest.warns(UnknownMarkerWarning, match=r"town\.json does not hold") as caught:
+        looked = look_up(store, [9, 3, 4])
+    assert len(caught) == 1
+    assert looked.found == (None, store.markers[3], None)
+    assert (looked.unknown, looked.stale) == (2, 0)
+    # Nothing to say where all are known, and Python shows the warning once.
+    look_up(store, [3])
+    assert look_up(store, []).found == ()
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.resetwarnings()
+        for _ in range(3):
+            look_up(store, [9])
+    assert len(shown) == 1
+
+
+def test_entries_out_of_date_give_no_prior():
+    store = MarkerStore({
+        1: dated(1), 2: dated(2, DAY), 3: dated(3, DAY, DAY + datetime.timedelta(10)), 4: dated(4, None, DAY),
+    })  # fmt: skip
+    with pytest.warns(StaleMarkerWarning, match="survey them again"):
+        looked = look_up(store, [1, 2, 3, 4], today=DAY)
+    assert [m is not None for m in looked.found] == [True, True, True, False]
+    assert (looked.unknown, looked.stale) == (0, 1)
+    later = DAY + datetime.timedelta(10)
+    with pytest.warns(StaleMarkerWarning):
+        assert [m is not None for m in look_up(store, [1, 2, 3, 4], today=later).found] == [True, True, False, False]
+    # A limit of age: an entry without a date of survey is too old.
+    with pytest.warns(StaleMarkerWarning):
+        aged = look_up(store, [1, 2, 3], today=DAY + datetime.timedelta(5), max_age_days=5)
+    assert [m is not None for m in aged.found] == [False, True, True]
+    with pytest.warns(StaleMarkerWarning):
+        assert look_up(store, [2], today=DAY + datetime.timedelta(6), max_age_days=5).stale == 1
+    assert look_up(store, [1, 2, 3, 4]).stale == 0
+    with pytest.raises(ValueError, match="give today"):
+        look_up(store, [1], max_age_days=5)

@@ -8,6 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.world.bev_sensor import BevSensorConfig
 from tflane_jax.world.ring_cameras import CameraRigConfig
@@ -26,6 +27,7 @@ class ExampleConfig:
         sensor: bird's-eye-view evidence; None leaves it out.
         cameras: ring of cameras of the built-in world; None leaves them out. With cameras the traffic elements are
             those that the first one sees, with their boxes in its image, as OpenLane-V2 annotates them.
+        markers: fiducial-marker prior with simulated detections (marker paper, section IV-A); None leaves it out.
         lanes, lane_points: merged centerlines and points on each.
         segments, segment_points: lane segments and points on each.
         areas, area_points: crossings with road boundaries and points on each.
@@ -38,6 +40,7 @@ class ExampleConfig:
     range: PerceptionRange = PerceptionRange()
     sensor: BevSensorConfig | None = BevSensorConfig()
     cameras: CameraRigConfig | None = None
+    markers: MarkerConfig | None = None
     lanes: int = 48
     lane_points: int = 11
     segments: int = 96

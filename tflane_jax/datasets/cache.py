@@ -33,7 +33,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 
 # The code that decides what an example is, relative to the package.
-_SOURCES = ("scene.py", "logs.py", "geometry", "world", "datasets")
+_SOURCES = ("scene.py", "logs.py", "geometry", "world", "markers", "datasets")
 
 
 class Cacheable(Source, Protocol):

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from tflane_jax.datasets.areas import crop_areas
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
+from tflane_jax.datasets.marker_observations import marker_observations
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.logs import Log, Tracks
@@ -111,7 +112,9 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         ),
         hidden=hidden,
         traffic_flow=flow,
-        markers=None,
+        markers=None if config.markers is None else marker_observations(
+            log, keyframe, config.markers, config.range, bike_lanes=config.bike_lanes == "include"
+        ),
         sd_map=None,
         lanes=lanes.graph,
         segments=segments.graph,

@@ -1,0 +1,179 @@
+"""From detected markers to lanes in the ego frame."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.datasets.small_logs import lane_map, segment
+from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
+from tflane_jax.logs import PlacedMarkers
+from tflane_jax.markers.observe import observe
+from tflane_jax.markers.simulation import SimulatedMarkers
+from tflane_jax.markers.store import MarkerStore, UnknownMarkerWarning, store_of
+from tflane_jax.world.markers import marker_pose
+
+RANGE = PerceptionRange()
+SIZES = {"markers": 3, "lanes": 6, "points": 5}
+# Two lanes along x that join a third, which bends out of the range and comes back.
+LANES = lane_map(
+    segment(1, [(-60, 0), (20, 0)], [3]), segment(2, [(-60, 4), (0, 4), (20, 0)], [3]),
+    segment(3, [(20, 0), (30, 0), (30, 40), (35, 40), (35, 0)]),
+).segments  # fmt: skip
+PLACED = PlacedMarkers(
+    np.array([5, 8, 2]), marker_pose(np.array([[20, -5, 3], [40, -5, 3], [-10, -5, 3.0]]), np.full(3, np.pi))
+)
+STORE = store_of(LANES, PLACED, radius=100.0)
+
+
+def detect(pose, ids=(5, 8, 2), *, score=None, valid=None):
+    """Return detections; the rows that are not valid hold garbage."""
+    pose, ids = np.array(pose, float), np.array(ids)
+    valid = np.ones(len(ids), bool) if valid is None else np.array(valid)
+    pose[~valid] = np.nan
+    score = np.ones(len(ids)) if score is None else np.where(valid, score, np.nan)
+    return SimulatedMarkers(ids, pose, score, np.zeros(len(ids), bool), valid)
+
+
+def rows_of(markers):
+    return {int(i): row for row, i in enumerate(markers.marker_id) if markers.valid[row]}
+
+
+def test_lanes_lie_where_the_pose_says():
+    """The vehicle at the map's origin, and one that is elsewhere and sees the same."""
+    here = observe(detect(PLACED.pose), STORE, RANGE, **SIZES).markers
+    here.validate()
+    assert here.marker_id.tolist() == [2, 5, 8]  # nearest first
+    assert here.valid.all()
+    assert here.lanes.dtype == np.float32
+    np.testing.assert_allclose(here.pose, PLACED.pose[[2, 0, 1]], atol=1e-5)
+    for row in range(3):
+        assert here.lane_valid[row].tolist() == [True] * 4 + [False] * 2
+        lines = here.lanes[row]
+        np.testing.assert_allclose(lines[0], [(x, 0, 0) for x in np.linspace(-50, 20, 5)], atol=1e-4)
+        np.testing.assert_allclose(lines[1, [0, -1]], [(-50, 4, 0), (20, 0, 0)], atol=1e-4)
+        np.testing.assert_allclose(lines[2, [0, -1]], [(20, 0, 0), (30, 25, 0)], atol=1e-4)
+        np.testing.assert_allclose(lines[3, [0, -1]], [(35, 25, 0), (35, 0, 0)], atol=1e-4)
+        assert np.argwhere(here.successor[row]).tolist() == [[0, 2], [1, 2]]
+    ego = yaw_pose(*np.array([[700.0], [-40.0], [2.0]]))[0]
+    there = observe(detect(ego @ PLACED.pose), STORE, RANGE, **SIZES).markers
+    # Far away nothing is in range: the marker stays, without lanes.
+    assert there.valid.all()
+    assert not there.lane_valid.any()
+    assert not there.successor.any()
+
+
+def test_a_successor_needs_the_joint_in_range():
+    shifted = observe(detect(yaw_pose(*np.array([[45.0], [0], [0]])) @ PLACED.pose), STORE, RANGE, **SIZES).markers
+    assert shifted.lane_valid[0].sum() == 2  # lanes 1 and 2 join 3 at x = 65
+    assert not shifted.successor.any()
+
+
+def test_no_room():
+    detected = detect(PLACED.pose)
+    all_ = observe(detected, STORE, RANGE, **SIZES)
+    assert (all_.markers_dropped, all_.lanes_dropped) == (0, 0)
+    fewer = observe(detected, STORE, RANGE, markers=2, lanes=3, points=5)
+    assert fewer.markers.marker_id.tolist() == [2, 5]
+    assert (fewer.markers_dropped, fewer.lanes_dropped) == (1, 2)
+    # Marker 2 stands at x = -10, and the piece of lane 3 that comes back is the farthest from it.
+    np.testing.assert_array_equal(fewer.markers.lanes, all_.markers.lanes[:2, :3])
+    np.testing.assert_array_equal(fewer.markers.successor, all_.markers.successor[:2, :3, :3])
+    none = observe(detected, STORE, RANGE, markers=0, lanes=0, points=2)
+    none.markers.validate()
+    assert none.markers_dropped == 3
+
+
+def test_padding_and_nothing_detected():
+    padded = detect(PLACED.pose, valid=[True, False, True])
+    unpadded = detect(PLACED.pose[[0, 2]], (5, 2))
+    a, b = (observe(d, STORE, RANGE, **SIZES).markers for d in (padded, unpadded))
+    for name in ("marker_id", "pose", "score", "residual", "lanes", "lane_valid", "successor", "valid"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    for detected in (detect(np.zeros((0, 4, 4)), ()), detect(PLACED.pose, valid=[False] * 3)):
+        empty = observe(detected, STORE, RANGE, **SIZES).markers
+        empty.validate()
+        assert not empty.valid.any()
+        assert np.isfinite(empty.lanes).all()
+        np.testing.assert_array_equal(empty.pose, np.tile(np.eye(4, dtype=np.float32), (3, 1, 1)))
+
+
+def test_unknown_ids_are_left_out_and_counted():
+    with pytest.warns(UnknownMarkerWarning):
+        observed = observe(detect(PLACED.pose, (5, 77, 2)), STORE, RANGE, **SIZES)
+    assert (observed.unknown, observed.stale, observed.markers_dropped) == (1, 0, 0)
+    assert observed.markers.marker_id[observed.markers.valid].tolist() == [2, 5]
+    with pytest.warns(UnknownMarkerWarning):
+        assert not observe(detect(PLACED.pose), MarkerStore({}), RANGE, **SIZES).markers.valid.any()
+
+
+def test_of_one_id_seen_twice_the_better_counts():
+    poses = np.stack([PLACED.pose[0], PLACED.pose[1], PLACED.pose[0]])
+    observed = observe(detect(poses, (5, 5, 5), score=[0.2, 0.9, 0.3]), STORE, RANGE, **SIZES).markers
+    assert observed.valid.tolist() == [True, False, False]
+    assert observed.score[0] == np.float32(0.9)
+    np.testing.assert_allclose(observed.pose[0], PLACED.pose[1], atol=1e-5)
+
+
+def test_the_residual_takes_out_the_vehicles_motion():
+    now, before = (yaw_pose(*np.array(p)[:, None])[0] for p in ((3.0, 1.0, 0.2), (-4.0, 0.5, 0.1)))
+    motion = invert_pose(now) @ before
+    seen_now, seen_before = (detect(invert_pose(ego) @ PLACED.pose) for ego in (now, before))
+    still = observe(seen_now, STORE, RANGE, previous=seen_before, now_from_previous=motion, **SIZES).markers
+    np.testing.assert_allclose(still.residual, 0.0, atol=1e-5)
+    # The pose that was seen before lay 3 m further left: so did every lane point.
+    aside = seen_before.pose.copy()
+    aside[0, :3, 3] += invert_pose(motion)[:3, :3] @ [0.0, 3.0, 0.0]
+    moved = observe(
+        seen_now, STORE, RANGE, previous=seen_before._replace(pose=aside), now_from_previous=motion, **SIZES
+    ).markers
+    rows = rows_of(moved)
+    assert moved.residual[rows[5]] == pytest.approx(3.0, abs=1e-4)
+    assert moved.residual[rows[8]] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_the_residual_of_a_turn_is_that_of_the_lane_points():
+    pose = PLACED.pose[:1].copy()
+    pose[0, :3, :3] = yaw_pose(*np.zeros((2, 1)), np.array([0.1]))[0, :3, :3] @ pose[0, :3, :3]
+    markers = observe(
+        detect(PLACED.pose[:1], (5,)), STORE, RANGE, previous=detect(pose, (5,)), now_from_previous=np.eye(4), **SIZES
+    ).markers
+    points = np.einsum("ij,lpj->lpi", PLACED.pose[0, :3, :3], STORE.markers[5].lanes)
+    expected = np.hypot(points[..., 0], points[..., 1]).mean() * 2 * np.sin(0.05)
+    assert markers.residual[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_residual_of_a_first_sighting():
+    detected, before = detect(PLACED.pose), detect(PLACED.pose, valid=[False, True, False])
+    markers = observe(
+        detected, STORE, RANGE, previous=before, now_from_previous=np.eye(4), first_residual=7.0, **SIZES
+    ).markers
+    rows = rows_of(markers)
+    assert [markers.residual[rows[i]] for i in (5, 8, 2)] == [7.0, 0.0, 7.0]
+    assert observe(detected, STORE, RANGE, **SIZES).markers.residual.tolist() == [0.0, 0.0, 0.0]
+    with pytest.raises(ValueError, match="now_from_previous"):
+        observe(detected, STORE, RANGE, previous=before, **SIZES)
+
+
+def test_a_marker_without_lanes_has_the_residual_of_its_place():
+    store = store_of({}, PLACED)
+    before = detect(PLACED.pose)
+    before.pose[:, :2, 3] += [3.0, 4.0]
+    markers = observe(
+        detect(PLACED.pose), store, RANGE, previous=before, now_from_previous=np.eye(4), **SIZES
+    ).markers
+    np.testing.assert_allclose(markers.residual, 5.0, atol=1e-5)
+
+
+@given(st.floats(-60, 60), st.floats(-60, 60), st.floats(-np.pi, np.pi))
+@settings(max_examples=40, deadline=None)
+def test_whatever_the_pose_lanes_stay_in_range(x, y, yaw):
+    move = yaw_pose(np.array([x]), np.array([y]), np.array([yaw]))
+    markers = observe(detect(move @ PLACED.pose), STORE, RANGE, **SIZES).markers
+    markers.validate()
+    inside = markers.lanes[markers.lane_valid]
+    assert np.isfinite(inside).all()
+    assert RANGE.contains(inside).all()
+    assert not (markers.successor & ~(markers.lane_valid[:, :, None] & markers.lane_valid[:, None])).any()
+    for m, i, j in np.argwhere(markers.successor):
+        np.testing.assert_allclose(markers.lanes[m, i, -1], markers.lanes[m, j, 0], atol=1e-4)

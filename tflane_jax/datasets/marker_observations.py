@@ -1,0 +1,65 @@
+"""The marker prior of a log's key frames: its markers, the store of what they name, and what is detected of them."""
+
+from __future__ import annotations
+
+import warnings
+import weakref
+
+from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.geometry import PerceptionRange, relative_pose
+from tflane_jax.logs import Log, PlacedMarkers
+from tflane_jax.markers.observe import observe
+from tflane_jax.markers.simulation import MarkerConfig, moment_before, simulate_detections
+from tflane_jax.markers.store import MarkerStore, store_of
+from tflane_jax.scene import MarkerObservations
+from tflane_jax.world.markers import place_markers
+
+_STORES: dict[tuple[int, float, bool], MarkerStore] = {}
+
+
+def markers_of(log: Log) -> PlacedMarkers:
+    """Return the markers of a log; a log without any (real data) gets virtual ones, as in the paper (section IV-A)."""
+    return place_markers(log.map, log.seed) if log.markers is None else log.markers
+
+
+def store_of_log(log: Log, *, radius: float, bike_lanes: bool) -> MarkerStore:
+    """Return the store of a log's markers: merged centerlines within `radius` metres of each; remembered for as long as
+    the log lives.
+
+    Args:
+        bike_lanes: keep lanes closed to motor vehicles.
+    """
+    key = (id(log), radius, bike_lanes)
+    if key not in _STORES:
+        lanes = prepare_map(log.map, bike_lanes=bike_lanes).centerlines.lanes
+        _STORES[key] = store_of(
+            {lane.id: lane for lane in lanes}, markers_of(log), radius=radius, source=f"the store of {log.name}"
+        )
+        weakref.finalize(log, _STORES.pop, key)
+    return _STORES[key]
+
+
+def marker_observations(
+    log: Log, keyframe: int, config: MarkerConfig, range_: PerceptionRange, *, bike_lanes: bool
+) -> MarkerObservations:
+    """Return what a simulated detector and the store tell at a key frame.
+
+    Warns (`TruncationWarning`) where markers or lanes in range find no room.
+    """
+    markers, simulation = markers_of(log), config.simulation
+    moment, before = log.keyframes[keyframe], moment_before(log, keyframe, simulation.residual_interval)
+    observed = observe(
+        simulate_detections(log, moment, markers, simulation),
+        store_of_log(log, radius=config.radius, bike_lanes=bike_lanes), range_,
+        markers=config.markers, lanes=config.lanes, points=config.points, first_residual=simulation.first_residual,
+        previous=None if before is None else simulate_detections(log, before, markers, simulation),
+        now_from_previous=None if before is None else relative_pose(moment.global_from_ego, before.global_from_ego),
+    )  # fmt: skip
+    for name, dropped in (("markers", observed.markers_dropped), ("lanes", observed.lanes_dropped)):
+        if dropped:
+            warnings.warn(
+                f"more {name} in range than MarkerConfig.{name} = {getattr(config, name)}: the farthest are left out",
+                TruncationWarning, stacklevel=3,
+            )  # fmt: skip
+    return observed.markers

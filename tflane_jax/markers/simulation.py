@@ -1,0 +1,229 @@
+"""Observations of markers without pixels: the noise model of the marker paper (section IV-A).
+
+A marker is seen where the vehicle approaches its face and nothing stands between; whether it is detected, and how wrong
+its pose is, is drawn from a stream of its own for each log, moment and marker. So an observation does not depend on
+which others were asked for, nor in which order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.logs import KeyFrame, Log, PlacedMarkers
+from tflane_jax.world.line_of_sight import hidden_points
+
+ROOT = 20_251_123
+
+
+@dataclass(frozen=True)
+class MarkerSimulationConfig:
+    """Which markers are detected, and how wrong their poses are.
+
+    Attributes:
+        forward_sigma: standard deviation of the error along the ego x axis at `reference`, metres (paper: 3 m at 60 m).
+        yaw_sigma, pitch_sigma: of the orientation at `reference`, degrees (paper: 2 degrees at 60 m). The marker turns
+            about its own middle.
+        reference: distance at which these hold, metres.
+        growth: how all three grow with the distance from 0: "linear" or "quadratic". The paper says only that they
+            grow; a depth that is read off the marker's size in pixels has an error that grows with the square.
+        jump: probability of an abrupt jump (paper: 0.05 a frame), on top of the other errors.
+        jump_distance: of a jump, in a random direction in the ground plane, metres (paper: about 25).
+        jump_yaw: of a jump, to a random side, degrees (paper: about 90).
+        jump_spread: standard deviation of both, as a share.
+        detection_sigma: sigma_d of P = exp(-d^2 / (2 sigma_d^2)), metres. The paper fits it and does not say it. The
+            default puts P = 1/2 at 47 m, where a 1 m marker is 38 pixels wide in the front camera of Argoverse 2, some
+            5 pixels for each of the 7 cells of a 5x5 ArUco marker.
+        range: farthest that a marker is seen, metres (the paper's curves end at 60 m).
+        field_of_view: full angle of view ahead, degrees.
+        frontal: largest angle, from straight at the face, of both the line of sight and the vehicle's heading, degrees:
+            a marker is visible only to a vehicle that approaches it frontally.
+        occlusion: "line_of_sight": road users and buildings hide markers; "none": nothing does.
+        score: range from which the detection score is drawn (uniform).
+        residual_interval: r compares with the observation so many seconds before (the paper's frames come at 2 Hz);
+            None compares with the previous key frame.
+        first_residual: r of a marker that was not detected then, metres.
+    """
+
+    forward_sigma: float = 3.0
+    yaw_sigma: float = 2.0
+    pitch_sigma: float = 2.0
+    reference: float = 60.0
+    growth: Literal["linear", "quadratic"] = "linear"
+    jump: float = 0.05
+    jump_distance: float = 25.0
+    jump_yaw: float = 90.0
+    jump_spread: float = 0.1
+    detection_sigma: float = 40.0
+    range: float = 60.0
+    field_of_view: float = 120.0
+    frontal: float = 60.0
+    occlusion: Literal["line_of_sight", "none"] = "line_of_sight"
+    score: tuple[float, float] = (1.0, 1.0)
+    residual_interval: float | None = 0.5
+    first_residual: float = 0.0
+
+    def growth_at(self, distance: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
+        """Return by what the standard deviations at `reference` are multiplied at a distance (metres)."""
+        share = distance / self.reference
+        return share if self.growth == "linear" else share**2
+
+    def detection_probability(self, distance: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
+        """Return P_detect of a visible marker at a distance (metres)."""
+        return np.exp(-(distance**2) / (2.0 * self.detection_sigma**2))
+
+
+# A simulation without noise, in which every visible marker is detected.
+PERFECT = MarkerSimulationConfig(
+    forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0.0, jump=0.0, detection_sigma=float("inf")
+)
+
+
+@dataclass(frozen=True)
+class MarkerConfig:
+    """The marker prior of an example.
+
+    Attributes:
+        markers, lanes, points: capacities M and J, and points P on each lane. What does not fit is left out, the
+            farthest markers and the lanes farthest from their marker.
+        radius: lanes within so many metres of a marker are stored.
+        simulation: of what is detected.
+    """
+
+    markers: int = 4
+    lanes: int = 48
+    points: int = 11
+    radius: float = 50.0
+    simulation: MarkerSimulationConfig = MarkerSimulationConfig()
+
+
+class SimulatedMarkers(NamedTuple):
+    """Simulated detections: a row for each marker of the log, in its order.
+
+    Attributes:
+        marker_id: (M,) identity.
+        pose: (M, 4, 4) float64 noisy ego_from_marker, metres; the identity where not valid.
+        score: (M,) detection score.
+        jump: (M,) the pose has jumped. Never a model input: it is there for evaluation.
+        valid: (M,) detected.
+    """
+
+    marker_id: Int[np.ndarray, " m"]
+    pose: Float[np.ndarray, "m 4 4"]
+    score: Float[np.ndarray, " m"]
+    jump: Bool[np.ndarray, " m"]
+    valid: Bool[np.ndarray, " m"]
+
+
+def simulate_detections(
+    log: Log, moment: KeyFrame, markers: PlacedMarkers, config: MarkerSimulationConfig
+) -> SimulatedMarkers:
+    """Return which markers are detected at a moment of a log, and their noisy poses.
+
+    The same log seed, track frame and marker id give the same bits, whatever else is simulated.
+    """
+    true = relative_pose(moment.global_from_ego, markers.pose)
+    seen = visible(true, config)
+    if config.occlusion == "line_of_sight":
+        seen[seen] = ~_hidden(log, moment, true[seen])
+    count = len(seen)
+    drawn = _draws(log.seed, moment.track_frame, markers.marker_id, seen)
+    distance = np.hypot(true[:, 0, 3], true[:, 1, 3])
+    jump = drawn.uniform[:, 1] < config.jump
+    valid = seen & (drawn.uniform[:, 0] < config.detection_probability(distance))
+    low, high = config.score
+    return SimulatedMarkers(
+        marker_id=np.asarray(markers.marker_id),
+        pose=np.where(valid[:, None, None], _perturbed(true, distance, jump, drawn, config), np.eye(4)),
+        score=np.where(valid, low + (high - low) * drawn.uniform[:, 2], 0.0).reshape(count),
+        jump=jump & valid,
+        valid=valid,
+    )
+
+
+def visible(ego_from_marker: Float[np.ndarray, "m 4 4"], config: MarkerSimulationConfig) -> Bool[np.ndarray, " m"]:
+    """Return which markers a vehicle with free sight sees: within range, ahead, and approached frontally."""
+    place, face = ego_from_marker[:, :2, 3], ego_from_marker[:, :2, 2]
+    distance = np.hypot(place[:, 0], place[:, 1])
+    ahead = np.abs(np.arctan2(place[:, 1], place[:, 0])) <= np.deg2rad(config.field_of_view) / 2
+    to_vehicle = -(face * place).sum(-1) / np.where(distance > 0.0, distance, 1.0)
+    least = np.cos(np.deg2rad(config.frontal))
+    return (distance > 0.0) & (distance <= config.range) & ahead & (to_vehicle >= least) & (-face[:, 0] >= least)
+
+
+def moment_before(log: Log, keyframe: int, interval: float | None) -> KeyFrame | None:
+    """Return the moment with which the residual compares: the track frame nearest to `interval` seconds before the key
+    frame, or for None the previous key frame; None where the log has no such moment."""
+    moment = log.keyframes[keyframe]
+    if interval is None:
+        return log.keyframes[keyframe - 1] if keyframe > 0 else None
+    earlier = log.timestamps_ns[: moment.track_frame]
+    if not len(earlier):
+        return None
+    off = np.abs(earlier - (moment.timestamp_ns - interval * 1e9))
+    frame = int(off.argmin())
+    # A gap in the record, or its start: the nearest frame is no stand-in for the one that is wanted.
+    if off[frame] > 0.5e9 * interval:
+        return None
+    return KeyFrame(int(earlier[frame]), log.global_from_ego[frame], frame)
+
+
+class _Draws(NamedTuple):
+    """What is drawn for each marker: (M, 4) in [0, 1) and (M, 5) standard normal; 0 for markers that nobody sees."""
+
+    uniform: Float[np.ndarray, "m 4"]
+    normal: Float[np.ndarray, "m 5"]
+
+
+def _draws(seed: int, frame: int, marker_id: Int[np.ndarray, " m"], wanted: Bool[np.ndarray, " m"]) -> _Draws:
+    uniform, normal = np.zeros((len(wanted), 4)), np.zeros((len(wanted), 5))
+    for row in np.flatnonzero(wanted):
+        rng = np.random.default_rng([ROOT, seed, frame, int(marker_id[row])])
+        uniform[row], normal[row] = rng.random(4), rng.standard_normal(5)
+    return _Draws(uniform, normal)
+
+
+def _perturbed(
+    true: Float[np.ndarray, "m 4 4"], distance: Float[np.ndarray, " m"], jump: Bool[np.ndarray, " m"], drawn: _Draws,
+    config: MarkerSimulationConfig,
+) -> Float[np.ndarray, "m 4 4"]:
+    """Return the poses with the errors of section IV-A: the marker moves along x, jumps, and turns about itself."""
+    growth = config.growth_at(distance)
+    forward, yaw, pitch, further, turned = drawn.normal.T
+    yaw, pitch = growth * config.yaw_sigma * yaw, growth * config.pitch_sigma * pitch
+    # One number gives the direction of a jump and, by its half, the side to which it turns.
+    angle = 2.0 * np.pi * drawn.uniform[:, 3]
+    length = np.where(jump, config.jump_distance * (1.0 + config.jump_spread * further), 0.0)
+    side = np.where(drawn.uniform[:, 3] * 8.0 % 2.0 < 1.0, 1.0, -1.0)
+    yaw += np.where(jump, side * config.jump_yaw * (1.0 + config.jump_spread * turned), 0.0)
+    place = true[:, :3, 3] + np.stack(
+        [growth * config.forward_sigma * forward + length * np.cos(angle), length * np.sin(angle), 0.0 * angle], -1
+    )
+    turn = yaw_pose(0.0 * yaw, 0.0 * yaw, np.deg2rad(yaw))[:, :3, :3] @ _about_y(np.deg2rad(pitch))
+    return pose_matrix(turn @ true[:, :3, :3], place)
+
+
+def _about_y(angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 3 3"]:
+    cos, sin, zero, one = np.cos(angle), np.sin(angle), np.zeros_like(angle), np.ones_like(angle)
+    rows = ([cos, zero, sin], [zero, one, zero], [-sin, zero, cos])
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def _hidden(log: Log, moment: KeyFrame, ego_from_marker: Float[np.ndarray, "m 4 4"]) -> Bool[np.ndarray, " m"]:
+    """Return which markers stand behind road users or buildings. All stand on flat ground, as everywhere in sight."""
+    actors, frame = log.actors, moment.track_frame
+    ego_from_track = relative_pose(moment.global_from_ego, log.global_from_ego[frame])
+    there = actors.valid[frame]
+    size, position = actors.size[there], transform_points(ego_from_track, actors.position[frame, there])
+    yaw = actors.yaw[frame, there] + pose_yaw(ego_from_track)
+    boxes = np.column_stack([position[:, :2], size[:, :2], yaw, size[:, 2], np.zeros(len(size))]).reshape(-1, 7)
+    blocks = log.map.buildings
+    stand = relative_pose(moment.global_from_ego, yaw_pose(blocks[:, 0], blocks[:, 1], blocks[:, 4]))
+    buildings = np.column_stack([stand[:, :2, 3], blocks[:, 2:4], pose_yaw(stand)]).reshape(-1, 5)
+    return hidden_points(
+        ego_from_marker[:, :2, 3], boxes, buildings, target_height=ego_from_marker[:, 2, 3]
+    )

@@ -7,14 +7,15 @@ stands before it. A plane between them does: whatever lies on the camera's side 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.geometry import invert_pose
+from tflane_jax.world.camera_pictures import paint_picture
 from tflane_jax.world.front_view_camera import NEAR, FrontCamera
 from tflane_jax.world.front_view_polygons import HEADLIGHTS, SHIFT, Solid, clipped, fixed_point
 from tflane_jax.world.front_view_weather import Weather
@@ -25,6 +26,8 @@ _SLACK = 0.04
 _SIDES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 _CORNERS = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
 _OUTLINE = 18
+# Black of pictures: print is never quite black.
+_INK = np.full((1, 3), 0.045)
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ class Bodies:
         blobs: (L, 4) centre and radius, metres.
         blob_colours: (L, 3).
         blob_owner: (L,).
+        pictures: (r, c) by the number of the polygon that shows it, top row first: 1 where it has its own colour, 0
+            where it is black. Such a polygon is a parallelogram, its lower left corner first as seen by a viewer.
     """
 
     boxes: Float[np.ndarray, "b 7"]
@@ -52,6 +57,7 @@ class Bodies:
     blobs: Float[np.ndarray, "l 4"]
     blob_colours: Float[np.ndarray, "l 3"]
     blob_owner: Int[np.ndarray, " l"]
+    pictures: Mapping[int, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
 
     def placed(self, xy: Float[np.ndarray, "#b 2"], yaw: Float[np.ndarray, " #b"]) -> Bodies:
         """Return the bodies turned by `yaw` about the origin and then moved by `xy`, all alike or each by its own."""
@@ -64,18 +70,21 @@ class Bodies:
         corners[:, :2] = _turned(self.corners[:, :2], pose[np.repeat(self.owner, _counts(self.stops))])
         blobs[:, :2] = _turned(self.blobs[:, :2], pose[self.blob_owner])
         return Bodies(
-            boxes, corners, self.stops, self.colours, self.light, self.owner, blobs, self.blob_colours, self.blob_owner
-        )
+            boxes, corners, self.stops, self.colours, self.light, self.owner, blobs, self.blob_colours, self.blob_owner,
+            self.pictures,
+        )  # fmt: skip
 
     def chosen(self, keep: Bool[np.ndarray, " b"]) -> Bodies:
         """Return some of the bodies."""
         number = np.cumsum(keep) - 1
         kept, blob = keep[self.owner], keep[self.blob_owner]
         counts = _counts(self.stops)
+        place = np.cumsum(kept) - 1
         return Bodies(
             self.boxes[keep], self.corners[np.repeat(kept, counts)], np.cumsum(counts[kept]), self.colours[kept],
             self.light[kept], number[self.owner[kept]], self.blobs[blob], self.blob_colours[blob],
             number[self.blob_owner[blob]],
+            {int(place[polygon]): picture for polygon, picture in self.pictures.items() if kept[polygon]},
         )  # fmt: skip
 
 
@@ -98,6 +107,7 @@ def join(groups: Sequence[Bodies]) -> Bodies:
     """Return the bodies of several groups as one."""
     bodies = np.cumsum([0, *(len(g.boxes) for g in groups)])
     corners = np.cumsum([0, *(len(g.corners) for g in groups)])
+    polygons = np.cumsum([0, *(len(g.stops) for g in groups)]).tolist()
     return Bodies(
         boxes=np.concatenate([g.boxes for g in groups]),
         corners=np.concatenate([g.corners for g in groups]),
@@ -108,6 +118,11 @@ def join(groups: Sequence[Bodies]) -> Bodies:
         blobs=np.concatenate([g.blobs for g in groups]),
         blob_colours=np.concatenate([g.blob_colours for g in groups]),
         blob_owner=np.concatenate([g.blob_owner + n for g, n in zip(groups, bodies[:-1], strict=True)]),
+        pictures={
+            n + polygon: picture
+            for g, n in zip(groups, polygons[:-1], strict=True)
+            for polygon, picture in g.pictures.items()
+        },
     )
 
 
@@ -153,7 +168,11 @@ def draw_bodies(
         ring = fixed[part]
         if near[number]:
             ring = fixed_point(camera.image_of(clipped(bodies.corners[part], depth[part]))[0])
-        cv2.fillPoly(image, [ring], colour, line, SHIFT)
+        if number in bodies.pictures and not near[number]:
+            black = _lit(_INK, normal[[number]], bodies.light[[number]], a[[number]], weather)[0]
+            paint_picture(image, bodies.corners[part], bodies.pictures[number], camera, np.stack([black, colour]))
+        else:
+            cv2.fillPoly(image, [ring], colour, line, SHIFT)
 
 
 def _far_to_near(
@@ -234,7 +253,7 @@ def _with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
         bodies.boxes, np.concatenate([bodies.corners, corners]), np.concatenate([bodies.stops, stops]),
         np.concatenate([bodies.colours, bodies.blob_colours]), np.concatenate([bodies.light, np.zeros(count)]),
         np.concatenate([bodies.owner, bodies.blob_owner]), bodies.blobs[:0], bodies.blob_colours[:0],
-        bodies.blob_owner[:0],
+        bodies.blob_owner[:0], bodies.pictures,
     )  # fmt: skip
 
 

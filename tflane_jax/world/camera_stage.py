@@ -13,6 +13,7 @@ from tflane_jax.logs import Log
 from tflane_jax.world.camera_elements import mast_bodies
 from tflane_jax.world.camera_ground import Ground, draw_ground
 from tflane_jax.world.camera_light import cast, draw_panorama, log_weather
+from tflane_jax.world.camera_markers import marker_bodies
 from tflane_jax.world.camera_paint import Paint, paint_of
 from tflane_jax.world.camera_scenery import Scenery, draw_scenery
 from tflane_jax.world.camera_solids import Bodies, footprints, join
@@ -49,7 +50,7 @@ class Stage:
     Attributes:
         weather: with its sun in the global frame.
         paint, scenery: of the map.
-        static: scenery and masts, global frame.
+        static: scenery, masts and fiducial markers, global frame.
         panorama: of the sky.
         shade: (h, w) uint8 share of sunlight that buildings and trees let pass, and `lamps` the light of street lamps;
             both with texels of `SHADE_TEXEL` from `low`.
@@ -98,11 +99,12 @@ def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
         dirt=weather.dirt, wet=weather.rain, urban=scenery.urban,
     )  # fmt: skip
     low, shade, lamps = _static_light(places, scenery, weather)
+    masts = mast_bodies(log.map.elements, log.map.road_boundaries)
     return Stage(
         weather=weather,
         paint=paint,
         scenery=scenery,
-        static=join([scenery.bodies, mast_bodies(log.map.elements, log.map.road_boundaries)]),
+        static=join([scenery.bodies, masts, marker_bodies(getattr(log, "markers", None))]),
         panorama=draw_panorama(log_stream(log, Stream.SKY), weather, 3072 if config.scale > LARGE else 1024),
         low=low,
         shade=shade,

@@ -5,11 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.world.camera_scene import FRONT, scene, street
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import project
 from tflane_jax.markers.patterns import MarkerFamily, board_cells, board_size, marker_cells
 from tflane_jax.world.camera_markers import marker_bodies
 from tflane_jax.world.camera_pictures import paint_picture
+from tflane_jax.world.camera_sensor import render_cameras, render_window
 from tflane_jax.world.camera_solids import draw_bodies, join, pack
 from tflane_jax.world.front_view_polygons import Solid
 from tflane_jax.world.front_view_weather import FrontWeatherConfig, draw_weather
@@ -158,3 +160,15 @@ def test_what_means_nothing_is_refused(change, words):
     covered = change.pop("covered", 0.0)
     with pytest.raises(UserError, match=words):
         marker_bodies(markers(pose(9.0, 0.0, 2.0), **change), covered=covered)
+
+
+def test_a_window_is_a_part_of_the_image():
+    log = scene(street())
+    whole = render_cameras(log, 0, FRONT).image[0]
+    part = render_window(log, 0, FRONT, (200, 120), (140, 90))
+    # The lens blurs across the part's border.
+    difference = np.abs(part.astype(int) - whole[120:210, 200:340])[3:-3, 3:-3]
+    assert difference.max() <= 3
+    assert np.ptp(part) > 60
+    with pytest.raises(UserError, match="window"):
+        render_window(log, 0, FRONT, (600, 0), (140, 90))

@@ -13,7 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
+from tflane_jax.geometry.cameras import crop_intrinsics
 from tflane_jax.logs import Log
 from tflane_jax.scene import CameraViews
 from tflane_jax.world.camera_elements import element_bodies, element_boxes, unhidden
@@ -63,7 +65,9 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
         view = _view(camera, config.supersample)
         picture = _draw(stage, moment, view, config)
         rng = camera_stream(log.seed, mount, Stream.PICTURE, keyframe)
-        image[number, : camera.height, : camera.width] = _develop(rng, picture, camera, stage.weather)
+        image[number, : camera.height, : camera.width] = _develop(
+            rng, picture, camera, stage.weather, max(camera.width, camera.height)
+        )
     return CameraViews(
         image=image,
         size=size,
@@ -71,6 +75,33 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
         camera_from_ego=np.stack([camera.camera_from_ego for camera in cameras]).astype(np.float32),
         valid=np.ones(len(cameras), bool),
     )
+
+
+def render_window(
+    log: Log, keyframe: int, config: CameraRigConfig, corner: tuple[int, int], size: tuple[int, int], *, camera: int = 0
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a part of one camera's image of a key frame: as `render_cameras` draws it, but for its rain and noise.
+
+    Args:
+        log, keyframe, config: as for `render_cameras`.
+        corner: column and row of the part's upper left pixel.
+        size: its width and height.
+        camera: of the rig, by number.
+
+    Raises UserError where the rig can make no images or the part does not lie in the image.
+    """
+    whole = draw_rig(log.seed, config)[camera]
+    (left, top), (width, height) = corner, size
+    if not (0 <= left < left + width <= whole.width and 0 <= top < top + height <= whole.height):
+        raise UserError(
+            f"a window of {width} x {height} pixels at column {left}, row {top} is not within the image of "
+            f"{whole.width} x {whole.height} pixels: choose a smaller one"
+        )
+    part = replace(whole, width=width, height=height, intrinsics=crop_intrinsics(whole.intrinsics, corner))
+    stage = stage_of(log, config)
+    picture = _draw(stage, moment_of(log, keyframe, stage, config), _view(part, config.supersample), config)
+    rng = camera_stream(log.seed, config.cameras[camera], Stream.PICTURE, keyframe, left, top)
+    return _develop(rng, picture, part, stage.weather, max(whole.width, whole.height))
 
 
 def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> ElementViews:
@@ -160,12 +191,12 @@ def _ground_colour(moment: Moment, view: View, x: np.ndarray, y: np.ndarray) -> 
 
 
 def _develop(
-    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], camera: FrontCamera, weather: Weather
+    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], camera: FrontCamera, weather: Weather, longest: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture at its own size as the camera delivers it."""
+    """Return the picture at its own size as the camera delivers it; `longest` is the longer side of all it sees."""
     import cv2
 
     if picture.shape[0] != camera.height:
         picture = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    scale = max(camera.width, camera.height) / _PICTURE
+    scale = longest / _PICTURE
     return develop(rng, picture, replace(weather, blur=weather.blur * min(scale, 2.0)), scale)

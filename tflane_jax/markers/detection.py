@@ -1,0 +1,375 @@
+"""Finding fiducial markers in calibrated images: which, where, turned how, and how sure (section III of the paper).
+
+OpenCV (extra `images`) finds the squares and reads their ids; pose, score and the choice between the two poses that a
+square can have are ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import invert_pose, pose_matrix, transform_points
+from tflane_jax.geometry.cameras import project
+from tflane_jax.images import opencv
+from tflane_jax.markers.patterns import MarkerFamily, cells_across, correctable_bits, dictionary_of, marker_cells
+from tflane_jax.scene import CameraViews
+
+# Corners of a marker of size 2 in its own frame, in OpenCV's order: upper left, upper right, lower right, lower left.
+_SQUARE = np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0)])
+# Errors below this are alike, pixels: it keeps the ratio of two perfect fits at 1.
+_EXACT = 1e-3
+# Score: pixels of a cell's side and error of the fit (pixels) at which their factors fall to 1 - 1/e and exp(-1/2).
+_CELL, _ERROR = 2.0, 1.0
+# Refinement: standard deviation of the blur of lens and pixels, pixels; most steps; how far a corner may move,
+# cells.
+_SPREAD, _STEPS, _REACH = 0.8, 12, 0.6
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """How markers are looked for.
+
+    Attributes:
+        family: dictionary of the markers.
+        size: side of the black square, metres.
+        capacity: most markers reported for a frame; the best scores stay.
+        corners: "pattern" moves the corners until the printed cells fit the image best, "subpixel" finds each corner
+            between the pixels by itself, "none" takes the pixels of the outline.
+        enlarge: each image is enlarged so many times before the search, which finds smaller markers and takes longer.
+        least_pixels: shorter sides are not looked at, pixels of the given image.
+        ambiguous: where the better of the two poses fits less than so many times better than the other (ratio of errors
+            above this), the prior chooses; 1 never asks the prior.
+        tilt, turn: standard deviations of the prior, radians: how far the marker's y axis leans from the vertical, and
+            how far its face is turned away from the camera.
+    """
+
+    family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
+    size: float = 1.0
+    capacity: int = 16
+    corners: Literal["pattern", "subpixel", "none"] = "pattern"
+    enlarge: int = 1
+    least_pixels: float = 8.0
+    ambiguous: float = 0.6
+    tilt: float = 0.05
+    turn: float = 0.8
+
+    def validate(self) -> None:
+        """Raise UserError for numbers that mean nothing."""
+        for name, least in (("capacity", 1), ("enlarge", 1)):
+            if getattr(self, name) < least:
+                raise UserError(f"DetectorConfig.{name} must be at least {least}, not {getattr(self, name)}")
+        for name in ("size", "least_pixels", "tilt", "turn"):
+            if not getattr(self, name) > 0.0:
+                raise UserError(f"DetectorConfig.{name} must be positive, not {getattr(self, name)}")
+
+
+class ImageMarkers(NamedTuple):
+    """K markers found in one image.
+
+    Attributes:
+        marker_id: (K,).
+        corners: (K, 4, 2) pixels from the image's corner: upper left, upper right, lower right, lower left of the
+            black square as printed.
+        wrong_bits: (K,) cells whose brightness is on the wrong side, border included.
+    """
+
+    marker_id: Int[np.ndarray, " k"]
+    corners: Float[np.ndarray, "k 4 2"]
+    wrong_bits: Int[np.ndarray, " k"]
+
+
+class SquarePose(NamedTuple):
+    """The two poses that a square can have.
+
+    Attributes:
+        camera_from_marker: (2, 4, 4) the preferred one first.
+        error: (2,) root mean square distance between seen and projected corners, pixels.
+    """
+
+    camera_from_marker: Float[np.ndarray, "2 4 4"]
+    error: Float[np.ndarray, "2"]
+
+    @property
+    def ambiguity(self) -> float:
+        """Smaller over greater error, 0 (only one pose fits) to 1 (both fit alike)."""
+        return float((self.error.min() + _EXACT) / (self.error.max() + _EXACT))
+
+
+class DetectedMarkers(NamedTuple):
+    """Markers found in the images of one frame, the best score first; what is not valid is padding.
+
+    Attributes:
+        marker_id: (M,) int32.
+        pose: (M, 4, 4) ego_from_marker, metres (frame: `tflane_jax.markers`).
+        score: (M,) 0 to 1, see `detection_score`.
+        reprojection: (M,) root mean square distance between seen and projected corners, pixels.
+        ambiguity: (M,) 0 (only one pose fits) to 1 (both fit alike).
+        camera: (M,) int32 view of the frame that it was taken from.
+        valid: (M,).
+    """
+
+    marker_id: Int[np.ndarray, " m"]
+    pose: Float[np.ndarray, "m 4 4"]
+    score: Float[np.ndarray, " m"]
+    reprojection: Float[np.ndarray, " m"]
+    ambiguity: Float[np.ndarray, " m"]
+    camera: Int[np.ndarray, " m"]
+    valid: Bool[np.ndarray, " m"]
+
+    @classmethod
+    def empty(cls, capacity: int) -> DetectedMarkers:
+        """Return room for `capacity` markers and none valid."""
+        number, real = np.zeros(capacity, np.int32), np.zeros(capacity, np.float32)
+        pose = np.tile(np.eye(4, dtype=np.float32), (capacity, 1, 1))
+        return cls(number, pose, real, real.copy(), real.copy(), number.copy(), np.zeros(capacity, bool))
+
+
+def detect(views: CameraViews, config: DetectorConfig = DetectorConfig()) -> DetectedMarkers:
+    """Return the markers in all images of a frame; of an id that several images show, or one shows twice, the best.
+
+    Views that are not valid, and pixels beyond a view's size, are not looked at. Raises UserError without OpenCV or for
+    a config that means nothing.
+    """
+    rows: dict[int, tuple[float, int, np.ndarray, float, float]] = {}
+    for number in np.flatnonzero(np.asarray(views.valid)).tolist():
+        width, height = np.asarray(views.size[number]).tolist()
+        intrinsics = np.asarray(views.intrinsics[number], np.float64)
+        camera_from_ego = np.asarray(views.camera_from_ego[number], np.float64)
+        found = find_markers(np.asarray(views.image[number])[:height, :width], config)
+        for marker_id, corners, wrong in zip(found.marker_id.tolist(), found.corners, found.wrong_bits, strict=True):
+            fit = solve_square(corners, intrinsics, camera_from_ego, config)
+            score = detection_score(corners, int(wrong), float(fit.error[0]), config.family)
+            if marker_id not in rows or score > rows[marker_id][0]:
+                pose = invert_pose(camera_from_ego) @ fit.camera_from_marker[0]
+                rows[marker_id] = (score, number, pose, float(fit.error[0]), fit.ambiguity)
+    answer = DetectedMarkers.empty(config.capacity)
+    # Equal scores stay in the order of ids, so that the answer does not depend on the order of the views.
+    best = sorted(rows, key=lambda marker_id: (-rows[marker_id][0], marker_id))[: config.capacity]
+    for place, marker_id in enumerate(best):
+        score, camera, pose, error, ambiguity = rows[marker_id]
+        for column, value in zip(answer, (marker_id, pose, score, error, ambiguity, camera, True), strict=True):
+            column[place] = value
+    return answer
+
+
+def find_markers(
+    image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], config: DetectorConfig = DetectorConfig()
+) -> ImageMarkers:
+    """Return the markers of the family in an image without lens distortion, RGB or grey.
+
+    Raises UserError without OpenCV or for a config that means nothing.
+    """
+    config.validate()
+    cv2 = opencv()
+    if min(image.shape[:2]) < config.least_pixels:
+        return ImageMarkers(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros(0, int))
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else np.ascontiguousarray(image)
+    if config.enlarge > 1:
+        grey = cv2.resize(grey, None, fx=config.enlarge, fy=config.enlarge, interpolation=cv2.INTER_CUBIC)
+    outlines, ids, _ = _detector(cv2, max(grey.shape), config).detectMarkers(grey)
+    if ids is None or not len(ids):
+        return ImageMarkers(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros(0, int))
+    found = np.asarray(ids, int).ravel()
+    # OpenCV counts from the middle of the first pixel, we from its corner.
+    corners = np.asarray(outlines, np.float64).reshape(-1, 4, 2) + 0.5
+    if config.corners == "pattern":
+        pairs = zip(corners, found.tolist(), strict=True)
+        corners = np.stack([refine_corners(grey, square, marker_cells(config.family, i)) for square, i in pairs])
+    wrong = [_wrong_bits(cv2, grey, c, config.family, i) for c, i in zip(corners, found.tolist(), strict=True)]
+    return ImageMarkers(found, corners / config.enlarge, np.array(wrong, int))
+
+
+def _detector(cv2: Any, longest: int, config: DetectorConfig) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = 4.0 * config.least_pixels * config.enlarge / longest
+    parameters.cornerRefinementMethod = {
+        "pattern": cv2.aruco.CORNER_REFINE_SUBPIX,
+        "subpixel": cv2.aruco.CORNER_REFINE_SUBPIX,
+        "none": cv2.aruco.CORNER_REFINE_NONE,
+    }[config.corners]
+    return cv2.aruco.ArucoDetector(dictionary_of(config.family), parameters)
+
+
+def _wrong_bits(
+    cv2: Any, grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], family: MarkerFamily, marker_id: int
+) -> int:
+    """Return how many cells look white that are black, or black that are white."""
+    cells = marker_cells(family, marker_id)
+    across, fine = len(cells), 8
+    square = fine * across * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5
+    flat = cv2.getPerspectiveTransform((corners - 0.5).astype(np.float32), square.astype(np.float32))
+    seen = cv2.warpPerspective(grey, flat, (fine * across, fine * across), flags=cv2.INTER_LINEAR)
+    # The middle of each cell: its edge mixes with its neighbours.
+    middle = seen.reshape(across, fine, across, fine)[:, 2:6, :, 2:6].mean((1, 3))
+    between = 0.5 * (middle[cells].mean() + middle[~cells].mean())
+    return int(((middle > between) != cells).sum())
+
+
+def refine_corners(
+    grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"]
+) -> Float[np.ndarray, "4 2"]:
+    """Return the corners (pixels) of the black square for which its cells fit the image best.
+
+    Gauss-Newton on the sum of squares of a + b T(q) - I(H(q)) over points q of the marker and half a cell around it: T
+    the printed cells as a lens and pixels blur them, H the homography that the four corners fix, a and b brightness and
+    contrast (solved for in each step). All edges of all cells count, not the four corners alone. Where it does not
+    settle within a quarter of a cell of where it began, the corners are returned as they came.
+
+    Args:
+        grey: image.
+        corners: a first guess, in the order of `ImageMarkers`.
+        cells: of the marker, as `marker_cells`.
+    """
+    cv2 = opencv()
+    n = len(cells)
+    cell = np.linalg.norm(corners - np.roll(corners, 1, 0), axis=-1).mean() / n
+    # Points in shares of the square, from its upper left corner; the blur in points.
+    fine = int(np.clip(np.ceil(cell / 2.0) * 2.0, 4, 8))
+    board = np.kron(np.pad(cells, 1, constant_values=True), np.ones((fine, fine))).astype(np.float32)
+    # Both are blurred until an edge is wider than the points are apart: else it could move between them unseen.
+    spread = max(_SPREAD, cell / fine)
+    blurred = cv2.GaussianBlur(board, (0, 0), spread * fine / cell, borderType=cv2.BORDER_REPLICATE)
+    edge = fine // 2
+    template = blurred[edge:-edge, edge:-edge].ravel().astype(np.float64)
+    share = (np.arange(edge, (n + 2) * fine - edge) + 0.5 - fine) / (n * fine)
+    s, t = (axis.ravel() for axis in np.meshgrid(share, share))
+    points = np.stack([s, t, np.ones_like(s)])
+    around = 3.0 * spread + 2.0 * cell
+    low = np.maximum(np.floor(corners.min(0) - around), 0).astype(int)
+    high = np.maximum(np.ceil(corners.max(0) + around), low + 1).astype(int)
+    picture = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    if not picture.size:
+        return corners
+    if spread > 1.1 * _SPREAD:
+        extra = float(np.sqrt(spread**2 - _SPREAD**2))
+        picture = cv2.GaussianBlur(picture, (0, 0), extra, borderType=cv2.BORDER_REPLICATE)
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], np.float32)
+    now = corners.astype(np.float64)
+    for _ in range(_STEPS):
+        # The image and its slope, from the points and from half a pixel to either side of them.
+        image_from_square = cv2.getPerspectiveTransform(square, now.astype(np.float32))
+        top = image_from_square @ points
+        pixels = top[:2] / top[2]
+        u, v = (pixels - low[:, None] - 0.5).astype(np.float32)
+
+        def seen(du: float, dv: float, u: np.ndarray = u, v: np.ndarray = v) -> np.ndarray:
+            return cv2.remap(
+                picture, u + np.float32(du), v + np.float32(dv), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            ).ravel().astype(np.float64)  # fmt: skip
+
+        slope = np.stack([seen(0.5, 0.0) - seen(-0.5, 0.0), seen(0.0, 0.5) - seen(0.0, -0.5)])
+        # How the pixel of a point moves with the eight numbers of the homography, and these with the corners.
+        moves = _homography_slopes(s, t, pixels) / top[2]
+        at_corners = _homography_slopes(square[:, 0], square[:, 1], now.T) / (image_from_square @ np.vstack(
+            [square.T, np.ones(4)]))[2]  # fmt: skip
+        by_corner = np.linalg.inv(at_corners.transpose(2, 0, 1).reshape(8, 8))
+        along = np.einsum("cp,ckp->pk", slope, moves) @ by_corner
+        unknown = np.column_stack([along, -np.ones_like(s), -template])
+        matrix = unknown.T @ unknown
+        if np.linalg.matrix_rank(matrix) != 10:
+            return corners
+        step = np.linalg.solve(matrix, -unknown.T @ seen(0.0, 0.0))
+        if not step[9] > 0.0:
+            return corners
+        now = now + step[:8].reshape(4, 2)
+        if np.abs(now - corners).max() > max(_REACH * cell, 1.0) or not np.isfinite(now).all():
+            return corners
+        # cv2.remap looks at 1/32 of a pixel.
+        if np.abs(step[:8]).max() < 0.02:
+            return now
+    return corners
+
+
+def _homography_slopes(
+    s: Float[np.ndarray, " p"], t: Float[np.ndarray, " p"], pixels: Float[np.ndarray, "2 p"]
+) -> Float[np.ndarray, "2 8 p"]:
+    """Return how the pixel of (s, t) moves with the first eight entries of a homography, times its third coordinate."""
+    one, none = np.ones(len(s)), np.zeros(len(s))
+    u, v = pixels
+    return np.array([
+        [s, t, one, none, none, none, -u * s, -u * t],
+        [none, none, none, s, t, one, -v * s, -v * t],
+    ])  # fmt: skip
+
+
+def solve_square(
+    corners: Float[np.ndarray, "4 2"], intrinsics: Float[np.ndarray, "3 3"], camera_from_ego: Float[np.ndarray, "4 4"],
+    config: DetectorConfig = DetectorConfig(),
+) -> SquarePose:  # fmt: skip
+    """Return both poses of a marker whose corners are seen (in the order of `ImageMarkers`), the preferred one first.
+
+    A square seen from afar looks nearly the same when its face is mirrored about the line of sight, so that four
+    corners fit two poses (infinitesimal plane-based pose estimation, Collins and Bartoli 2014; OpenCV's IPPE_SQUARE).
+    The rule: the pose with the smaller error is preferred, unless the ratio of both errors is above `config.ambiguous`.
+    Then the prior prefers the one with the smaller (lean / tilt)^2 + (turned / turn)^2 + (error / least error)^2, with
+    lean the angle between the marker's y axis and the ego frame's z axis (a marker stands upright on its post), and
+    turned the angle between its z axis and the direction to the camera (it faces those whom it addresses).
+    """
+    cv2 = opencv()
+    square = 0.5 * config.size * _SQUARE
+    rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(np.asarray(intrinsics, np.float64)).T
+    # A marker that faces the camera is turned by half a circle, where OpenCV's rotation vectors break down (always for
+    # an upright marker before a level camera). Seen in a mirror, y turned round, it is hardly turned at all; its own z
+    # is turned round as well, of which a flat square shows nothing.
+    count, turns, places, _ = cv2.solvePnPGeneric(
+        square, np.ascontiguousarray(rays[:, :2] / rays[:, 2:] * [1.0, -1.0]), np.eye(3), None,
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )  # fmt: skip
+    mirror, back = np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
+    rotation = mirror[:, None] * np.stack([cv2.Rodrigues(turn)[0] for turn in turns]) * back
+    poses = pose_matrix(rotation, mirror * np.stack([place.ravel() for place in places]))
+    if count == 1:
+        poses = np.concatenate([poses, poses])
+    pixels, _, _ = project(square[None], np.asarray(intrinsics, np.float64), poses)
+    error = np.sqrt(((pixels - corners) ** 2).sum(-1).mean(-1))
+    order = np.argsort(error, kind="stable")
+    fit = SquarePose(poses[order], error[order])
+    if fit.ambiguity <= config.ambiguous:
+        return fit
+    up = np.asarray(camera_from_ego, np.float64)[:3, 2]
+    toward = -fit.camera_from_marker[:, :3, 3]
+    toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    lean = np.arccos(np.clip(fit.camera_from_marker[:, :3, 1] @ up, -1.0, 1.0))
+    turned = np.arccos(np.clip((fit.camera_from_marker[:, :3, 2] * toward).sum(-1), -1.0, 1.0))
+    worse = (fit.error + _EXACT) / (fit.error.min() + _EXACT)
+    cost = (lean / config.tilt) ** 2 + (turned / config.turn) ** 2 + worse**2
+    order = np.argsort(cost, kind="stable")
+    return SquarePose(fit.camera_from_marker[order], fit.error[order])
+
+
+def detection_score(corners: Float[np.ndarray, "4 2"], wrong_bits: int, error: float, family: MarkerFamily) -> float:
+    """Return how far a detection may be trusted, 0 to 1: the product of three factors.
+
+    - bits: 1 - h / (c + 1), at least 0; h wrong cells, of which c can be corrected in this family,
+    - size: 1 - exp(-p / 2); p mean side of a cell in pixels,
+    - fit: exp(-e^2 / 2); e reprojection error in pixels.
+
+    Args:
+        corners: of the black square, pixels.
+        wrong_bits: cells that were read wrong.
+        error: reprojection error of the pose, pixels.
+        family: of the marker.
+    """
+    side = np.linalg.norm(corners - np.roll(corners, 1, 0), axis=-1).mean()
+    bits = max(0.0, 1.0 - wrong_bits / (correctable_bits(family) + 1.0))
+    size = 1.0 - np.exp(-side / cells_across(family) / _CELL)
+    return float(bits * size * np.exp(-0.5 * (error / _ERROR) ** 2))
+
+
+def marker_outline(
+    pose: Float[np.ndarray, "4 4"], size: float, intrinsics: Float[np.ndarray, "3 3"],
+    camera_from_ego: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "4 2"]:  # fmt: skip
+    """Return the pixels of a marker's corners, in the order of `ImageMarkers`; what lies behind the camera is zeros.
+
+    Args:
+        pose: ego_from_marker.
+        size: side of the black square, metres.
+        intrinsics, camera_from_ego: of the camera.
+    """
+    return project(transform_points(pose, 0.5 * size * _SQUARE), intrinsics, camera_from_ego)[0]

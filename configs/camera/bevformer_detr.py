@@ -21,5 +21,6 @@ def get_config() -> RunConfig:
     host = toponet.task.model
     assert isinstance(toponet.task, LaneGraphTask)
     assert isinstance(host, TopoNetConfig)
-    model = BevFormerDetrConfig(host.encoder, replace(host.decoder, refine="fixed"), host.elements)
+    decoder = replace(host.decoder, refine="fixed")
+    model = BevFormerDetrConfig(host.encoder, decoder, host.elements, denoising=host.denoising)
     return replace(toponet, task=replace(toponet.task, model=model))

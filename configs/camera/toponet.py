@@ -15,6 +15,7 @@ from tflane_jax.models.bev_encoder import SMALL_BEVFORMER
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.image_encoder import ImageEncoderConfig
+from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
@@ -41,7 +42,8 @@ def get_config() -> RunConfig:
     """Return the small camera model."""
     return RunConfig(
         task=LaneGraphTask(
-            TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS), LaneGraphLossConfig(successor_weight=20.0)
+            TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS, denoising=DenoisingConfig()),
+            LaneGraphLossConfig(successor_weight=20.0),
         ),
         data=WorldData(train=600, val=20, test=75, example=ExampleConfig(range=TRUTH, sensor=None, cameras=RIG)),
         optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),

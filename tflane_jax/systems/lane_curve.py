@@ -119,10 +119,10 @@ class LaneCurveSystem:
 
         dataset = open_images(config.data.source("val"))  # pyright: ignore[reportArgumentType]
         indices = spread(len(dataset), config.evaluation.pictures)
-        examples = stack_examples([dataset.example(index) for index in indices])
+        examples = stack_examples([dataset.example(index) for index in indices]) if indices else None
 
         def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
-            if indices:
+            if examples is not None:
                 answer = predict(config.task, params, examples)
                 save_road_images(folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": answer})
 

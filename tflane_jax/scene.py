@@ -203,6 +203,18 @@ class MarkerObservations:
     successor: Bool[Array, "m j j"]
     valid: Bool[Array, " m"]
 
+    @classmethod
+    def empty(cls, capacity: int, lanes: int, points: int) -> MarkerObservations:
+        """Return room for `capacity` markers of `lanes` lanes each, and none valid."""
+        return cls(
+            marker_id=np.zeros(capacity, np.int32),
+            pose=np.tile(np.eye(4, dtype=np.float32), (capacity, 1, 1)),
+            score=np.zeros(capacity, np.float32), residual=np.zeros(capacity, np.float32),
+            lanes=np.zeros((capacity, lanes, points, 3), np.float32),
+            lane_valid=np.zeros((capacity, lanes), bool), successor=np.zeros((capacity, lanes, lanes), bool),
+            valid=np.zeros(capacity, bool),
+        )  # fmt: skip
+
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""
         m, j, p = self.lanes.shape[:3]

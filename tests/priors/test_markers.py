@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tflane_jax.priors.markers import MarkerPriorConfig, confidence, select_marker_lanes, stride
 from tflane_jax.scene import MarkerObservations
 
-CONFIG = MarkerPriorConfig(points=3)
+CONFIG = MarkerPriorConfig(points=3, lanes=7)
 
 
 def observations(markers=2, lanes=3, points=5, seed=0, valid=(True, True), garbage=0.0):
@@ -48,26 +48,41 @@ def test_farther_or_less_steady_is_trusted_less(distance, residual, more, shake)
     assert 0 < here <= 1
 
 
-def test_lanes_are_thinned_and_keep_their_ends():
+def expected_lanes(markers):
+    """Return (trust, marker, lane) of every valid lane, the most trusted first."""
+    trust = np.exp(-np.hypot(*markers.pose[:, :2, 3].T) / 40 - markers.residual / 10)
+    rows = [(trust[m], m, j) for m in range(len(trust)) for j in np.flatnonzero(markers.lane_valid[m])]
+    return sorted(rows, key=lambda row: -row[0])
+
+
+def test_lanes_are_thinned_keep_their_ends_and_come_in_order_of_trust():
     markers = observations()
-    lanes = select_marker_lanes(markers, CONFIG)
+    lanes, expected = select_marker_lanes(markers, CONFIG), expected_lanes(markers)
     np.testing.assert_array_equal(stride(5, 3), [0, 2, 4])
-    for row in np.flatnonzero(lanes.valid):
-        m, j = divmod(int(row), 3)
+    np.testing.assert_array_equal(np.flatnonzero(lanes.valid), np.arange(len(expected)))
+    assert 2 < len(expected) < 7
+    for row, (trust, m, j) in enumerate(expected):
         np.testing.assert_array_equal(lanes.points[row], markers.lanes[m, j, ::2, :2])
-        expected = np.exp(-np.hypot(*markers.pose[m, :2, 3]) / 40 - markers.residual[m] / 10)
-        np.testing.assert_allclose(lanes.confidence[row], expected, rtol=1e-5)
-    np.testing.assert_allclose(lanes.frame_confidence, lanes.confidence.max())
+        np.testing.assert_allclose(lanes.confidence[row], trust, rtol=1e-5)
+    np.testing.assert_allclose(lanes.frame_confidence, expected[0][0], rtol=1e-5)
 
 
-def test_lanes_of_different_markers_are_not_connected():
-    markers = observations(seed=3).replace(successor=np.ones((2, 3, 3), bool), lane_valid=np.ones((2, 3), bool))
+def test_without_room_the_least_trusted_are_left_out():
+    markers = observations()
+    many, few = (select_marker_lanes(markers, MarkerPriorConfig(3, lanes=count)) for count in (7, 2))
+    for name in ("points", "confidence", "valid"):
+        np.testing.assert_array_equal(getattr(many, name)[:2], getattr(few, name))
+    np.testing.assert_array_equal(many.successor[:2, :2], few.successor)
+
+
+def test_edges_stay_within_their_marker():
+    markers = observations(seed=3).replace(lane_valid=np.ones((2, 3), bool))
     edges = select_marker_lanes(markers, CONFIG).successor
-    np.testing.assert_array_equal(edges, np.kron(np.eye(2), np.ones((3, 3))).astype(bool))
-    own = observations(seed=4).replace(lane_valid=np.ones((2, 3), bool))
-    edges = select_marker_lanes(own, CONFIG).successor
-    np.testing.assert_array_equal(edges[:3, :3], own.successor[0])
-    np.testing.assert_array_equal(edges[3:, 3:], own.successor[1])
+    names = [(m, j) for _, m, j in expected_lanes(markers)]
+    for a, (m, i) in enumerate(names):
+        for b, (n, j) in enumerate(names):
+            assert edges[a, b] == (m == n and markers.successor[m, i, j])
+    assert not edges[6:].any()
 
 
 @pytest.mark.parametrize("valid", [(True, False), (False, False)])
@@ -83,14 +98,15 @@ def test_padding_may_hold_nan_and_numpy_equals_jax(valid):
 @pytest.mark.parametrize("sizes", [(0, 3), (2, 0), (1, 1)])
 def test_no_markers_and_no_lanes(sizes):
     lanes = select_marker_lanes(observations(*sizes), CONFIG)
-    assert lanes.points.shape == (sizes[0] * sizes[1], 3, 2)
+    assert lanes.points.shape == (7, 3, 2)
+    assert not lanes.valid[sizes[0] * sizes[1] :].any()
     assert lanes.frame_confidence >= 0
 
 
 def test_the_raw_score_counts_where_it_is_asked_for():
-    markers = observations()
+    markers = observations(markers=1)
     plain, scored = (select_marker_lanes(markers, MarkerPriorConfig(3, use_score=use)) for use in (False, True))
-    np.testing.assert_allclose(scored.confidence, plain.confidence * np.repeat(markers.score, 3), rtol=1e-6)
+    np.testing.assert_allclose(scored.confidence, plain.confidence * markers.score, rtol=1e-6)
 
 
 def test_too_few_points_are_refused():

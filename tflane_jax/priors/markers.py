@@ -22,12 +22,14 @@ class MarkerPriorConfig:
 
     Attributes:
         points: K, points of a polyline (paper: 11).
+        lanes: L, lanes of all markers of a frame; those of the most trusted markers, where there are more.
         distance_scale: tau_d of Eq. (2), metres.
         residual_scale: tau_r of Eq. (2), metres.
         use_score: multiply the confidence by the detector's raw score, which the paper mentions as a supplement.
     """
 
     points: int = 11
+    lanes: int = 32
     distance_scale: float = 40.0
     residual_scale: float = 10.0
     use_score: bool = False
@@ -64,7 +66,7 @@ def confidence(
 
 
 def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) -> MarkerLanes:
-    """Return the lanes of one frame's markers; padding may hold anything.
+    """Return the lanes of one frame's markers, the most trusted first; padding may hold anything.
 
     Raises ValueError where the lanes have fewer points than the config asks for.
     """
@@ -82,12 +84,16 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     flat = markers.lanes[..., :2].reshape(count * lanes, points, 2)[:, stride(points, config.points)]
     same = np.repeat(np.eye(count, dtype=bool), lanes, 0).repeat(lanes, 1)
     edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
-    edges = edges.reshape(count * lanes, count * lanes)
+    edges = edges.reshape(count * lanes, count * lanes) & same & valid[:, None] & valid[None, :]
+    trust = xp.where(valid, xp.repeat(trust, lanes), 0.0)
+    # Stable, so that lanes of one marker keep their order; padding goes last.
+    order = xp.argsort(xp.where(valid, -trust, xp.inf), stable=True)[: config.lanes]
+    missing = config.lanes - len(order)
     return MarkerLanes(
-        points=xp.where(valid[:, None, None], flat, 0.0),
-        confidence=xp.where(valid, xp.repeat(trust, lanes), 0.0),
-        successor=edges & same & valid[:, None] & valid[None, :],
-        valid=valid,
+        points=xp.pad(xp.where(valid[:, None, None], flat, 0.0)[order], ((0, missing), (0, 0), (0, 0))),
+        confidence=xp.pad(trust[order], (0, missing)),
+        successor=xp.pad(edges[order][:, order], ((0, missing), (0, missing))),
+        valid=xp.pad(valid[order], (0, missing)),
     )
 
 

@@ -1,0 +1,207 @@
+"""Confidence-gated marker fusion (Wu and Hu): from the lanes that markers name to guided BEV features.
+
+Lanes of a frame's markers -> memory (`priors.marker_memory`) -> one token for each lane (III-A) -> in every layer of
+the BEV encoder, behind the cameras, attention of the BEV features to the tokens, gated by the confidence (III-B).
+
+A frame without guidance leaves the BEV features exactly as they are, so that a model that never sees a marker is the
+model without markers; Eq. (3) alone would normalise them once more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.graph import Mlp
+from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
+from tflane_jax.priors.marker_memory import (
+    MarkerGuidance,
+    MarkerMemory,
+    MarkerMemoryConfig,
+    guidance,
+    remember,
+)
+from tflane_jax.priors.markers import MarkerPriorConfig, select_marker_lanes
+from tflane_jax.scene import Example, MarkerObservations
+
+
+@dataclass(frozen=True)
+class MarkerFusionConfig:
+    """The module; the defaults are the paper's, `SMALL_MARKER_FUSION` trains on two CPU cores.
+
+    Attributes:
+        prior: confidence and polylines.
+        memory: temporal memory, None for the ablation without (Table III).
+        encoding: of a polyline (Table IV): "sine" is the transformer on Eq. (1), "transformer" the same on raw
+            coordinates, "mlp" a perceptron on all raw coordinates of a line.
+        lines: sizes of the transformer; `dim` is that of a token.
+        fusion: "gated" is Eq. (3); "uniform" sets its c to one, "hard" to one from `hard_threshold` on and to nothing
+            below (Table II).
+        hard_threshold: confidence from which on "hard" trusts a marker.
+        heads: of the attention to the tokens.
+        query_position: add their positions to the BEV features where they look at the tokens. Eq. (3) writes none;
+            SMERF does, and BEV features of a convolution do not know where they are.
+        connectivity: let lanes know their successors and predecessors (the paper's future work).
+        range: the box that coordinates are normalised by.
+    """
+
+    prior: MarkerPriorConfig = MarkerPriorConfig()
+    memory: MarkerMemoryConfig | None = MarkerMemoryConfig()
+    encoding: Literal["sine", "transformer", "mlp"] = "sine"
+    lines: PolylineEncoderConfig = MARKER_POLYLINES
+    fusion: Literal["gated", "uniform", "hard"] = "gated"
+    hard_threshold: float = 0.5
+    heads: int = 4
+    query_position: bool = True
+    connectivity: bool = False
+    range: PerceptionRange = BevGrid().range
+
+
+SMALL_MARKER_FUSION = MarkerFusionConfig(
+    lines=PolylineEncoderConfig(
+        dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
+    )
+)
+
+
+class MarkerTokens(nn.Module):
+    """Polylines to one token each (III-A), and on request what they know of their neighbours."""
+
+    config: MarkerFusionConfig
+
+    @nn.compact
+    def __call__(self, guide: MarkerGuidance, *, deterministic: bool = True) -> Float[Array, "n c"]:
+        """Return the tokens, scaled by their weights (Eq. 4); 0 where not valid."""
+        config, valid = self.config, guide.valid
+        points = jnp.where(valid[:, None, None], config.range.normalise(guide.points), 0.0)
+        count = points.shape[1]
+        if config.encoding == "sine":
+            nothing = jnp.zeros((len(points), 0))
+            x = PolylineEncoder(config.lines, name="lines")(points, nothing, valid, deterministic=deterministic)
+        elif config.encoding == "transformer":
+            x = RawTransformer(config.lines, name="lines")(points, deterministic=deterministic)
+        else:
+            x = Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2))
+        x = jnp.where(valid[:, None], x, 0.0)
+        if config.connectivity:
+            x = jnp.where(valid[:, None], LaneNeighbours(config.lines.dim, name="neighbours")(x, guide.successor), 0.0)
+        return x * guide.weight[:, None]  # Eq. (4)
+
+
+class RawTransformer(nn.Module):
+    """The transformer of III-A on raw coordinates (Table IV, "Transformer")."""
+
+    config: PolylineEncoderConfig
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "n k 2"], *, deterministic: bool) -> Float[Array, "n c"]:
+        """Return one token for each line."""
+        config, (lines, count) = self.config, points.shape[:2]
+        x = nn.Dense(config.dim, name="embed")(points)
+        sizes = TransformerConfig(config.heads, config.hidden, config.dropout)
+        for i in range(config.layers):
+            over_lines = nn.vmap(
+                lambda layer, x: layer(x, jnp.zeros_like(x), deterministic=deterministic),
+                variable_axes={"params": None, "intermediates": 0},
+                split_rngs={"params": False, "dropout": True}, in_axes=0,
+            )  # fmt: skip
+            x = over_lines(EncoderLayer(sizes, name=f"layer_{i}"), x)
+        return nn.Dense(config.dim, name="out")(x.reshape(lines, count * config.dim))
+
+
+class LaneNeighbours(nn.Module):
+    """One round of messages along the directed connectivity of a marker's lanes."""
+
+    dim: int
+
+    @nn.compact
+    def __call__(self, tokens: Float[Array, "n c"], successor: Bool[Array, "t l l"]) -> Float[Array, "n c"]:
+        """Return tokens that know the mean of their successors and of their predecessors."""
+        slots, lanes = successor.shape[:2]
+        x = tokens.reshape(slots, lanes, -1)
+        out = x
+        for name, edges in (("successors", successor), ("predecessors", successor.swapaxes(1, 2))):
+            weight = edges.astype(x.dtype)
+            mean = jnp.einsum("tij,tjc->tic", weight, x) / jnp.maximum(weight.sum(-1, keepdims=True), 1.0)
+            out = out + nn.Dense(self.dim, use_bias=False, name=name)(mean)
+        return out.reshape(tokens.shape)
+
+
+class MarkerFusion(nn.Module):
+    """Eq. (3) in one layer of the BEV encoder."""
+
+    config: MarkerFusionConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        bev: Float[Array, "q c"],
+        position: Float[Array, "q c"],
+        tokens: Float[Array, "n d"],
+        valid: Bool[Array, " n"],
+        gate: Float[Array, ""],
+    ) -> Float[Array, "q c"]:
+        """Return the BEV features after the fusion; exactly those that came in where no token is valid.
+
+        Args:
+            bev, position: features of the cells, and of where they are.
+            tokens: of all lanes that guide.
+            valid: of the tokens.
+            gate: c of Eq. (3), as `fusion_gate` gives it.
+        """
+        query = bev + position if self.config.query_position else bev
+        attention = MultiHeadAttention(bev.shape[-1], self.config.heads, name="attention")
+        found = attention(query, tokens, tokens, key_mask(valid))
+        fused = nn.LayerNorm(epsilon=1e-5, name="norm")(bev + gate * found)  # Eq. (3)
+        return jnp.where(valid.any(), fused, bev)
+
+
+def fusion_gate(
+    guide: MarkerGuidance, config: MarkerFusionConfig
+) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
+    """Return c of Eq. (3) and the tokens that are looked at, for the variant of Table II."""
+    if config.fusion == "gated":
+        return guide.gate, guide.valid
+    one = jnp.ones_like(guide.gate)
+    if config.fusion == "uniform":
+        return one, guide.valid
+    return one, guide.valid & (guide.gate >= config.hard_threshold)
+
+
+def guide_frame(
+    example: Example, memory: MarkerMemory | None, config: MarkerFusionConfig
+) -> tuple[MarkerGuidance, MarkerMemory | None]:
+    """Return what guides this frame, and the memory for the next.
+
+    Args:
+        example: one frame; data that know no markers are data in which none is seen.
+        memory: of the frame before; None is a frame on its own, and stays None.
+        config: see there.
+    """
+    markers = example.markers
+    if markers is None:
+        markers = MarkerObservations.empty(1, 1, config.prior.points)
+    observed = jax.tree.map(jnp.asarray, select_marker_lanes(markers, config.prior))
+    if memory is None or config.memory is None:
+        exponent = 1.0 if config.memory is None else config.memory.exponent
+        return guidance(observed, exponent), memory
+    bank, guide = remember(
+        memory, observed, jnp.asarray(example.previous_from_ego), jnp.asarray(example.has_previous), config.memory
+    )
+    return guide, bank
+
+
+def empty_marker_memory(config: MarkerFusionConfig) -> MarkerMemory | None:
+    """Return the memory before the first frame; None for a model without memory."""
+    if config.memory is None:
+        return None
+    return MarkerMemory.empty(config.memory.frames, config.prior.lanes, config.prior.points)

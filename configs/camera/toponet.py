@@ -49,3 +49,9 @@ def get_config() -> RunConfig:
         optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=3000, batch_size=4, eval_every=1000, checkpoint_every=500),
     )
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the model without denoising queries."""
+    config = get_config()
+    return {"plain": replace(config, task=replace(config.task, model=replace(config.task.model, denoising=None)))}

@@ -1,12 +1,16 @@
 """TopoNet's lane branch on the built-in world, at a size for two cores: the vision-only baseline.
 
     tflane train --config configs/tf_lane/toponet.py
+    tflane train --config configs/tf_lane/toponet.py:denoising --training.steps 2500
 
 Ten minutes on one core. Test split, five seeds: all/DET_l 9.4 +- 1.9 percent, occluded/DET_l 9.3 +- 1.8 (README).
 """
 
+from dataclasses import replace
+
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
@@ -24,3 +28,11 @@ def get_config() -> RunConfig:
         optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),
     )
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return faster ways to train, none of them from the papers (docs/cameras.md, "Small models")."""
+    plain = get_config()
+    model = replace(plain.task.model, denoising=DenoisingConfig())
+    muon = replace(plain, optim=replace(plain.optim, lr=2e-3, matrices="muon"))
+    return {"muon": muon, "denoising": replace(muon, task=replace(plain.task, model=model))}

@@ -74,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
     _summary(commands)
     _compare(commands)
     _score(commands)
+    _markers(commands)
     _demo(commands)
     _bench(commands)
     return parser
@@ -246,6 +247,42 @@ def _score(commands) -> None:
                         help="95 percent intervals from N draws of whole scenes (some 200 are enough)")  # fmt: skip
     parser.add_argument("--out", metavar="STEM", type=Path, default=Path("score"),
                         help="write STEM.md and STEM.json (default score)")  # fmt: skip
+
+
+def _markers(commands) -> None:
+    parser = commands.add_parser("markers", help="find fiducial markers", description="Fiducial markers.")
+    inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    detect = _command(inner, "detect", "find markers in photos of a calibrated camera", module="markers",
+                      function="find")  # fmt: skip
+    detect.add_argument("images", metavar="IMAGES", nargs="+", type=Path, help="photos, or folders of photos")
+    detect.add_argument("--intrinsics", metavar=("FX", "FY", "CX", "CY"), nargs=4, type=float, required=True,
+                        help="focal lengths and principal point, pixels from the image's corner")  # fmt: skip
+    detect.add_argument("--distortion", metavar="K", nargs="+", type=float,
+                        help="of the lens: OpenCV's K1 K2 P1 P2 [K3 [K4 K5 K6]]; default none")  # fmt: skip
+    detect.add_argument("--size", type=float, default=1.0, help="side of the black square, metres (default 1)")
+    detect.add_argument("--height", type=float, default=1.5, help="of the camera above ground, metres (default 1.5)")
+    detect.add_argument("--pitch", type=float, default=0.0, help="of the camera, downwards, degrees (default 0)")
+    detect.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/markers"), help="default runs/markers")
+    curves = _command(inner, "curves", "measure how detection and pose get worse with distance, in the built-in world",
+                      module="markers", function="curves")  # fmt: skip
+    curves.add_argument("--distances", type=float, nargs="+", default=[5.0 * n for n in range(1, 13)],
+                        help="metres (default 5 to 60)")  # fmt: skip
+    curves.add_argument("--scales", type=float, nargs="+", default=[1.0, 0.5],
+                        help="sizes of the images, 1 is native (default 1 0.5)")  # fmt: skip
+    curves.add_argument("--seeds", type=int, default=8, help="scenes, with three boards each (default 8)")
+    curves.add_argument("--severity", type=float, default=0.5, help="of weather and camera, 0 to 1 (default 0.5)")
+    curves.add_argument("--sigma-d", type=float, default=40.0,
+                        help="of the paper's detection curve in the picture, metres (default 40)")  # fmt: skip
+    curves.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    for command, many in ((detect, False), (curves, True)):
+        command.add_argument("--family", default="ARUCO_5X5_100", help="of the markers (default ARUCO_5X5_100)")
+        command.add_argument("--enlarge", type=int, default=1, help="search images so many times larger (default 1)")
+        ways = ("pattern", "subpixel", "none")
+        if many:
+            command.add_argument("--corners", choices=ways, nargs="+", default=["pattern", "subpixel"],
+                                 help="how corners are found (default pattern subpixel)")  # fmt: skip
+        else:
+            command.add_argument("--corners", choices=ways, default="pattern", help="how corners are found")
 
 
 def _demo(commands) -> None:

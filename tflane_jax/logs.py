@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tflane_jax.markers.patterns import MarkerFamily
+
 
 @dataclass(frozen=True)
 class LaneSegment:
@@ -126,11 +128,13 @@ class PlacedMarkers:
         marker_id: (M,) int32, unique within a log.
         pose: (M, 4, 4) float64 global_from_marker, metres.
         size: side of the black square, metres.
+        family: dictionary of the printed patterns.
     """
 
     marker_id: np.ndarray
     pose: np.ndarray
     size: float = 1.0
+    family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
 
 
 @dataclass(frozen=True)

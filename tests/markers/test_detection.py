@@ -277,3 +277,14 @@ def test_outline_is_upper_left_first():
 def test_settings_that_mean_nothing_are_refused(change):
     with pytest.raises(UserError, match=next(iter(change))):
         find_markers(np.zeros((60, 60), np.uint8), DetectorConfig(**change))
+
+
+@pytest.mark.parametrize("x", [4.0, 15.0, 39.7])
+def test_a_marker_straight_before_the_camera_has_a_pose(x):
+    """Seen exactly from the front, where OpenCV's solution is not a number."""
+    truth = pose(x, 0.0, 1.5)
+    corners = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
+    fit = solve_square(corners, AHEAD.intrinsics, AHEAD.camera_from_ego)
+    for solution in invert_pose(AHEAD.camera_from_ego) @ fit.camera_from_marker:
+        assert degrees_between(solution, truth) < 0.2
+    assert fit.error.max() < 1e-3

@@ -1,6 +1,6 @@
 """Markers in the world's images: where geometry puts them, as dark as their area, behind what hides them."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +8,8 @@ import pytest
 from tests.world.camera_scene import FRONT, scene, street
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import project
+from tflane_jax.logs import PlacedMarkers
+from tflane_jax.markers.detection import DetectorConfig, detect
 from tflane_jax.markers.patterns import MarkerFamily, board_cells, board_size, marker_cells
 from tflane_jax.world.camera_markers import marker_bodies
 from tflane_jax.world.camera_pictures import paint_picture
@@ -36,7 +38,7 @@ def pose(x, y, z, turn=0.0):
 
 def markers(*poses, ids=None, size=1.0):
     ids = np.arange(len(poses)) if ids is None else np.array(ids)
-    return SimpleNamespace(marker_id=ids, pose=np.array(poses).reshape(-1, 4, 4), size=size)
+    return PlacedMarkers(ids, np.array(poses).reshape(-1, 4, 4), size)
 
 
 def drawn(*bodies, tone=120):
@@ -172,3 +174,26 @@ def test_a_window_is_a_part_of_the_image():
     assert np.ptp(part) > 60
     with pytest.raises(UserError, match="window"):
         render_window(log, 0, FRONT, (600, 0), (140, 90))
+
+
+def test_a_marker_of_the_log_is_drawn_and_found_and_none_change_nothing():
+    plain = scene(street())
+    ego = plain.keyframes[0].global_from_ego
+    local = pose(11.0, -1.8, 2.6, 0.3)
+    bare = render_cameras(plain, 0, FRONT)
+    empty = render_cameras(replace(plain, markers=markers()), 0, FRONT)
+    assert empty.image.tobytes() == bare.image.tobytes()
+    for family in (FAMILY, MarkerFamily.APRILTAG_36H11):
+        placed = PlacedMarkers(np.array([17]), (ego @ local)[None], 1.0, family)
+        views = render_cameras(replace(plain, markers=placed), 0, FRONT)
+        found = detect(views, DetectorConfig(family))
+        assert found.marker_id[found.valid].tolist() == [17]
+        np.testing.assert_allclose(found.pose[0], local, atol=0.05)
+        changed = (views.image != bare.image).any((0, 3))
+        rows, columns = np.nonzero(changed)
+        assert 0 < changed.mean() < 0.1
+        assert columns.min() > 0.5 * FRONT.size(FRONT.cameras[0])[0]
+        assert rows.min() > 0
+    hidden = scene(street(), [(8.5, -1.4, 2.0, 1.9, 3.6)])
+    views = render_cameras(replace(hidden, markers=placed), 0, FRONT)
+    assert not detect(views, DetectorConfig(family)).valid.any()

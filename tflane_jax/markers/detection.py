@@ -25,6 +25,10 @@ _SQUARE = np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, 
 _EXACT = 1e-3
 # Score: pixels of a cell's side and error of the fit (pixels) at which their factors fall to 1 - 1/e and exp(-1/2).
 _CELL, _ERROR = 2.0, 1.0
+# Widths of the windows of OpenCV's thresholds, pixels: its defaults.
+_WINDOWS = (3, 13, 23)
+# Moves the corners by less than a ten-thousandth of a pixel.
+_NUDGE = 3e-8 * np.array([(1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-1.0, 1.0)])
 # Refinement: standard deviation of the blur of lens and pixels, pixels; most steps; how far a corner may move,
 # cells.
 _SPREAD, _STEPS, _REACH = 0.8, 12, 0.6
@@ -69,7 +73,7 @@ class DetectorConfig:
 
 
 class ImageMarkers(NamedTuple):
-    """K markers found in one image.
+    """K markers found in one image, ids ascending and each once.
 
     Attributes:
         marker_id: (K,).
@@ -143,6 +147,8 @@ def detect(views: CameraViews, config: DetectorConfig = DetectorConfig()) -> Det
         found = find_markers(np.asarray(views.image[number])[:height, :width], config)
         for marker_id, corners, wrong in zip(found.marker_id.tolist(), found.corners, found.wrong_bits, strict=True):
             fit = solve_square(corners, intrinsics, camera_from_ego, config)
+            if not np.isfinite(fit.error[0]):
+                continue
             score = detection_score(corners, int(wrong), float(fit.error[0]), config.family)
             if marker_id not in rows or score > rows[marker_id][0]:
                 pose = invert_pose(camera_from_ego) @ fit.camera_from_marker[0]
@@ -160,7 +166,8 @@ def detect(views: CameraViews, config: DetectorConfig = DetectorConfig()) -> Det
 def find_markers(
     image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], config: DetectorConfig = DetectorConfig()
 ) -> ImageMarkers:
-    """Return the markers of the family in an image without lens distortion, RGB or grey.
+    """Return the markers of the family in an image without lens distortion, RGB or grey; of an id that is found twice,
+    the one whose cells are read best.
 
     Raises UserError without OpenCV or for a config that means nothing.
     """
@@ -171,43 +178,49 @@ def find_markers(
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else np.ascontiguousarray(image)
     if config.enlarge > 1:
         grey = cv2.resize(grey, None, fx=config.enlarge, fy=config.enlarge, interpolation=cv2.INTER_CUBIC)
-    outlines, ids, _ = _detector(cv2, max(grey.shape), config).detectMarkers(grey)
-    if ids is None or not len(ids):
-        return ImageMarkers(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros(0, int))
-    found = np.asarray(ids, int).ravel()
-    # OpenCV counts from the middle of the first pixel, we from its corner.
-    corners = np.asarray(outlines, np.float64).reshape(-1, 4, 2) + 0.5
-    if config.corners == "pattern":
-        pairs = zip(corners, found.tolist(), strict=True)
-        corners = np.stack([refine_corners(grey, square, marker_cells(config.family, i)) for square, i in pairs])
-    wrong = [_wrong_bits(cv2, grey, c, config.family, i) for c, i in zip(corners, found.tolist(), strict=True)]
-    return ImageMarkers(found, corners / config.enlarge, np.array(wrong, int))
+    # Before a bright sky the white margin looks as dark as the square at some widths of the threshold's window, and the
+    # outline is that of the board. OpenCV tries the outermost outline first; each width by itself, the best is kept.
+    best: dict[int, tuple[tuple[int, float], np.ndarray]] = {}
+    for width in _WINDOWS:
+        outlines, ids, _ = _detector(cv2, max(grey.shape), config, width).detectMarkers(grey)
+        # OpenCV counts from the middle of the first pixel, we from its corner.
+        squares = np.asarray(outlines, np.float64).reshape(-1, 4, 2) + 0.5
+        for marker_id, corners in zip([] if ids is None else np.ravel(ids).tolist(), squares, strict=True):
+            cells = marker_cells(config.family, marker_id)
+            if config.corners == "pattern":
+                corners = refine_corners(grey, corners, cells)
+            rank = _fit(cv2, grey, corners, cells)
+            if marker_id not in best or rank < best[marker_id][0]:
+                best[marker_id] = rank, corners
+    return ImageMarkers(
+        np.array(sorted(best), int),
+        np.array([best[marker_id][1] for marker_id in sorted(best)]).reshape(-1, 4, 2) / config.enlarge,
+        np.array([best[marker_id][0][0] for marker_id in sorted(best)], int),
+    )
 
 
-def _detector(cv2: Any, longest: int, config: DetectorConfig) -> Any:
+def _detector(cv2: Any, longest: int, config: DetectorConfig, window: int) -> Any:
     parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window
     parameters.minMarkerPerimeterRate = 4.0 * config.least_pixels * config.enlarge / longest
-    parameters.cornerRefinementMethod = {
-        "pattern": cv2.aruco.CORNER_REFINE_SUBPIX,
-        "subpixel": cv2.aruco.CORNER_REFINE_SUBPIX,
-        "none": cv2.aruco.CORNER_REFINE_NONE,
-    }[config.corners]
+    alone = config.corners == "none"
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE if alone else cv2.aruco.CORNER_REFINE_SUBPIX
     return cv2.aruco.ArucoDetector(dictionary_of(config.family), parameters)
 
 
-def _wrong_bits(
-    cv2: Any, grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], family: MarkerFamily, marker_id: int
-) -> int:
-    """Return how many cells look white that are black, or black that are white."""
-    cells = marker_cells(family, marker_id)
+def _fit(
+    cv2: Any, grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"]
+) -> tuple[int, float]:
+    """Return how many cells look white that are black, or black that are white, and less the contrast of the others,
+    0 to 255: the smaller, the better."""
     across, fine = len(cells), 8
     square = fine * across * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5
     flat = cv2.getPerspectiveTransform((corners - 0.5).astype(np.float32), square.astype(np.float32))
     seen = cv2.warpPerspective(grey, flat, (fine * across, fine * across), flags=cv2.INTER_LINEAR)
     # The middle of each cell: its edge mixes with its neighbours.
     middle = seen.reshape(across, fine, across, fine)[:, 2:6, :, 2:6].mean((1, 3))
-    between = 0.5 * (middle[cells].mean() + middle[~cells].mean())
-    return int(((middle > between) != cells).sum())
+    white, black = middle[cells].mean(), middle[~cells].mean()
+    return int(((middle > 0.5 * (white + black)) != cells).sum()), float(black - white)
 
 
 def refine_corners(
@@ -316,13 +329,14 @@ def solve_square(
     # A marker that faces the camera is turned by half a circle, where OpenCV's rotation vectors break down (always for
     # an upright marker before a level camera). Seen in a mirror, y turned round, it is hardly turned at all; its own z
     # is turned round as well, of which a flat square shows nothing.
-    count, turns, places, _ = cv2.solvePnPGeneric(
-        square, np.ascontiguousarray(rays[:, :2] / rays[:, 2:] * [1.0, -1.0]), np.eye(3), None,
-        flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )  # fmt: skip
+    seen = rays[:, :2] / rays[:, 2:] * [1.0, -1.0]
+    count, turns, places = _two_poses(cv2, square, seen)
+    if not np.isfinite(turns).all():
+        # Seen exactly from the front, one of them is the root of a number that rounding makes negative.
+        count, turns, places = _two_poses(cv2, square, seen + _NUDGE)
     mirror, back = np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
     rotation = mirror[:, None] * np.stack([cv2.Rodrigues(turn)[0] for turn in turns]) * back
-    poses = pose_matrix(rotation, mirror * np.stack([place.ravel() for place in places]))
+    poses = pose_matrix(rotation, mirror * places)
     if count == 1:
         poses = np.concatenate([poses, poses])
     pixels, _, _ = project(square[None], np.asarray(intrinsics, np.float64), poses)
@@ -340,6 +354,16 @@ def solve_square(
     cost = (lean / config.tilt) ** 2 + (turned / config.turn) ** 2 + worse**2
     order = np.argsort(cost, kind="stable")
     return SquarePose(fit.camera_from_marker[order], fit.error[order])
+
+
+def _two_poses(
+    cv2: Any, square: Float[np.ndarray, "4 3"], seen: Float[np.ndarray, "4 2"]
+) -> tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Return how many poses there are, their rotation vectors, and their places."""
+    count, turns, places, _ = cv2.solvePnPGeneric(
+        square, np.ascontiguousarray(seen), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    return count, np.reshape(turns, (-1, 3)), np.reshape(places, (-1, 3))
 
 
 def detection_score(corners: Float[np.ndarray, "4 2"], wrong_bits: int, error: float, family: MarkerFamily) -> float:

@@ -6,18 +6,17 @@ Where a marker stands, and its frame, is as `tflane_jax.markers` says: `global_f
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from tflane_jax.errors import UserError
+from tflane_jax.logs import PlacedMarkers
 from tflane_jax.markers.patterns import MarkerFamily, board_cells, board_size
 from tflane_jax.world.camera_solids import Bodies, Box, pack
 from tflane_jax.world.front_view_polygons import Solid
 from tflane_jax.world.solid_shapes import Colour, box
 
-DEFAULT_FAMILY = MarkerFamily.ARUCO_5X5_100
 # The board's thickness and the side of its square post, metres.
 _THICK, _POST = 0.03, 0.1
 _BACK: Colour = (0.55, 0.56, 0.57)
@@ -26,25 +25,11 @@ _WHITE: Colour = (0.93, 0.93, 0.93)
 _LEAVES = 0.22
 
 
-class StandingMarkers(Protocol):
-    """M markers in the world, as `logs.PlacedMarkers`: ids, global_from_marker, side of the black squares in metres."""
-
-    @property
-    def marker_id(self) -> Int[np.ndarray, " m"]: ...
-    @property
-    def pose(self) -> Float[np.ndarray, "m 4 4"]: ...
-    @property
-    def size(self) -> float: ...
-
-
-def marker_bodies(
-    markers: StandingMarkers | None, family: MarkerFamily = DEFAULT_FAMILY, covered: float = 0.0
-) -> Bodies:
+def marker_bodies(markers: PlacedMarkers | None, covered: float = 0.0) -> Bodies:
     """Return a board and a post for each marker, global frame; none for None.
 
     Args:
         markers: where they stand; the ground is at z = 0, and a board that hangs lower than its post is thick has none.
-        family: of the patterns.
         covered: share of each board that leaves hide, from its right edge on, 0 to 1.
 
     Raises UserError for a share outside 0 to 1, a size that is not positive, or ids that the family does not have.
@@ -58,11 +43,11 @@ def marker_bodies(
     solids: list[Solid] = []
     boxes: list[Box] = []
     pictures: dict[int, np.ndarray] = {}
-    half = 0.5 * board_size(family, float(markers.size))
+    half = 0.5 * board_size(markers.family, float(markers.size))
     faces = 0
     for marker_id, pose in zip(np.asarray(markers.marker_id).tolist(), np.asarray(markers.pose), strict=True):
         board, outline = _board(pose, half)
-        pictures[faces] = _picture(family, marker_id, covered)
+        pictures[faces] = _picture(markers.family, marker_id, covered)
         post = Solid()
         foot, top = pose[:3, 3] - (_THICK + 0.5 * _POST) * pose[:3, 2], float(pose[2, 3] + 0.4 * half)
         heading = float(np.arctan2(pose[1, 2], pose[0, 2]))

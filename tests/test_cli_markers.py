@@ -1,0 +1,63 @@
+"""`tflane markers`, from the command line to the files that it writes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.markers.test_detection import AHEAD, photo, pose
+from tflane_jax.cli import main
+
+cv2 = pytest.importorskip("cv2")
+
+INTRINSICS = ["--intrinsics", "900", "900", "480", "270"]
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name, places in (("a", {12: pose(9.0, -0.5, 2.0, 15.0)}), ("b", {})):
+        cv2.imwrite(str(folder / f"{name}.png"), photo(AHEAD, places)[..., ::-1])
+    return folder
+
+
+def test_detect_writes_poses_and_pictures(photos, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["markers", "detect", str(photos), *INTRINSICS, "--out", str(out)]) == 0
+    written = json.loads((out / "detections.json").read_text())
+    first, second = written["photos"]
+    assert second["markers"] == []
+    (marker,) = first["markers"]
+    assert marker["id"] == 12
+    np.testing.assert_allclose(marker["position"], [9.0, -0.5, 2.0], atol=0.03)
+    np.testing.assert_allclose(marker["pose"], pose(9.0, -0.5, 2.0, 15.0), atol=0.03)
+    assert marker["turn"] == pytest.approx(15.0, abs=1.0)
+    table = capsys.readouterr().out
+    assert "a.png" in table
+    assert "12" in table
+    picture, plain = cv2.imread(str(out / first["picture"])), cv2.imread(str(photos / "a.png"))
+    changed = (picture != plain).any(-1)
+    assert 100 < changed.sum() < 0.2 * changed.size
+    assert (cv2.imread(str(out / second["picture"])) == cv2.imread(str(photos / "b.png"))).all()
+
+
+def test_a_size_scales_the_distance(photos, tmp_path):
+    assert main(["markers", "detect", str(photos / "a.png"), *INTRINSICS, "--size", "0.5", "--out", str(tmp_path)]) == 0
+    (marker,) = json.loads((tmp_path / "detections.json").read_text())["photos"][0]["markers"]
+    assert marker["position"][0] == pytest.approx(4.5, abs=0.02)
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (["--family", "QR"], "ARUCO_5X5_100"), (["--size", "0"], "size"), (["--distortion", "0.1"], "--distortion"),
+    (["--intrinsics", "0", "900", "1", "1"], "--intrinsics"), (["--enlarge", "0"], "enlarge"),
+])  # fmt: skip
+def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):
+    assert main(["markers", "detect", str(photos), *INTRINSICS, *change, "--out", str(tmp_path / "out")]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_curves_refuse_what_means_nothing(tmp_path, capsys):
+    for change in (["--scales", "-1"], ["--seeds", "0"], ["--sigma-d", "0"]):
+        assert main(["markers", "curves", "--out", str(tmp_path), *change]) == 2
+        assert capsys.readouterr().err.startswith("tflane: ")

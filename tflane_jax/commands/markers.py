@@ -1,0 +1,164 @@
+"""`tflane markers detect` and `tflane markers curves`.
+
+detect: detections.json, and one picture for each photo with the outline and the axes of every marker in it (x red, y
+green, z blue):
+    {"family", "size", "photos": [{"file", "picture", "markers": [{"id", "score", "position", "distance", "turn",
+     "reprojection", "ambiguity", "pose"}, ...]}, ...]}
+    position and pose (ego_from_marker, 4 x 4) in the ego frame below the camera: x forward, y left, z up, metres.
+
+curves: curves-NAME.md and .json for each curve, and curves.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tflane_jax.commands.sources import make_folder
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.cameras import project
+from tflane_jax.images import list_photos, opencv, read_image
+from tflane_jax.markers.curves import CurveConfig, measure, save_error_curves, summarise
+from tflane_jax.markers.detection import DetectedMarkers, DetectorConfig, detect, marker_outline
+from tflane_jax.markers.patterns import MarkerFamily
+from tflane_jax.plots import format_table, save_table
+from tflane_jax.scene import CameraViews
+from tflane_jax.training.run_folder import write_json
+from tflane_jax.world.front_view_camera import camera_pose
+
+_AXES = np.array([(255, 40, 40), (40, 200, 40), (60, 90, 255)])
+_OUTLINE = (255, 210, 0)
+
+
+def find(options: argparse.Namespace) -> int:
+    """Find the markers in photos of one calibrated camera; print a table, write pictures and detections.json."""
+    photos = list_photos(options.images)
+    config = DetectorConfig(_family(options.family), options.size, corners=options.corners, enlarge=options.enlarge)
+    config.validate()
+    intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
+    make_folder(options.out)
+    rows, records = [], []
+    for number, path in enumerate(photos):
+        photo = _without_distortion(read_image(path), intrinsics, options.distortion)
+        found = detect(_views(photo, intrinsics, pose), config)
+        picture = f"{number:03d}-{path.stem}-markers.png"
+        _write_picture(options.out / picture, photo, found, config.size, intrinsics, pose)
+        here = [_record(found, k) for k in np.flatnonzero(found.valid).tolist()]
+        records.append({"file": str(path), "picture": picture, "markers": here})
+        # A pose is too long for a table.
+        shown = [{k: v for k, v in record.items() if k not in ("pose", "position")} for record in here]
+        places = [dict(zip("xyz", record["position"], strict=True)) for record in here]
+        rows += [{"photo": path.name} | a | b for a, b in zip(shown, places, strict=True)] or [{"photo": path.name}]
+    write_json(options.out / "detections.json", {"family": config.family.name, "size": config.size, "photos": records})
+    columns = ("photo", "id", "score", "distance", "x", "y", "z", "turn", "reprojection", "ambiguity")
+    full = [{column: row.get(column) for column in columns} for row in rows]
+    print(format_table(full, columns, title=f"{config.family.name}, {config.size:g} m; metres, degrees, pixels"))
+    print(f"\nwritten to {options.out}")
+    return 0
+
+
+def curves(options: argparse.Namespace) -> int:
+    """Measure how rate and pose get worse with distance; write tables and a picture."""
+    if min(options.scales) <= 0.0:
+        raise UserError(f"--scales are positive shares of the native image, not {min(options.scales):g}")
+    if not options.sigma_d > 0.0:
+        raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
+    make_folder(options.out)
+    drawn: dict[str, list[dict[str, Any]]] = {}
+    for scale in options.scales:
+        # The same scenes for all ways of finding corners.
+        configs = [
+            CurveConfig(
+                seeds=options.seeds, scale=scale, severity=options.severity, distances=tuple(options.distances),
+                detector=DetectorConfig(_family(options.family), corners=corners, enlarge=options.enlarge),
+            )
+            for corners in options.corners
+        ]  # fmt: skip
+        for corners, config, sightings in zip(options.corners, configs, measure(configs), strict=True):
+            name = f"{corners}, scale {scale:g}"
+            drawn[name] = summarise(sightings)
+            stem = options.out / f"curves-{corners}-{scale:g}"
+            meta = {"config": str(config), "boards": [vars(sighting) for sighting in sightings]}
+            save_table(stem, drawn[name], meta, title=name)
+            print(format_table(drawn[name], title=name) + "\n")
+    print("written to", save_error_curves(options.out / "curves.png", drawn, options.sigma_d))
+    return 0
+
+
+def _family(name: str) -> MarkerFamily:
+    if name not in MarkerFamily.__members__:
+        raise UserError(f"there is no marker family {name}: choose one of {', '.join(MarkerFamily.__members__)}")
+    return MarkerFamily[name]
+
+
+def _intrinsics(numbers: list[float]) -> Float[np.ndarray, "3 3"]:
+    fx, fy, cx, cy = numbers
+    if not (fx > 0.0 and fy > 0.0):
+        raise UserError(f"--intrinsics are FX FY CX CY in pixels with positive FX and FY, not {fx:g} {fy:g}")
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _without_distortion(
+    photo: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], distortion: list[float] | None
+) -> UInt8[np.ndarray, "h w 3"]:
+    if distortion is None:
+        return photo
+    if len(distortion) not in (4, 5, 8):
+        raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
+    # OpenCV counts pixels from the middle of the first one.
+    shifted = intrinsics - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    return opencv().undistort(photo, shifted, np.array(distortion))
+
+
+def _views(
+    photo: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], pose: Float[np.ndarray, "4 4"]
+) -> CameraViews:
+    height, width = photo.shape[:2]
+    return CameraViews(photo[None], np.array([[width, height]]), intrinsics[None], pose[None], np.ones(1, bool))
+
+
+def _record(found: DetectedMarkers, k: int) -> dict[str, Any]:
+    pose = np.asarray(found.pose[k], np.float64)
+    # Its face turned to the left of facing straight back along x.
+    turn = np.rad2deg(np.arctan2(-pose[1, 2], -pose[0, 2]))
+    return {
+        "id": int(found.marker_id[k]),
+        "score": round(float(found.score[k]), 4),
+        "distance": round(float(np.linalg.norm(pose[:2, 3])), 4),
+        "turn": round(float(turn), 2),
+        "reprojection": round(float(found.reprojection[k]), 4),
+        "ambiguity": round(float(found.ambiguity[k]), 4),
+        "position": np.round(pose[:3, 3], 4).tolist(),
+        "pose": np.round(pose, 6).tolist(),
+    }
+
+
+def _write_picture(
+    path: Path, photo: UInt8[np.ndarray, "h w 3"], found: DetectedMarkers, size: float,
+    intrinsics: Float[np.ndarray, "3 3"], camera_from_ego: Float[np.ndarray, "4 4"],
+) -> None:  # fmt: skip
+    cv2 = opencv()
+    image = np.ascontiguousarray(photo)
+    width = max(1, round(max(image.shape) / 900))
+
+    def fixed(pixels: np.ndarray) -> np.ndarray:
+        return np.round((np.clip(pixels, -8000.0, 8000.0) - 0.5) * 16).astype(np.int32)
+
+    for k in np.flatnonzero(found.valid).tolist():
+        pose = np.asarray(found.pose[k], np.float64)
+        outline = marker_outline(pose, size, intrinsics, camera_from_ego)
+        cv2.polylines(image, [fixed(outline)], True, _OUTLINE, width, cv2.LINE_AA, 4)
+        ends = pose[:3, 3] + np.concatenate([np.zeros((1, 3)), 0.75 * size * pose[:3, :3].T])
+        pixels, _, ahead = project(ends, intrinsics, camera_from_ego)
+        for axis in np.flatnonzero(ahead[1:]).tolist():
+            start, end = fixed(pixels[[0, axis + 1]]).tolist()
+            cv2.line(image, start, end, _AXES[axis].tolist(), 2 * width, cv2.LINE_AA, 4)
+        low = outline.max(0)
+        words = f"{found.marker_id[k]}: {np.linalg.norm(pose[:2, 3]):.1f} m, {found.score[k]:.2f}"
+        place = (int(outline[:, 0].min()), int(low[1]) + 16 * width)
+        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, _OUTLINE, width, cv2.LINE_AA)
+    path.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())

@@ -1,0 +1,340 @@
+"""How detection and pose of markers get worse with distance, measured in images of the built-in world.
+
+Counterpart of the paper's Fig. 3, which assumes such curves (section IV-A): a vehicle drives along a straight street
+towards three boards beside it that are turned by different angles; nothing stands between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import invert_pose, yaw_pose
+from tflane_jax.logs import KeyFrame, LaneSegment, Log, PlacedMarkers, Tracks, VectorMap
+from tflane_jax.markers.detection import DetectorConfig, find_markers, marker_outline, solve_square
+from tflane_jax.markers.patterns import marker_count
+from tflane_jax.scene import LineType
+from tflane_jax.world.camera_sensor import render_window
+from tflane_jax.world.front_view_camera import FrontCamera
+from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, CameraMount, CameraRigConfig, draw_rig
+
+# Standard deviation of the paper's forward error and of its yaw and pitch errors at 60 m, metres and degrees.
+PAPER_DISTANCE, PAPER_FORWARD, PAPER_ANGLE = 60.0, 3.0, 2.0
+# Around a board this many pixels are drawn, and of its own size half as many again.
+_AROUND = 24
+_LANE, _HEIGHT = 3.5, 3.0
+
+
+@dataclass(frozen=True)
+class CurveConfig:
+    """What is measured.
+
+    Attributes:
+        distances: from the camera to the boards along the street, metres.
+        turns: how far each of the boards is turned from facing the traffic, degrees.
+        seeds: scenes; each has its own weather, light, calibration and place of the boards.
+        mounts: cameras; the first one in whose image a board lies is asked.
+        scale: of their images, 1 is native.
+        severity: of weather and camera, 0 (clear day, perfect camera) to 1.
+        detector: that looks.
+    """
+
+    distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
+    turns: tuple[float, ...] = (0.0, 20.0, 40.0)
+    seeds: int = 8
+    mounts: tuple[CameraMount, ...] = (ARGOVERSE2_RING[0], ARGOVERSE2_RING[2])
+    scale: float = 1.0
+    severity: float = 0.5
+    detector: DetectorConfig = DetectorConfig()
+
+    def validate(self) -> None:
+        """Raise UserError for numbers that mean nothing."""
+        self.detector.validate()
+        if not self.distances or min(self.distances) <= 1.0:
+            raise UserError("markers are measured at distances above 1 m: give at least one")
+        if self.seeds < 1 or not self.turns or not self.mounts:
+            raise UserError("markers are measured in at least one scene, at one angle, with one camera: give them")
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One board in one image.
+
+    Attributes:
+        seed, turn: of the scene and the board (degrees).
+        distance: along the street, metres.
+        found: its id was read.
+        translation: (3,) of the estimate minus truth, along the line of sight, to the right, down, metres.
+        rotation: angle between estimated and true orientation, degrees.
+        other: the same of the pose that was not preferred.
+        pixels: mean side of the black square.
+        error: reprojection error, pixels.
+        ambiguity: ratio of the two errors.
+    """
+
+    seed: int
+    turn: float
+    distance: float
+    found: bool
+    pixels: float
+    translation: Float[np.ndarray, "3"] = field(default_factory=lambda: np.full(3, np.nan))
+    rotation: float = np.nan
+    other: float = np.nan
+    error: float = np.nan
+    ambiguity: float = np.nan
+
+
+def measure(configs: Sequence[CurveConfig]) -> list[list[Sighting]]:
+    """Draw every scene and return what each detector makes of each board that lies wholly in an image.
+
+    The same configs give the same numbers. Raises UserError for a config that means nothing, or for configs that differ
+    in more than the detector.
+    """
+    found: list[list[Sighting]] = [[] for _ in configs]
+    for config in configs:
+        config.validate()
+        if replace(config, detector=configs[0].detector) != configs[0]:
+            raise UserError("detectors are compared on the same scenes: give configs that differ in the detector alone")
+    for image in _images(configs[0]) if configs else ():
+        for sightings, config in zip(found, configs, strict=True):
+            sightings += _sightings(image, config.detector)
+    return found
+
+
+@dataclass(frozen=True)
+class _Image:
+    """Part of an image with some boards.
+
+    Attributes:
+        pixels: (h, w, 3).
+        corner: its upper left pixel in the whole image.
+        camera: of the whole image.
+        boards: marker id, ego_from_marker, turn (degrees) and outline (4, 2) of each.
+        seed, distance: as in `Sighting`.
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    corner: tuple[int, int]
+    camera: FrontCamera
+    boards: list[tuple[int, Float[np.ndarray, "4 4"], float, Float[np.ndarray, "4 2"]]]
+    seed: int
+    distance: float
+
+
+def _images(config: CurveConfig) -> Iterator[_Image]:
+    rig = CameraRigConfig(cameras=config.mounts, scale=config.scale, severity=config.severity)
+    for seed in range(config.seeds):
+        log, turns = street(seed, config), _turns(seed, config)
+        markers = log.markers
+        assert markers is not None
+        for number, distance in enumerate(config.distances):
+            poses = invert_pose(log.keyframes[number].global_from_ego) @ markers.pose
+            left = np.ones(len(poses), bool)
+            for view, camera in enumerate(draw_rig(log.seed, rig)):
+                outlines = np.stack(
+                    [marker_outline(pose, markers.size, camera.intrinsics, camera.camera_from_ego) for pose in poses]
+                )
+                here = left & _in_image(outlines, camera)
+                left &= ~here
+                if here.any():
+                    corner, size = _window(outlines[here], camera)
+                    ids = markers.marker_id.tolist()
+                    boards = [(ids[k], poses[k], turns[k], outlines[k]) for k in np.flatnonzero(here).tolist()]
+                    pixels = render_window(log, number, rig, corner, size, camera=view)
+                    yield _Image(pixels, corner, camera, boards, seed, distance)
+
+
+def _sightings(image: _Image, detector: DetectorConfig) -> list[Sighting]:
+    found, answer = find_markers(image.pixels, detector), []
+    for marker_id, pose, turn, outline in image.boards:
+        sight = Sighting(image.seed, turn, image.distance, False, float(_sides(outline)))
+        hits = np.flatnonzero(found.marker_id == marker_id)
+        if len(hits):
+            sight = _compared(sight, found.corners[hits[0]] + image.corner, image.camera, pose, detector)
+        answer.append(sight)
+    return answer
+
+
+def _sides(outline: Float[np.ndarray, "*b 4 2"]) -> Float[np.ndarray, "*b"]:
+    return np.linalg.norm(outline - np.roll(outline, 1, -2), axis=-1).mean(-1)
+
+
+def _in_image(outlines: Float[np.ndarray, "b 4 2"], camera: FrontCamera) -> Bool[np.ndarray, " b"]:
+    """Return which boards lie in the image with their margin."""
+    margin = 0.3 * _sides(outlines)[:, None, None]
+    size = np.array([camera.width, camera.height])
+    return np.asarray(((outlines > margin) & (outlines < size - margin)).all((1, 2)))
+
+
+def _window(outlines: Float[np.ndarray, "b 4 2"], camera: FrontCamera) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return corner and size of the part of the image that shows these boards."""
+    around = _AROUND + 0.5 * _sides(outlines).max()
+    low = np.maximum(np.floor(outlines.min((0, 1)) - around), 0.0).astype(int)
+    high = np.minimum(np.ceil(outlines.max((0, 1)) + around), [camera.width, camera.height]).astype(int)
+    (left, top), (width, height) = low.tolist(), (high - low).tolist()
+    return (left, top), (width, height)
+
+
+def _compared(
+    sight: Sighting, corners: Float[np.ndarray, "4 2"], camera: FrontCamera, ego_from_marker: Float[np.ndarray, "4 4"],
+    detector: DetectorConfig,
+) -> Sighting:  # fmt: skip
+    """Return the sighting with what its corners say about the pose."""
+    fit = solve_square(corners, camera.intrinsics, camera.camera_from_ego, detector)
+    truth = camera.camera_from_ego @ ego_from_marker
+    along = truth[:3, 3] / np.linalg.norm(truth[:3, 3])
+    right = np.cross([0.0, 1.0, 0.0], along)
+    right /= np.linalg.norm(right)
+    axes = np.stack([along, right, np.cross(along, right)])
+    turned = [_angle_between(pose[:3, :3], truth[:3, :3]) for pose in fit.camera_from_marker]
+    return replace(
+        sight, found=True, translation=axes @ (fit.camera_from_marker[0, :3, 3] - truth[:3, 3]), rotation=turned[0],
+        other=turned[1], error=float(fit.error[0]), ambiguity=fit.ambiguity,
+    )  # fmt: skip
+
+
+def summarise(sightings: Sequence[Sighting]) -> list[dict[str, Any]]:
+    """Return one row for each distance: rate of detection and errors of what was found.
+
+    translation m: mean distance between estimate and truth; forward m: standard deviation along the line of sight about
+    zero; sideways m: the same across it; rotation: median and root mean square; wrong pose: share in which the pose
+    that was not preferred is nearer to the truth by more than a degree.
+    """
+    rows = []
+    for distance in sorted({sighting.distance for sighting in sightings}):
+        all_here = [sighting for sighting in sightings if sighting.distance == distance]
+        here = [sighting for sighting in all_here if sighting.found]
+        shift = np.array([sighting.translation for sighting in here]).reshape(-1, 3)
+        turned = np.array([sighting.rotation for sighting in here])
+        other = np.array([sighting.other for sighting in here])
+        rows.append({
+            "distance m": distance,
+            "boards": len(all_here),
+            "pixels": _mean([sighting.pixels for sighting in all_here]),
+            "found": len(here) / len(all_here),
+            "translation m": _mean(np.linalg.norm(shift, axis=-1)),
+            "forward m": _rms(shift[:, 0]),
+            "sideways m": _rms(np.linalg.norm(shift[:, 1:], axis=-1)),
+            "rotation median": float(np.median(turned)) if len(here) else np.nan,
+            "rotation rms": _rms(turned),
+            "wrong pose": _mean(other < turned - 1.0),
+            "reprojection px": _mean([sighting.error for sighting in here]),
+        })  # fmt: skip
+    return rows
+
+
+def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma_d: float) -> Path:
+    """Draw rate, forward error and rotation error over distance, beside what the paper assumes, and return the path.
+
+    Args:
+        path: .png, .pdf or .svg.
+        curves: rows of `summarise` by name.
+        sigma_d: of the paper's probability of detection exp(-d^2 / 2 sigma_d^2), metres.
+    """
+    from tflane_jax.plots.figure import new_figure, save_figure
+
+    figure, axes = new_figure(1, 4, panel=(3.6, 3.0))
+    panels = (
+        ("found", "detection rate"), ("forward m", "forward error, rms [m]"),
+        ("rotation median", "rotation error, median [deg]"), ("wrong pose", "other pose nearer to the truth"),
+    )  # fmt: skip
+    far = np.linspace(0.0, PAPER_DISTANCE, 61)
+    paper = {
+        "found": np.exp(-0.5 * (far / sigma_d) ** 2),
+        "forward m": PAPER_FORWARD * far / PAPER_DISTANCE,
+        "rotation median": PAPER_ANGLE * far / PAPER_DISTANCE,
+    }
+    for ax, (key, label) in zip(axes.flat, panels, strict=True):
+        for name, rows in curves.items():
+            ax.plot([row["distance m"] for row in rows], [row[key] for row in rows], ".-", label=name)
+        if key in paper:
+            ax.plot(far, paper[key], "k--", label="the paper's assumption")
+        ax.set_xlabel("distance [m]")
+        ax.set_ylabel(label)
+        ax.set_xlim(0.0, None)
+        ax.set_ylim(0.0, None)
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend(fontsize=7)
+    return save_figure(figure, path)
+
+
+def street(seed: int, config: CurveConfig) -> Log:
+    """Return a drive along a straight empty street towards boards at its right side, with a key frame for each
+    distance."""
+    rng = np.random.default_rng([20_251_122, seed])
+    heading, place = rng.uniform(-np.pi, np.pi), rng.uniform(-1000.0, 1000.0, 2)
+    global_from_street = yaw_pose(place[0], place[1], np.asarray(heading))
+    eyes = np.array([config.mounts[0].x + distance for distance in config.distances])
+    keyframes = [global_from_street @ yaw_pose(-eye, np.asarray(-0.5 * _LANE), np.zeros(())) for eye in eyes]
+    # The boards stand beside each other, so that none hides another.
+    lateral = -_LANE - 1.0 - 1.8 * np.arange(len(config.turns)) - rng.uniform(0.0, 0.5)
+    height = _HEIGHT + rng.uniform(-0.3, 0.3, len(config.turns))
+    poses = [
+        global_from_street @ _facing_back(0.0, y, z, np.deg2rad(turn))
+        for y, z, turn in zip(lateral, height, _turns(seed, config), strict=True)
+    ]
+    ids = rng.choice(marker_count(config.detector.family), len(poses), replace=False)
+    frames = len(keyframes)
+    nothing = Tracks(
+        np.zeros((frames, 0, 3)), np.zeros((frames, 0)), np.zeros((0, 3)), np.zeros(0, np.int32),
+        np.zeros((frames, 0), bool), np.zeros((frames, 0), bool), np.zeros(0, str),
+    )  # fmt: skip
+    return Log(
+        name=f"markers {seed}", source="markers", map=_street_map(global_from_street, float(eyes.max())),
+        timestamps_ns=np.arange(frames) * 500_000_000, global_from_ego=np.stack(keyframes), tracks=nothing,
+        actors=nothing,
+        keyframes=tuple(KeyFrame(int(n) * 500_000_000, keyframes[n], int(n)) for n in range(frames)),
+        weather=float(rng.random()), paint_wear=0.5, seed=seed,
+        markers=PlacedMarkers(ids, np.stack(poses), config.detector.size, config.detector.family),
+    )  # fmt: skip
+
+
+def _turns(seed: int, config: CurveConfig) -> list[float]:
+    """Return the angles of the boards from the road outwards, another order and side in every scene."""
+    rng = np.random.default_rng([20_251_123, seed])
+    return (rng.permutation(config.turns) * rng.choice([-1.0, 1.0], len(config.turns))).tolist()
+
+
+def _facing_back(x: float, y: float, z: float, turn: float) -> Float[np.ndarray, "4 4"]:
+    """Return the pose of an upright marker that faces those who come along x, turned by `turn` (radians)."""
+    face = np.array([-np.cos(turn), -np.sin(turn), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    pose = np.eye(4)
+    pose[:3] = np.stack([np.cross(up, face), up, face, [x, y, z]], -1)
+    return pose
+
+
+def _street_map(global_from_street: Float[np.ndarray, "4 4"], length: float) -> VectorMap:
+    ends = np.array([-length - 60.0, 60.0])
+
+    def line(y: float) -> np.ndarray:
+        local = np.column_stack([ends, np.full(2, y), np.zeros(2)])
+        return local @ global_from_street[:3, :3].T + global_from_street[:3, 3]
+
+    lanes = {
+        n: LaneSegment(n, line(y), line(y + 0.5 * _LANE), line(y - 0.5 * _LANE), LineType.DASHED, LineType.SOLID,
+                       False, ())
+        for n, y in enumerate((0.5 * _LANE, -0.5 * _LANE))
+    }  # fmt: skip
+    # A closed ring has no kerb along which trees and lamps could stand before the boards.
+    low, high = line(-_LANE - 0.5), line(_LANE + 0.5)
+    ring = np.concatenate([low, high[::-1], low[:1]])
+    return VectorMap(lanes, road_boundaries=(ring,))
+
+
+def _angle_between(a: Float[np.ndarray, "3 3"], b: Float[np.ndarray, "3 3"]) -> float:
+    return float(np.rad2deg(np.arccos(np.clip(0.5 * (np.trace(a.T @ b) - 1.0), -1.0, 1.0))))
+
+
+def _mean(values: Any) -> float:
+    return float(np.mean(values)) if len(values) else np.nan
+
+
+def _rms(values: Float[np.ndarray, " n"]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan

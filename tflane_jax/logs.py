@@ -67,6 +67,8 @@ class VectorMap:
         road_boundaries: polylines (n, 3); a closed ring repeats its first point.
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks beside the road, unlimited in height.
+        roads: one line (n, 3) in the middle of each road, of sources that know roads; a closed one repeats its first
+            point.
     """
 
     segments: dict[int, LaneSegment]
@@ -74,6 +76,7 @@ class VectorMap:
     road_boundaries: tuple[np.ndarray, ...] = ()
     elements: tuple[MapElement, ...] = ()
     buildings: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
+    roads: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True)

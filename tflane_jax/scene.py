@@ -52,6 +52,19 @@ class AreaType(enum.IntEnum):
     ROAD_BOUNDARY = 2
 
 
+class SdCategory(enum.IntEnum):
+    """Category of a line of an SD map, as SMERF numbers it."""
+
+    ROAD = 0
+    CROSSWALK = 1  # sidewalks and other ways of pedestrians too
+    TRUCK_ROAD = 2
+    HIGHWAY = 3
+    RESIDENTIAL = 4
+    SERVICE = 5
+    BUS_WAY = 6
+    OTHER = 7
+
+
 class BevChannel(enum.IntEnum):
     """Channels of the bird's-eye-view evidence raster (`Example.bev`)."""
 
@@ -231,13 +244,20 @@ class SdMap:
 
     Attributes:
         points: (R, P, 2) metres, ego frame.
-        category: (R,) 0 road, 1 crosswalk, 2 sidewalk.
+        category: (R,) `SdCategory`.
         valid: (R,).
     """
 
     points: Float[Array, "r p 2"]
     category: Int[Array, " r"]
     valid: Bool[Array, " r"]
+
+    @classmethod
+    def empty(cls, capacity: int, points: int) -> SdMap:
+        """Return a map with room for `capacity` lines of `points` points and none valid."""
+        return cls(
+            np.zeros((capacity, points, 2), np.float32), np.zeros(capacity, np.int32), np.zeros(capacity, bool)
+        )
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""

@@ -12,6 +12,7 @@ from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.world.bev_sensor import BevSensorConfig
 from tflane_jax.world.ring_cameras import CameraRigConfig
+from tflane_jax.world.sd_map import SdMapConfig
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class ExampleConfig:
         tracks: instances K of traffic flow.
         elements: traffic lights and signs.
         bike_lanes: whether lanes closed to motor vehicles are truth.
+        sd_map: coarse map of the roads of the built-in world; None leaves it out.
     """
 
     range: PerceptionRange = PerceptionRange()
@@ -51,6 +53,7 @@ class ExampleConfig:
     tracks: int = 96
     elements: int = 24
     bike_lanes: Literal["include", "exclude"] = "include"
+    sd_map: SdMapConfig | None = None
 
     @property
     def ground(self) -> PerceptionRange:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,6 +18,7 @@ from tflane_jax.logs import Log, Tracks
 from tflane_jax.scene import Example, TrafficFlow
 from tflane_jax.world.bev_sensor import hidden_cells, render_bev
 from tflane_jax.world.camera_sensor import render_cameras, visible_elements
+from tflane_jax.world.sd_map import make_sd_map
 
 
 def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tuple[TrafficFlow, int]:
@@ -99,9 +101,10 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         capacity=config.elements, seen=None if rig is None else visible_elements(log, keyframe, rig),
     )  # fmt: skip
     flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks)
+    sd_map, lines_dropped = (None, 0) if config.sd_map is None else make_sd_map(log, keyframe, config.sd_map)
     _warn_dropped(
         config, lanes=lanes.dropped, segments=segments.dropped, areas=areas_dropped,
-        elements=elements_dropped, tracks=tracks_dropped,
+        elements=elements_dropped, tracks=tracks_dropped, **{"sd_map.lines": lines_dropped},
     )  # fmt: skip
     previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
     return Example(
@@ -115,7 +118,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         markers=None if config.markers is None else marker_observations(
             log, keyframe, config.markers, config.range, bike_lanes=config.bike_lanes == "include"
         ),
-        sd_map=None,
+        sd_map=sd_map,
         lanes=lanes.graph,
         segments=segments.graph,
         areas=areas,
@@ -144,7 +147,7 @@ def _warn_dropped(config: ExampleConfig, **dropped: int) -> None:
         if count:
             # One text for all frames, so that Python's default filter shows it once.
             warnings.warn(
-                f"more {name} in range than ExampleConfig.{name} = {getattr(config, name)}: "
+                f"more {name} in range than ExampleConfig.{name} = {attrgetter(name)(config)}: "
                 "the farthest are left out",
                 TruncationWarning,
                 stacklevel=3,

@@ -7,7 +7,9 @@ every layer look at the queries as they were before the first layer; `value_proj
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -18,6 +20,10 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
+
+# What priors add to the BEV features of a layer: (number of the layer, features (q, c), position (q, c)) -> features.
+# Modules that it uses are made inside it, so that their parameters stand below the layer that calls it.
+Fuse = Callable[[int, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
 
 
 @dataclass(frozen=True)
@@ -113,6 +119,7 @@ class BevEncoder(nn.Module):
         history: BevMemory,
         shift: Float[Array, "2"],
         deterministic: bool,
+        fuse: Fuse | None = None,
     ) -> Float[Array, "q c"]:
         """Return the encoded queries; see `BevFormer.encode` and the attentions for the arguments."""
         config, initial = self.config, queries
@@ -121,7 +128,7 @@ class BevEncoder(nn.Module):
         cells = jnp.stack([before, here], 1)
         past = history.features.reshape(queries.shape)
         # Static arguments: the module itself counts as the first.
-        layer = nn.remat(BevEncoderLayer, static_argnums=(8, 9)) if config.remat else BevEncoderLayer
+        layer = nn.remat(BevEncoderLayer, static_argnums=(8, 9, 10)) if config.remat else BevEncoderLayer
         for i in range(config.layers):
             # Without a memory the queries look at themselves twice.
             previous = jnp.where(history.valid, past, queries)
@@ -129,8 +136,9 @@ class BevEncoder(nn.Module):
             if config.temporal_value == "initial":
                 looked_at = jnp.where(history.valid, initial, queries)
             queries = layer(config, name=f"layer_{i}")(
-                queries, position, (previous, looked_at), cells, tokens, reference, visible, shapes, deterministic
-            )
+                queries, position, (previous, looked_at), cells, tokens, reference, visible, shapes, deterministic,
+                None if fuse is None else partial(fuse, i),
+            )  # fmt: skip
         return queries
 
 
@@ -151,6 +159,7 @@ class BevEncoderLayer(nn.Module):
         visible: Bool[Array, "v q z"],
         shapes: tuple[tuple[int, int], ...],
         deterministic: bool,
+        fuse: Callable[[Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]] | None = None,
     ) -> Float[Array, "q c"]:
         """Return the queries after the layer; `frames` are what temporal attention looks at, previous and present."""
         config, grid = self.config, self.config.grid
@@ -169,6 +178,8 @@ class BevEncoderLayer(nn.Module):
             config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
         )
         queries = add(queries, spatial(queries, tokens, shapes, reference, visible), "spatial")
+        if fuse is not None:
+            queries = fuse(queries, position)
         x = nn.relu(nn.Dense(config.hidden, kernel_init=init, dtype=config.dtype, name="expand")(queries))
         x = nn.Dropout(config.dropout, name="hidden_dropout")(x, deterministic=deterministic)
         x = nn.Dense(config.dim, kernel_init=init, dtype=config.dtype, name="contract")(x)

@@ -22,7 +22,7 @@ from tflane_jax.geometry.pillars import pillar_points, project_pillars
 from tflane_jax.geometry.poses import pose_yaw
 from tflane_jax.layers.bev_alignment import ego_shift, rotate_nearest, vehicle_center, warp
 from tflane_jax.layers.positions import LearnedImageEncoding
-from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory
+from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory, Fuse
 from tflane_jax.scene import CameraViews
 
 # Length of the reference's vector of vehicle motion (the "CAN bus").
@@ -42,6 +42,7 @@ class BevFormer(nn.Module):
         previous_from_ego: Float[Array, "4 4"],
         *,
         deterministic: bool = True,
+        fuse: Fuse | None = None,
     ) -> Float[Array, "h w c"]:
         """Return the BEV features.
 
@@ -51,6 +52,7 @@ class BevFormer(nn.Module):
             memory: of the previous frame; None and an invalid one are the same.
             previous_from_ego: pose of this ego frame in the previous one's, looked at where the memory is valid.
             deterministic: no dropout; with it, the key `dropout` is needed.
+            fuse: what priors add behind the cameras of each layer.
         """
         config = self.config
         memory = memory or _no_memory(config)
@@ -59,7 +61,7 @@ class BevFormer(nn.Module):
         history = BevMemory(jnp.where(memory.valid, memory.features, 0.0), memory.valid)
         history, shift = align(config, history, pose)
         motion = motion_vector(pose, memory.valid)
-        return self.encode(features, cameras, history, shift, motion, deterministic=deterministic)
+        return self.encode(features, cameras, history, shift, motion, deterministic=deterministic, fuse=fuse)
 
     @nn.compact
     def encode(
@@ -71,6 +73,7 @@ class BevFormer(nn.Module):
         motion: Float[Array, " m"],
         *,
         deterministic: bool = True,
+        fuse: Fuse | None = None,
     ) -> Float[Array, "h w c"]:
         """Return the BEV features from a memory that has been aligned (`align`) and a vector of vehicle motion."""
         config, grid = self.config, self.config.grid
@@ -96,7 +99,7 @@ class BevFormer(nn.Module):
         shapes = tuple((level.shape[1], level.shape[2]) for level in features)
         reference, visible = see_pillars(config, cameras)
         encoder = BevEncoder(config, name="encoder")
-        encoded = encoder(queries, position, tokens, shapes, reference, visible, history, shift, deterministic)
+        encoded = encoder(queries, position, tokens, shapes, reference, visible, history, shift, deterministic, fuse)
         return encoded.reshape(grid.rows, grid.columns, config.dim)
 
 

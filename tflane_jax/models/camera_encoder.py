@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.models.auxiliary import LaneCellHead
-from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
+from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory, Fuse
 from tflane_jax.models.bevformer import BevFormer
 from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
@@ -78,7 +78,7 @@ class CameraEncoder(nn.Module):
     config: CameraEncoderConfig
 
     @nn.compact
-    def __call__(self, example: Example, memory: BevMemory | None, *, train: bool) -> Seen:
+    def __call__(self, example: Example, memory: BevMemory | None, *, train: bool, fuse: Fuse | None = None) -> Seen:
         """Return what the cameras show; raises UserError where the example has no images."""
         cameras = example.cameras
         if cameras is None:
@@ -88,7 +88,7 @@ class CameraEncoder(nn.Module):
             # No gradient through time, as in the reference; a new scene begins without memory.
             memory = BevMemory(lax.stop_gradient(memory.features), memory.valid & example.has_previous)
         bev = BevFormer(self.config.bev, name="bev")(
-            levels, cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train
+            levels, cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train, fuse=fuse
         )
         if self.config.cells:
             LaneCellHead(name="cells")(bev)
@@ -107,17 +107,25 @@ def make_encoder(config: EncoderConfig) -> EvidenceEncoder | CameraEncoder:
 
 
 def look(
-    encoder: EvidenceEncoder | CameraEncoder, example: Example, memory: BevMemory | None, *, train: bool
+    encoder: EvidenceEncoder | CameraEncoder,
+    example: Example,
+    memory: BevMemory | None,
+    *,
+    train: bool,
+    fuse: Fuse | None = None,
 ) -> Seen:
-    """Return what a host's encoder makes of an example; raises UserError where the example lacks what it reads."""
+    """Return what a host's encoder makes of an example, and of what priors add to it in each layer.
+
+    Raises UserError where the example lacks what the encoder reads.
+    """
     if isinstance(encoder, CameraEncoder):
-        return encoder(example, memory, train=train)
+        return encoder(example, memory, train=train, fuse=fuse)
     if example.bev is None:
         raise UserError(
             "the model reads BEV evidence, and these data have none (bev is None): choose data with evidence, or a "
             "model with cameras"
         )
-    return Seen(encoder(example.bev))
+    return Seen(encoder(example.bev, fuse))
 
 
 def empty_memory(config: EncoderConfig) -> BevMemory | None:

@@ -8,7 +8,11 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
+from tflane_jax.geometry import BevGrid
+from tflane_jax.geometry.pillars import cell_points
+from tflane_jax.layers.polyline_encoder import temperature_encoding
 from tflane_jax.models.auxiliary import LaneCellHead
+from tflane_jax.models.bev_encoder import Fuse
 
 
 @dataclass(frozen=True)
@@ -34,8 +38,14 @@ class EvidenceEncoder(nn.Module):
     config: EvidenceEncoderConfig
 
     @nn.compact
-    def __call__(self, bev: UInt8[Array, "h w c"]) -> Float[Array, "hf wf d"]:
-        """Return features, `cell` times coarser than the raster; raises ValueError where that does not divide it."""
+    def __call__(self, bev: UInt8[Array, "h w c"], fuse: Fuse | None = None) -> Float[Array, "hf wf d"]:
+        """Return features, `cell` times coarser than the raster; raises ValueError where that does not divide it.
+
+        Args:
+            bev: evidence.
+            fuse: what priors add behind each residual block. Cells have no learned position here: it is a sine encoding
+                of (x, y).
+        """
         (h, w, c), n = bev.shape, self.config.cell
         if h % n or w % n:
             raise ValueError(f"a raster of {h} x {w} cells does not fold into blocks of {n} x {n}")
@@ -46,9 +56,18 @@ class EvidenceEncoder(nn.Module):
         for i, dilation in enumerate(self.config.dilations):
             y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
             x = nn.relu(x + _norm(f"block_{i}_norm")(y))
+            if fuse is not None:
+                x = fuse(i, x.reshape(-1, x.shape[-1]), _positions(x)).reshape(x.shape)
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x
+
+
+def _positions(x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
+    """Return the encoding of where cells lie, as many channels as the features have (a multiple of 4)."""
+    rows, columns, dim = x.shape
+    share = jnp.asarray(cell_points(BevGrid(rows=rows, columns=columns)), x.dtype)
+    return temperature_encoding(share, dim // 2, layout="blocks")
 
 
 def _norm(name: str) -> nn.GroupNorm:

@@ -21,6 +21,7 @@ from tflane_jax.world.lane_network import LaneNetwork
 from tflane_jax.world.layout_junctions import plan_junctions
 from tflane_jax.world.layout_roads import plan_road
 from tflane_jax.world.road_config import RoadConfig, SceneKind
+from tflane_jax.world.road_lines import road_lines
 from tflane_jax.world.through_roads import lay_out_road
 
 __all__ = ["RoadConfig", "RoadNetwork", "SceneKind", "build_road_network"]
@@ -63,8 +64,10 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
     kind = kinds[rng.choice(len(kinds), p=np.array(weights) / np.sum(weights))]
     network = LaneNetwork()
     if kind in _JUNCTIONS:
-        site = lay_out_junctions(rng, plan_junctions(rng, kind, config), network, config)
+        plan = plan_junctions(rng, kind, config)
+        site = lay_out_junctions(rng, plan, network, config)
     else:
+        plan = None
         site = lay_out_road(plan_road(rng, kind, config), network, config)
     density = rng.uniform(0.55, 0.95) if site.urban else rng.uniform(0.0, 0.3)
     boxes = roadside.buildings(rng, site, config.building_setback, density)
@@ -72,7 +75,7 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         map=VectorMap(
             segments=network.segments(), crossings=_on_plane(site.crossings),
             road_boundaries=_on_plane([*site.kerbs, *site.islands]), elements=tuple(site.elements),
-            buildings=boxes,
+            buildings=boxes, roads=_on_plane(road_lines(site.streets, plan)),
         ),
         speed_limit={i: d.speed for i, d in network.drafts.items()},
         yield_to={i: tuple(sorted(others)) for i, others in network.yield_to.items()},

@@ -1,0 +1,139 @@
+"""SD maps from GeoJSON: places on the ground, categories, and what is wrong with a file."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.geojson import Origin, RoadLines, read_geojson, sd_map_around, to_ego
+from tflane_jax.errors import UserError
+from tflane_jax.scene import SdCategory
+from tflane_jax.world.sd_map import SdMapConfig
+
+
+def earth(latitude, longitude):
+    """Return WGS84 places (degrees) in Earth-centred metres."""
+    f = 1 / 298.257223563
+    e2, lat, lon = f * (2 - f), np.radians(latitude), np.radians(longitude)
+    n = 6378137.0 / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    return np.stack([n * np.cos(lat) * np.cos(lon), n * np.cos(lat) * np.sin(lon), n * (1 - e2) * np.sin(lat)], -1)
+
+
+def east_north(latitude, longitude, origin):
+    """Return exact local coordinates of places."""
+    lat, lon = np.radians(origin.latitude), np.radians(origin.longitude)
+    offset = earth(latitude, longitude) - earth(origin.latitude, origin.longitude)
+    east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+    north = np.array([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
+    return np.stack([offset @ east, offset @ north], -1)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    st.floats(-60, 60), st.floats(-180, 180), st.floats(0, 2 * np.pi), st.sampled_from([(100.0, 3e-3), (1000.0, 0.3)]),
+)  # fmt: skip
+def test_places_are_as_exact_as_promised(latitude, longitude, bearing, reach):
+    distance, tolerance = reach
+    origin = Origin(latitude, longitude)
+    lat = latitude + np.degrees(distance * np.cos(bearing) / 6.37e6)
+    lon = longitude + np.degrees(distance * np.sin(bearing) / (6.37e6 * np.cos(np.radians(latitude))))
+    # As a file would have it on the other side of the 180th meridian.
+    lon = (lon + 180) % 360 - 180
+    x, y = to_ego(np.array([[lon, lat]]), origin)[0]
+    np.testing.assert_allclose([-y, x], east_north(lat, lon, origin), atol=tolerance)
+
+
+@pytest.mark.parametrize(("heading", "expected"), [(0, (10, 0)), (90, (0, 10)), (180, (-10, 0)), (270, (0, -10))])
+def test_heading_turns_clockwise_from_north(heading, expected):
+    """A place ten metres to the north."""
+    place = np.array([[8.4, 49.0 + 10 / 111_200]])
+    np.testing.assert_allclose(to_ego(place, Origin(49.0, 8.4, heading))[0], expected, atol=0.01)
+
+
+def feature(coordinates, kind="LineString", **properties):
+    return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
+
+
+LINE = [[8.4, 49.0], [8.401, 49.0]]
+
+
+def write(path, *features, **other):
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": list(features)} | other))
+    return path
+
+
+def test_a_file_becomes_a_map_around_the_vehicle(tmp_path):
+    path = write(
+        tmp_path / "map.geojson",
+        feature(LINE, highway="residential"),
+        feature([8.4, 49.0], "Point", highway="crossing"),
+        feature([[[8.4, 49.0], [8.4, 49.0001]], [[8.5, 49.0], [8.6, 49.0]]], "MultiLineString", category="side_walk"),
+        feature([[8.4, 49.0, 110.0], [8.4, 48.9999, 110.0]], highway="motorway_link"),
+        feature(LINE, highway="raceway"),
+        {"type": "Feature", "geometry": None, "properties": None},
+        crs={"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}},
+    )
+    roads = read_geojson(path)
+    walk = SdCategory.CROSSWALK
+    expected = [SdCategory.RESIDENTIAL, walk, walk, SdCategory.HIGHWAY, SdCategory.OTHER]
+    assert list(roads.category) == expected
+    sd_map = sd_map_around(roads, Origin(49.0, 8.4, 90.0), SdMapConfig(lines=6, points=3))
+    sd_map.validate()
+    # The second sidewalk lies kilometres away.
+    assert sd_map.category[sd_map.valid].tolist() == [expected[i] for i in (0, 1, 3, 4)]
+    np.testing.assert_allclose(sd_map.points[0], [[0, 0], [25.6, 0], [51.2, 0]], atol=1e-3)
+    np.testing.assert_allclose(sd_map.points[1], [[0, 0], [0, 5.56], [0, 11.12]], atol=5e-3)
+    with pytest.warns(TruncationWarning, match="SdMapConfig.lines = 3"):
+        sd_map_around(roads, Origin(49.0, 8.4), SdMapConfig(lines=3))
+    nothing = sd_map_around(RoadLines((), ()), Origin(0.0, 0.0), SdMapConfig(lines=2))
+    assert not nothing.valid.any()
+
+
+BAD = {
+    "no list of points": (feature(7, highway="road"), "feature 1 is no line of at least two points"),
+    "one point": (feature([[8.4, 49.0]], highway="road"), "feature 1 is no line of at least two points"),
+    "text": (feature([[8.4, 49.0], ["a", "b"]], highway="road"), "feature 1 is no line of at least two points"),
+    "no lines": (feature(None, "MultiLineString", highway="road"), "feature 1 is no line of at least two points"),
+    "latitude first": (feature([[49.0, 8.4], [49.0, 98.4]], highway="road"), "longitude first"),
+    "nan": (feature([[float("nan"), 8.4], [49.0, 8.4]], highway="road"), "feature 1 leaves the Earth"),
+    "no category": (feature(LINE, name="x"), "neither of the properties `highway` and `category`"),
+    "no properties": (feature(LINE) | {"properties": None}, "neither of the properties"),
+    "unknown category": (feature(LINE, category="raod"), "'raod': choose one of road, cross_walk"),
+    "no feature": ({"type": "Way"}, "feature 1 is no GeoJSON Feature"),
+    "a list": ([], "feature 1 is no GeoJSON Feature"),
+    "geometry": (feature(LINE, "Line", highway="road"), "feature 1 has a geometry of type 'Line'"),
+    "named": (feature(LINE) | {"id": "way/12"}, r"feature 1 \(way/12\) has neither"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_feature_is_named_with_its_remedy(name, tmp_path):
+    bad, message = BAD[name]
+    path = write(tmp_path / "map.geojson", feature(LINE, highway="road"), bad)
+    with pytest.raises(UserError, match=message) as raised:
+        read_geojson(path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is no JSON"),
+        ("[]", "is no GeoJSON FeatureCollection"),
+        ('{"type": "Feature"}', "is no GeoJSON FeatureCollection"),
+        ('{"type": "FeatureCollection", "features": {}}', "is no GeoJSON FeatureCollection"),
+        ('{"type": "FeatureCollection", "features": [], "crs": {"name": "EPSG:25832"}}', "convert it to EPSG:4326"),
+        (b"\xff\xfe", "is no JSON"),
+        (None, "cannot read"),
+    ],
+)
+def test_a_bad_file_is_named(content, message, tmp_path):
+    path = tmp_path / "map.geojson"
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(UserError, match=message) as raised:
+        read_geojson(path)
+    assert str(path) in str(raised.value)

@@ -1,0 +1,372 @@
+"""SMERF's map encoder and fusion against the reference's numbers; absent maps, padding, both BEV encoders."""
+
+from dataclasses import replace
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import (
+    assert_gradients_close,
+    assert_outputs_close,
+    case_id,
+    golden_modules,
+    load_module_case,
+    named_gradients,
+)
+from tests.models.test_bevformer import CONFIG, golden_config, golden_views, levels, ring
+from tests.parameters import random_params
+from tflane_jax.convert.renaming import check_fits, renamed_params
+from tflane_jax.convert.sd_map import (
+    CROSS_ATTENTION,
+    convert_sd_map_encoder,
+    convert_smerf_bevformer,
+)
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.layers.polyline_encoder import (
+    MARKER_POLYLINES,
+    PolylineEncoder,
+    PolylineEncoderConfig,
+    temperature_encoding,
+)
+from tflane_jax.models.bevformer import BevFormer, BevFormerConfig, BevMemory, see_pillars
+from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
+from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, SdMapModuleConfig
+from tflane_jax.priors.sd_map import SdMapPriorConfig
+from tflane_jax.scene import SdMap
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("smerf_sine_continuous_pe*"), ids=case_id)
+def test_encoding_of_points_matches_the_reference(path):
+    case = load_module_case(path)
+    config = case.meta["config"]
+    low, size = np.array(config["offset"], np.float32), np.array(config["range"], np.float32)
+    unit = (case.inputs["x"] - low) / size
+    out = jax.jit(lambda x: temperature_encoding(x, config["num_feats"], temperature=config["temperature"]))(unit)
+    assert_outputs_close({"output": out}, case.outputs)
+
+
+@pytest.mark.parametrize("layout", ["blocks", "interleaved"])
+def test_encoding_of_points_is_equation_one(layout):
+    points = np.random.default_rng(0).uniform(-0.1, 1.1, (3, 2)).astype(np.float32)
+    out = jax.jit(lambda x: temperature_encoding(x, 6, layout=layout))(points)
+    assert out.shape == (3, 12)
+    for n in range(3):
+        for axis in range(2):
+            angles = [2 * np.pi * points[n, axis] / 1000 ** (2 * j / 6) for j in range(3)]
+            waves = [(np.sin(a), np.cos(a)) for a in angles]
+            expected = np.ravel(waves) if layout == "interleaved" else np.ravel(waves, "F")
+            np.testing.assert_allclose(out[n, 6 * axis : 6 * axis + 6], expected, atol=2e-6)
+    with pytest.raises(ValueError, match="must be even, not 5"):
+        temperature_encoding(jnp.asarray(points), 5)
+
+
+def padded(rows, capacity, filler=np.nan):
+    """Return an array with rows of garbage behind its own."""
+    return jnp.concatenate([rows, jnp.full((capacity - len(rows), *rows.shape[1:]), filler, rows.dtype)])
+
+
+def golden_module_config(config):
+    lines = PolylineEncoderConfig(
+        config["dmodel"], config["layers"], config["heads"], config["hidden"], 0.0, config["num_feats"],
+        config["temperature"],
+    )  # fmt: skip
+    return SdMapModuleConfig(SdMapPriorConfig(categories=config["categories"]), lines)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("smerf_map_graph_transformer*"), ids=case_id)
+def test_map_encoder_matches_the_reference(path):
+    case = load_module_case(path)
+    config = golden_module_config(case.meta["config"])
+    encoder, capacity = SdMapEncoder(config), 9
+    categories = [case.inputs[f"onehot.{i}"].argmax(-1) for i in range(2)]
+
+    def scalar(torch_params, arrays):
+        variables = {"params": convert_sd_map_encoder(torch_params).variables["params"]}
+        out = {}
+        for i, category in enumerate(categories):
+            lines = arrays[f"poly{i}"]
+            sd_map = SdMap(
+                padded(lines, capacity), jnp.asarray(np.resize(category, capacity), jnp.int32),
+                jnp.arange(capacity) < len(lines),
+            )  # fmt: skip
+            tokens, valid = encoder.apply(variables, sd_map)
+            out[f"feat{i}"] = tokens[: len(lines)]
+            np.testing.assert_array_equal(valid.shape, (capacity,))
+        return sum((out[name] * case.weights[name]).sum() for name in out), out
+
+    inputs = {name: case.inputs[name] for name in ("poly0", "poly1")}
+    gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, out), (by_param, by_input) = gradient(case.params, inputs)
+    assert_outputs_close(out | {"grad_scalar": total}, case.outputs)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+    converted = convert_sd_map_encoder(case.params)
+    assert [row["tensor"] for row in converted.table] == list(case.params)
+    fresh = jax.eval_shape(encoder.init, jax.random.key(0), None)
+    check_fits(converted.variables["params"], fresh["params"], path)
+    with pytest.raises(UserError, match="no tensor of SMERF's map encoder"):
+        convert_sd_map_encoder({"map_embeding.weight": case.params["map_embedding.weight"]})
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("smerf_masked_cross_attention*"), ids=case_id)
+def test_attention_to_the_map_matches_the_reference(path):
+    case = load_module_case(path)
+    config = case.meta["config"]
+    lines = case.inputs.pop("spatial_shapes")
+    fusion = SdMapFusion(SdMapModuleConfig(heads=config["heads"]))
+
+    def scalar(torch_params, arrays):
+        norm = {"scale": jnp.ones(config["C"]), "bias": jnp.zeros(config["C"])}
+        variables = {"params": renamed_params(torch_params, CROSS_ATTENTION) | {"norm": norm}}
+
+        def one(query, position, value, count):
+            valid = jnp.arange(len(value)) < count
+            tokens = jnp.where(valid[:, None], value, jnp.nan)
+
+            # The case ends before the norm.
+            def no_norm(run, args, kwargs, context):
+                return args[0] if context.module.name == "norm" else run(*args, **kwargs)
+
+            with nn.intercept_methods(no_norm):
+                return fusion.apply(variables, query, position, tokens, valid)
+
+        out = jnp.stack([
+            one(*a) for a in zip(arrays["query"], arrays["query_pos"], arrays["value"], lines, strict=True)
+        ])
+        return (out * case.weights["output"]).sum(), out
+
+    gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, out), (by_param, by_input) = gradient(case.params, case.inputs)
+    assert_outputs_close({"output": out, "grad_scalar": total}, case.outputs)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+
+def fused_with(config, tokens, valid):
+    """Return the callback of a BEV encoder that fuses these tokens."""
+
+    def fuse(layer, bev, position):
+        return SdMapFusion(config, name=f"sd_map_{layer}")(bev, position, tokens, valid)
+
+    return fuse
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("smerf_bev_constructer*"), ids=case_id)
+def test_constructer_matches_the_reference(path):
+    case = load_module_case(path)
+    arrays = case.inputs
+    config = replace(golden_config(case), value_projections=2)
+    model, module = BevFormer(config), SdMapModuleConfig(heads=case.meta["config"]["heads"], absent="reference")
+    views = [
+        golden_views({"lidar2img": arrays["lidar2img"][i : i + 1], "img_hw": arrays["img_hw"]}) for i in range(2)
+    ]
+    masks = np.stack([see_pillars(config, view)[1] for view in views])
+    assert (masks[0] != masks[1]).any()
+    counts = np.maximum(masks.any(-1).sum(1), 1)
+    views = jax.tree.map(lambda *leaves: jnp.stack(leaves), *views)
+
+    def scalar(torch_params, inputs):
+        variables = {"params": convert_smerf_bevformer(torch_params).variables["params"]}
+
+        def one(views, count, motion, features, maps, valid):
+            def serve_whom_the_first_sees(run, args, kwargs, context):
+                # The reference's batch bug, see tests/layers/test_bev_attention.py.
+                if context.module.name != "spatial_attention":
+                    return run(*args, **kwargs)
+                out = run(*args[:4], jnp.asarray(masks[0]))
+                bias = context.module.variables["params"]["output_proj"]["bias"][None]
+                return (out - bias) * (counts[0] / count)[:, None] + bias
+
+            with nn.intercept_methods(serve_whom_the_first_sees):
+                return model.apply(
+                    variables, features, views, BevMemory.empty(config), jnp.zeros(2), motion,
+                    fuse=fused_with(module, maps, valid), method="encode",
+                ).reshape(-1, config.dim)  # fmt: skip
+
+        features = [inputs[f"feat{k}"].transpose(0, 1, 3, 4, 2) for k in range(2)]
+        maps = [inputs[f"map_feat{i}"] for i in range(2)]
+        valid = jnp.stack([jnp.arange(6) < len(lines) for lines in maps])
+        maps = jnp.stack([padded(lines, 6) for lines in maps])
+        out = jax.vmap(one)(views, jnp.asarray(counts), jnp.asarray(arrays["can_bus"]), features, maps, valid)
+        return (out * case.weights["output"]).sum(), out
+
+    inputs = {key: value for key, value in arrays.items() if "feat" in key}
+    gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
+    (total, out), (by_param, by_input) = gradient(case.params, inputs)
+    expected = {name: case.outputs[name] for name in ("output", "grad_scalar")}
+    assert_outputs_close({"output": out, "grad_scalar": total}, expected)
+    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+
+    converted = convert_smerf_bevformer(case.params)
+    assert [row["tensor"] for row in converted.table] == list(case.params)
+
+
+MODULE = SdMapModuleConfig(lines=PolylineEncoderConfig(8, 1, 2, 8, 0.0, 4), heads=2)
+VALID = np.array([True, False, True])
+
+
+def small_map(valid=VALID, filler=0.0):
+    points = np.random.default_rng(0).uniform(-20, 20, (3, 11, 2)).astype(np.float32)
+    return SdMap(
+        np.where(valid[:, None, None], points, filler).astype(np.float32),
+        np.where(valid, [0, 7, 1], -5 if np.isnan(filler) else 0).astype(np.int32), valid,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("attend", ["lines", "points"])
+def test_padding_changes_nothing_and_lines_have_no_order(attend):
+    config = replace(MODULE, lines=replace(MODULE.lines, attend=attend, layout="interleaved"))
+    encoder = SdMapEncoder(config)
+    params = random_params(encoder.init, None)
+
+    @jax.jit
+    def run(sd_map):
+        def scalar(params, points):
+            tokens, valid = encoder.apply(params, sd_map.replace(points=points))
+            return jnp.square(tokens).sum(), (tokens, valid)
+
+        return jax.value_and_grad(scalar, (0, 1), has_aux=True)(params, sd_map.points)
+
+    (total, (tokens, valid)), gradients = run(small_map())
+    (_, (same, _)), also = run(small_map(filler=np.nan))
+    np.testing.assert_array_equal(tokens, same)
+    jax.tree.map(np.testing.assert_array_equal, also, gradients)
+    assert total > 0
+    assert valid.tolist() == VALID.tolist()
+    assert not tokens[1].any()
+    assert tokens[np.flatnonzero(VALID)].any(-1).all()
+    order = np.array([2, 0, 1])
+    (_, (turned, _)), _ = run(jax.tree.map(lambda leaf: leaf[order], small_map()))
+    np.testing.assert_allclose(turned, tokens[order], atol=1e-5)
+    alone = small_map(np.array([True, False, False]))
+    (_, (by_itself, _)), _ = run(alone)
+    # Lines look at each other only where they should.
+    assert (np.abs(by_itself[0] - tokens[0]).max() > 1e-3) == (attend == "lines")
+
+
+@pytest.mark.parametrize("attend", ["lines", "points"])
+@pytest.mark.parametrize("lines", [0, 1])
+def test_sizes_of_a_map(attend, lines):
+    encoder = PolylineEncoder(replace(MARKER_POLYLINES, dim=8, layers=1, heads=2, hidden=8, attend=attend))
+    points, labels, valid = jnp.ones((lines, 3, 2)), jnp.zeros((lines, 0)), jnp.ones(lines, bool)
+    params = random_params(encoder.init, jnp.ones((1, 3, 2)), jnp.zeros((1, 0)), jnp.ones(1, bool))
+    out = jax.jit(encoder.apply)(params, points, labels, valid)
+    assert out.shape == (lines, 8)
+    assert np.isfinite(out).all()
+
+
+@pytest.mark.parametrize("absent", ["nothing", "reference"])
+@pytest.mark.parametrize("lines", [0, 3])
+def test_a_map_without_lines_changes_no_feature(absent, lines):
+    rng = np.random.default_rng(1)
+    bev, position = (jnp.asarray(rng.normal(size=(5, 8)), jnp.float32) for _ in range(2))
+    fusion = SdMapFusion(replace(MODULE, absent=absent))
+    params = random_params(fusion.init, bev, position, jnp.ones((1, 6)), jnp.ones(1, bool))
+
+    @jax.jit
+    def run(bev, tokens, valid):
+        out, pull = jax.vjp(lambda p, b, t: fusion.apply(p, b, position, t, valid), params, bev, tokens)
+        return out, pull(jnp.ones_like(out))
+
+    out, (by_params, by_bev, by_tokens) = run(bev, jnp.full((lines, 6), jnp.nan), jnp.zeros(lines, bool))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(by_params))
+    assert not by_tokens.any()
+    if absent == "nothing":
+        np.testing.assert_array_equal(out, bev)
+        np.testing.assert_array_equal(by_bev, np.ones((5, 8)))
+        assert not any(leaf.any() for leaf in jax.tree.leaves(by_params))
+    else:
+        inner = jax.tree.map(np.asarray, params["params"])
+        total = np.asarray(bev) + inner["attention"]["output"]["bias"]
+        unit = (total - total.mean(-1, keepdims=True)) / np.sqrt(total.var(-1, keepdims=True) + 1e-5)
+        np.testing.assert_allclose(out, unit * inner["norm"]["scale"] + inner["norm"]["bias"], atol=1e-5)
+
+
+class Fused(nn.Module):
+    """A host's encoder with a map."""
+
+    encoder: nn.Module
+    fuses: bool = True
+
+    @nn.compact
+    def __call__(self, sd_map, *inputs):
+        tokens, valid = SdMapEncoder(MODULE, name="sd_map")(sd_map)
+        return self.encoder(*inputs, fuse=fused_with(MODULE, tokens, valid) if self.fuses else None)
+
+
+def evidence():
+    raster = np.random.default_rng(2).integers(0, 256, (8, 16, 4), np.uint8)
+    return EvidenceEncoder(EvidenceEncoderConfig(8, 4, (1, 2))), (raster,)
+
+
+def cameras():
+    return BevFormer(replace(CONFIG, remat=True)), (levels(), ring(), None, jnp.eye(4))
+
+
+@pytest.mark.parametrize(("make", "layers"), [(evidence, 2), (cameras, 1)], ids=["evidence", "cameras"])
+def test_encoders_fuse_the_map_in_every_layer(make, layers):
+    encoder, inputs = make()
+    fused, plain = Fused(encoder), Fused(encoder, fuses=False)
+    params = random_params(fused.init, None, *inputs)
+    own = {path for path, _ in jax.tree.leaves_with_path(params)}
+    found = {key.key for path in own for key in path if key.key.startswith("sd_map_")}
+    assert found == {f"sd_map_{i}" for i in range(layers)}
+
+    @jax.jit
+    def run(params, sd_map):
+        def scalar(params):
+            out = fused.apply(params, sd_map, *inputs)
+            return jnp.square(out).sum(), out
+
+        (_, out), gradients = jax.value_and_grad(scalar, has_aux=True)(params)
+        return out, gradients
+
+    out, gradients = run(params, small_map(filler=np.nan))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+    assert all(
+        np.asarray(leaf).any() for path, leaf in jax.tree.leaves_with_path(gradients)
+        if any(key.key.startswith("sd_map") for key in path) and "key/bias" not in jax.tree_util.keystr(
+            path, simple=True, separator="/")
+    )  # fmt: skip
+    absent, gradients = run(params, small_map(np.zeros(3, bool), np.nan))
+    assert np.abs(out - absent).max() > 0.05
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+    # A host that never looked at a map, with the parameters that it would have.
+    without = jax.jit(lambda p: plain.apply(p, None, *inputs))(params)
+    np.testing.assert_allclose(absent, without, atol=1e-5)
+
+
+def test_paper_size_has_the_published_parameters():
+    module = SdMapModuleConfig()
+    tokens, valid = jnp.zeros((2, 256)), jnp.ones(2, bool)
+    encoder = jax.eval_shape(SdMapEncoder(module).init, jax.random.key(0), None)
+    assert sum(leaf.size for leaf in jax.tree.leaves(encoder)) == 2_467_072
+    config = BevFormerConfig(grid=BevGrid(), levels=1, cameras=2)
+    views = jax.tree.map(jnp.asarray, ring(2, (32, 32)))
+    init = lambda fuse: jax.eval_shape(  # noqa: E731
+        lambda f: BevFormer(config).init(jax.random.key(0), f, views, None, jnp.eye(4), fuse=fuse),
+        [jax.ShapeDtypeStruct((2, 4, 4, 256), jnp.float32)],
+    )
+    fuses = (fused_with(module, tokens, valid), None)
+    sizes = [sum(leaf.size for leaf in jax.tree.leaves(init(fuse))) for fuse in fuses]
+    assert sizes[0] - sizes[1] == 8_458_688 - 7_667_648
+
+
+def test_a_map_is_where_its_coordinates_are():
+    """The same road seen from two places is the same road: normalised by the range of the prior."""
+    wide = PerceptionRange((-20.0, 20.0), (-10.0, 10.0))
+    prior = SdMapPriorConfig(range=wide)
+    encoder = SdMapEncoder(replace(MODULE, prior=prior))
+    params = random_params(encoder.init, None)
+    half = small_map()
+    double = replace(MODULE, prior=SdMapPriorConfig(range=PerceptionRange((-40.0, 40.0), (-20.0, 20.0))))
+    tokens, _ = jax.jit(encoder.apply)(params, half)
+    scaled, _ = jax.jit(SdMapEncoder(double).apply)(params, half.replace(points=2 * half.points))
+    np.testing.assert_allclose(tokens, scaled, atol=1e-5)

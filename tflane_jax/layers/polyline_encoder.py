@@ -1,0 +1,118 @@
+"""Polylines to tokens: a sine encoding of their points, and a transformer.
+
+SMERF (Luo et al. 2024; specs/modules.md section 9) makes one token of the points of a line, and lines look at each
+other. Marker fusion (section III-A) lets the points of a line look at each other before one token is made of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
+
+Layout = Literal["blocks", "interleaved"]
+
+
+def temperature_encoding(
+    coordinates: Float[Array, "*b d"], bands: int, *, temperature: float = 1000.0, layout: Layout = "blocks"
+) -> Float[Array, "*b f"]:
+    """Return sines and cosines of 2 pi p / temperature^(2 j / bands), j < bands / 2, of every coordinate p.
+
+    Eq. (1) of marker fusion (bands 32, interleaved), and SMERF's encoding (bands 16, blocks); f = d bands.
+
+    Args:
+        coordinates: in [0, 1] across the perception range; others are encoded as well.
+        bands: channels of each coordinate, even.
+        temperature: the slowest wave is nearly this many times as long as the fastest.
+        layout: the channels of a coordinate: "blocks" has all sines, then all cosines; "interleaved" has them in turn.
+
+    Raises:
+        ValueError: an odd number of bands.
+    """
+    if bands % 2:
+        raise ValueError(f"every frequency has a sine and a cosine, so bands must be even, not {bands}")
+    frequency = 2.0 * math.pi * temperature ** (-2.0 * jnp.arange(bands // 2, dtype=coordinates.dtype) / bands)
+    angle = coordinates[..., None] * jnp.expand_dims(frequency, tuple(range(coordinates.ndim)))
+    waves = jnp.stack([jnp.sin(angle), jnp.cos(angle)], -2 if layout == "blocks" else -1)
+    return waves.reshape(*coordinates.shape[:-1], coordinates.shape[-1] * bands)
+
+
+@dataclass(frozen=True)
+class PolylineEncoderConfig:
+    """Sizes of the encoder; the defaults are SMERF's.
+
+    Attributes:
+        dim: channels of a token.
+        layers, heads, hidden, dropout: of the transformer.
+        bands, temperature, layout: of the encoding of points.
+        attend: who looks at whom, "lines" (SMERF) or the "points" of one line (marker fusion).
+    """
+
+    dim: int = 256
+    layers: int = 6
+    heads: int = 4
+    hidden: int = 256
+    dropout: float = 0.1
+    bands: int = 16
+    temperature: float = 1000.0
+    layout: Layout = "blocks"
+    attend: Literal["lines", "points"] = "lines"
+
+
+# Marker fusion, section IV-C.
+MARKER_POLYLINES = PolylineEncoderConfig(bands=32, layout="interleaved", attend="points")
+
+
+class PolylineEncoder(nn.Module):
+    """N polylines of P points to N tokens."""
+
+    config: PolylineEncoderConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        points: Float[Array, "n p 2"],
+        labels: Float[Array, "n k"],
+        valid: Bool[Array, " n"],
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "n c"]:
+        """Return one token for each line, 0 for an invalid one.
+
+        Args:
+            points: in [0, 1] across the perception range.
+            labels: what else is known of a line, such as its category; k may be 0.
+            valid: what stands in other lines changes nothing.
+            deterministic: no dropout; with it, the key `dropout` is needed.
+        """
+        config, (lines, count) = self.config, points.shape[:2]
+        points, labels = jnp.where(valid[:, None, None], points, 0.0), jnp.where(valid[:, None], labels, 0.0)
+        x = temperature_encoding(points, config.bands, temperature=config.temperature, layout=config.layout)
+        embed = nn.Dense(config.dim, name="embed")
+        sizes = TransformerConfig(config.heads, config.hidden, config.dropout)
+        if config.attend == "lines":
+            x = embed(jnp.concatenate([x.reshape(lines, count * x.shape[-1]), labels], -1))
+            nowhere, mask = jnp.zeros_like(x), key_mask(valid)
+            for i in range(config.layers):
+                x = EncoderLayer(sizes, name=f"layer_{i}")(x, nowhere, mask, deterministic=deterministic)
+        else:
+            each = jnp.broadcast_to(labels[:, None], (lines, count, labels.shape[-1]))
+            x = embed(jnp.concatenate([x, each], -1))
+            nowhere = jnp.zeros_like(x)
+            for i in range(config.layers):
+                layer = EncoderLayer(sizes, name=f"layer_{i}")
+                over_lines = nn.vmap(
+                    lambda layer, x, nowhere: layer(x, nowhere, deterministic=deterministic),
+                    variable_axes={"params": None, "intermediates": 0},
+                    split_rngs={"params": False, "dropout": True}, in_axes=0,
+                )  # fmt: skip
+                x = over_lines(layer, x, nowhere)
+            x = nn.Dense(config.dim, name="out")(x.reshape(lines, count * config.dim))
+        return jnp.where(valid[:, None], x, 0.0)

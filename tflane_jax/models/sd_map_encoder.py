@@ -1,0 +1,98 @@
+"""SMERF (Luo et al. 2024): an SD map as tokens, to which BEV queries attend; specs/modules.md section 9.
+
+A host encodes the map once a frame, and fuses it in every layer of its BEV encoder, behind the cameras:
+
+    tokens, valid = SdMapEncoder(config, name="sd_map")(example.sd_map)
+
+    def fuse(layer, bev, position):
+        return SdMapFusion(config, name=f"sd_map_{layer}")(bev, position, tokens, valid)
+
+The BEV encoder takes `fuse`; the parameters of a fusion stand below the layer that calls it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
+from tflane_jax.scene import SdMap
+
+
+@dataclass(frozen=True)
+class SdMapModuleConfig:
+    """Sizes of encoder and fusion; the defaults are SMERF's, `SMALL_SD_MAP` trains on two CPU cores.
+
+    Attributes:
+        prior: coordinates and labels.
+        lines: from polylines to tokens.
+        heads: of the attention to the tokens.
+        absent: where no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias
+            of the attention's output and normalises, as the published code does with an empty map beside a full one.
+    """
+
+    prior: SdMapPriorConfig = SdMapPriorConfig()
+    lines: PolylineEncoderConfig = PolylineEncoderConfig()
+    heads: int = 4
+    absent: Literal["nothing", "reference"] = "nothing"
+
+
+SMALL_SD_MAP = SdMapModuleConfig(lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0))
+
+# Points on a line of the map that stands for an absent one.
+POINTS = 11
+
+
+class SdMapEncoder(nn.Module):
+    """An SD map to one token for each line."""
+
+    config: SdMapModuleConfig
+
+    @nn.compact
+    def __call__(
+        self, sd_map: SdMap | None, *, deterministic: bool = True
+    ) -> tuple[Float[Array, "r d"], Bool[Array, " r"]]:
+        """Return tokens, 0 in padding, and which of them are valid.
+
+        Args:
+            sd_map: None, of a dataset without SD maps, is a map without lines. Parameters depend on the number of
+                points on a line: those made without a map fit maps of 11 points, as `ExampleConfig.sd_map` gives.
+            deterministic: no dropout; with it, the key `dropout` is needed.
+        """
+        if sd_map is None:
+            sd_map = jax.tree.map(jnp.asarray, SdMap.empty(1, POINTS))
+        seen = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior)
+        encoder = PolylineEncoder(self.config.lines, name="lines")
+        return encoder(seen.points, seen.labels, seen.valid, deterministic=deterministic), seen.valid
+
+
+class SdMapFusion(nn.Module):
+    """BEV queries look at the lines of the map: masked attention, residual, norm."""
+
+    config: SdMapModuleConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        bev: Float[Array, "q c"],
+        position: Float[Array, "q c"],
+        tokens: Float[Array, "r d"],
+        valid: Bool[Array, " r"],
+    ) -> Float[Array, "q c"]:
+        """Return the BEV features after the fusion; where no line is valid, see `SdMapModuleConfig.absent`."""
+        dim, present = bev.shape[-1], valid.any()
+        attention = MultiHeadAttention(dim, self.config.heads, name="attention")
+        found = attention(bev + position, tokens, tokens, key_mask(valid))
+        if self.config.absent == "reference":
+            # Attention over nothing is 0 before the output's projection there, and behind it here.
+            found = jnp.where(present, found, attention.variables["params"]["output"]["bias"][None])
+        fused = nn.LayerNorm(epsilon=1e-5, name="norm")(bev + found)
+        return fused if self.config.absent == "reference" else jnp.where(present, fused, bev)

@@ -1,0 +1,57 @@
+"""The SD-map prior of SMERF (Luo et al. 2024), up to the learned part: road-level polylines as coordinates and labels.
+
+The same lines run in numpy when data is loaded and under jit, whichever arrays come in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry.namespace import namespace
+from tflane_jax.scene import SdCategory, SdMap
+
+
+@dataclass(frozen=True)
+class SdMapPriorConfig:
+    """How an SD map becomes tokens.
+
+    Attributes:
+        range: the box that normalised coordinates span.
+        categories: labels, `scene.SdCategory`; a category beyond them counts as the last.
+    """
+
+    range: PerceptionRange = BevGrid().range
+    categories: int = len(SdCategory)
+
+
+@struct.dataclass
+class SdMapTokens:
+    """An SD map of R lines of P points as numbers for a network.
+
+    Attributes:
+        points: (R, P, 2) in [0, 1] across the range, beyond it outside; 0 in padding.
+        labels: (R, K) one-hot category; 0 in padding.
+        valid: (R,).
+    """
+
+    points: Float[Array, "r p 2"]
+    labels: Float[Array, "r k"]
+    valid: Bool[Array, " r"]
+
+
+def sd_map_tokens(sd_map: SdMap, config: SdMapPriorConfig) -> SdMapTokens:
+    """Return the tokens of one frame's SD map; padding may hold anything."""
+    xp = namespace(sd_map.points, sd_map.category, sd_map.valid)
+    points = xp.where(sd_map.valid[:, None, None], sd_map.points, 0.0)
+    known = (sd_map.category >= 0) & (sd_map.category < config.categories)
+    category = xp.where(known, sd_map.category, config.categories - 1)
+    labels = (category[:, None] == xp.arange(config.categories)[None]) & sd_map.valid[:, None]
+    return SdMapTokens(
+        points=xp.where(sd_map.valid[:, None, None], config.range.normalise(points), 0.0),
+        labels=labels.astype(points.dtype),
+        valid=sd_map.valid,
+    )

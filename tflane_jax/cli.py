@@ -71,7 +71,6 @@ def build_parser() -> argparse.ArgumentParser:
     _convert(commands)
     _export(commands)
     _data(commands)
-    _markers(commands)
     _summary(commands)
     _compare(commands)
     _score(commands)
@@ -214,23 +213,6 @@ def _data(commands) -> None:
     build.set_defaults(takes_overrides=True)
 
 
-def _markers(commands) -> None:
-    parser = commands.add_parser("markers", help="work with fiducial markers",
-                                 description="Work with fiducial markers.")  # fmt: skip
-    inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
-    store = _command(inner, "store", "write which lanes the markers of a log name", module="marker_store",
-                     function="run")  # fmt: skip
-    store.add_argument("--log", metavar="SCENE|FOLDER", required=True,
-                       help="number of a world scene, or an Argoverse 2 log, which gets virtual markers")  # fmt: skip
-    store.add_argument("--out", metavar="FILE", type=Path, default=Path("store.json"), help="default store.json")
-    store.add_argument("--radius", type=float, default=50.0, help="lanes so near to a marker, metres (default 50)")
-    store.add_argument("--frame", choices=("marker", "survey"), default="marker",
-                       help="of the lanes in the file: the marker's, or the map's (default marker)")  # fmt: skip
-    store.add_argument("--bike-lanes", choices=("include", "exclude"), default="include", help="default include")
-    store.add_argument("--surveyed", metavar="YYYY-MM-DD", help="day of the survey")
-    store.add_argument("--expires", metavar="YYYY-MM-DD", help="first day on which the entries count no longer")
-
-
 def _summary(commands) -> None:
     parser = _command(commands, "summary", "count a model's parameters, operations and memory",
                       module="summary", function="run", epilog=_OVERRIDES)  # fmt: skip
@@ -268,8 +250,10 @@ def _score(commands) -> None:
 
 
 def _markers(commands) -> None:
-    parser = commands.add_parser("markers", help="find fiducial markers", description="Fiducial markers.")
+    parser = commands.add_parser("markers", help="find fiducial markers, and store the lanes that they name",
+                                 description="Fiducial markers.")  # fmt: skip
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    _marker_store(inner)
     detect = _command(inner, "detect", "find markers in photos of a calibrated camera", module="markers",
                       function="find")  # fmt: skip
     detect.add_argument("images", metavar="IMAGES", nargs="+", type=Path, help="photos, or folders of photos")
@@ -301,6 +285,20 @@ def _markers(commands) -> None:
                                  help="how corners are found (default pattern subpixel)")  # fmt: skip
         else:
             command.add_argument("--corners", choices=ways, default="pattern", help="how corners are found")
+
+
+def _marker_store(inner) -> None:
+    store = _command(inner, "store", "write which lanes the markers of a log name", module="marker_store",
+                     function="run")  # fmt: skip
+    store.add_argument("--log", metavar="SCENE|FOLDER", required=True,
+                       help="number of a world scene, or an Argoverse 2 log, which gets virtual markers")  # fmt: skip
+    store.add_argument("--out", metavar="FILE", type=Path, default=Path("store.json"), help="default store.json")
+    store.add_argument("--radius", type=float, default=50.0, help="lanes so near to a marker, metres (default 50)")
+    store.add_argument("--frame", choices=("marker", "survey"), default="marker",
+                       help="of the lanes in the file: the marker's, or the map's (default marker)")  # fmt: skip
+    store.add_argument("--bike-lanes", choices=("include", "exclude"), default="include", help="default include")
+    store.add_argument("--surveyed", metavar="YYYY-MM-DD", help="day of the survey")
+    store.add_argument("--expires", metavar="YYYY-MM-DD", help="first day on which the entries count no longer")
 
 
 def _demo(commands) -> None:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax.numpy as jnp
 from flax import struct
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import BevGrid
@@ -178,8 +179,10 @@ class BevEncoderLayer(nn.Module):
             config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
         )
         queries = add(queries, spatial(queries, tokens, shapes, reference, visible), "spatial")
+        # Barriers, so that a prior that is absent leaves what a layer without priors computes, to the bit.
+        queries = lax.optimization_barrier(queries)
         if fuse is not None:
-            queries = fuse(queries, position)
+            queries = lax.optimization_barrier(fuse(queries, position))
         x = nn.relu(nn.Dense(config.hidden, kernel_init=init, dtype=config.dtype, name="expand")(queries))
         x = nn.Dropout(config.dropout, name="hidden_dropout")(x, deterministic=deterministic)
         x = nn.Dense(config.dim, kernel_init=init, dtype=config.dtype, name="contract")(x)

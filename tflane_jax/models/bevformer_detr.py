@@ -33,6 +33,8 @@ from tflane_jax.models.lane_decoder import (
 )
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
+from tflane_jax.models.marker_fusion import MarkerFusionConfig
+from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
 from tflane_jax.scene import LaneGraph, Prediction
 
 
@@ -46,6 +48,8 @@ class BevFormerDetrConfig:
         elements: traffic elements in the front view, or None. They need cameras, and as many layers as the decoder.
         control_points: a lane is a Bezier curve of so many control points, read at `decoder.points` points; None: a
             lane is its points. Goes with the loss's setting of the same name.
+        markers: fiducial markers in the BEV encoder, or None.
+        sd_map: an SD map in the BEV encoder (SMERF), or None.
         denoising: noised lanes to train the decoder with, or None as in the baseline.
     """
 
@@ -53,6 +57,8 @@ class BevFormerDetrConfig:
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
     control_points: int | None = None
+    markers: MarkerFusionConfig | None = None
+    sd_map: SdMapModuleConfig | None = None
     denoising: DenoisingConfig | None = None
 
     def build(self) -> BevFormerDetr:

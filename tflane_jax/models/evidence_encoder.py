@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import flax.linen as nn
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.geometry import BevGrid
@@ -56,8 +57,11 @@ class EvidenceEncoder(nn.Module):
         for i, dilation in enumerate(self.config.dilations):
             y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
             x = nn.relu(x + _norm(f"block_{i}_norm")(y))
+            # Barriers, so that a prior that is absent leaves what an encoder without priors computes, to the bit.
+            x = lax.optimization_barrier(x)
             if fuse is not None:
                 x = fuse(i, x.reshape(-1, x.shape[-1]), _positions(x)).reshape(x.shape)
+                x = lax.optimization_barrier(x)
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x

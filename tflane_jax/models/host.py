@@ -7,59 +7,119 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Float
 
 from tflane_jax.models.auxiliary import AUXILIARY
-from tflane_jax.models.bev_encoder import BevMemory
-from tflane_jax.models.camera_encoder import look, make_encoder
+from tflane_jax.models.bev_encoder import BevMemory, Fuse
+from tflane_jax.models.camera_encoder import EncoderConfig, empty_memory, look, make_encoder
 from tflane_jax.models.element_decoder import ElementDecoder, ElementOutput
 from tflane_jax.models.lane_denoising import NoisedQueries
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
+from tflane_jax.models.marker_fusion import (
+    MarkerFusion,
+    MarkerFusionConfig,
+    MarkerTokens,
+    empty_marker_memory,
+    fusion_gate,
+    guide_frame,
+)
+from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion
+from tflane_jax.priors.marker_memory import MarkerMemory
 from tflane_jax.scene import Example, LaneGraph, Prediction
+
+
+@struct.dataclass
+class HostMemory:
+    """What a host carries from frame to frame; what it does not use is None.
+
+    Attributes:
+        bev: BEV features of the frame before.
+        markers: lanes that markers gave in the last frames.
+    """
+
+    bev: BevMemory | None = None
+    markers: MarkerMemory | None = None
 
 
 class Host(nn.Module):
     """A model from an example to the predictions of every decoder layer; subclasses say how lanes are decoded.
 
     Attributes:
-        config: has `encoder`, and `elements` that is None in a host without traffic elements.
+        config: has `encoder`, and `elements`, `markers` and `sd_map`, each None in a host without.
     """
 
     config: Any
 
     def setup(self):
-        self.encoder = make_encoder(self.config.encoder)
-        if self.config.elements is not None:
-            self.elements = ElementDecoder(self.config.elements)
+        config = self.config
+        self.encoder = make_encoder(config.encoder)
+        if config.elements is not None:
+            self.elements = ElementDecoder(config.elements)
+        if config.markers is not None:
+            self.marker_tokens = MarkerTokens(config.markers)
+        if config.sd_map is not None:
+            self.sd_map_tokens = SdMapEncoder(config.sd_map)
 
-    def __call__(self, example: Example, memory: BevMemory | None = None, *, train: bool = False) -> Prediction:
+    def __call__(self, example: Example, memory: HostMemory | None = None, *, train: bool = False) -> Prediction:
         """Return predictions with a leading axis over decoder layers; the last one is the answer."""
         return self.step(example, memory, train=train)[0]
 
     def step(
-        self, example: Example, memory: BevMemory | None = None, *, train: bool = False
-    ) -> tuple[Prediction, BevMemory | None]:
-        """Return what `__call__` does, and the memory for the next frame (None for a model without cameras).
+        self, example: Example, memory: HostMemory | None = None, *, train: bool = False
+    ) -> tuple[Prediction, HostMemory]:
+        """Return what `__call__` does, and the memory for the next frame.
 
         Args:
             example: one frame.
-            memory: of the frame before it; None is a frame on its own. No gradient flows through it.
+            memory: of the frame before it; None is a frame on its own. No gradient flows through its BEV features.
             train: dropout, which needs the key `dropout`, and the batch's own statistics.
 
         Raises:
             UserError: the example lacks what the model reads.
         """
-        seen = look(self.encoder, example, memory, train=train)
+        memory = memory or HostMemory()
+        fuse, markers = self._priors(example, memory.markers, deterministic=not train)
+        seen = look(self.encoder, example, memory.bev, train=train, fuse=fuse)
         elements = None
         if self.config.elements is not None and seen.front is not None:
             elements = self.elements(*seen.front, deterministic=not train)
-        return self.decode_example(example, seen.bev, elements, deterministic=not train), seen.memory
+        answer = self.decode_example(example, seen.bev, elements, deterministic=not train)
+        return answer, HostMemory(seen.memory, markers)
+
+    def _priors(
+        self, example: Example, memory: MarkerMemory | None, *, deterministic: bool
+    ) -> tuple[Fuse | None, MarkerMemory | None]:
+        """Return what the priors add to every layer of the BEV encoder, and the markers' memory for the next frame."""
+        markers, sd_map = self.config.markers, self.config.sd_map
+        fusions = []
+        if sd_map is not None:
+            lines = self.sd_map_tokens(example.sd_map, deterministic=deterministic)
+            fusions.append(lambda bev, position: SdMapFusion(sd_map, name="sd_map")(bev, position, *lines))
+        if markers is not None:
+            guide, memory = guide_frame(example, memory, markers)
+            tokens, (gate, valid) = self.marker_tokens(guide, deterministic=deterministic), fusion_gate(guide, markers)
+            fusions.append(
+                lambda bev, position: MarkerFusion(markers, name="markers")(bev, position, tokens, valid, gate)
+            )
+
+        def fuse(layer: int, bev: Float[Array, "q c"], position: Float[Array, "q c"]) -> Float[Array, "q c"]:
+            for each in fusions:
+                bev = each(bev, position)
+            return bev
+
+        return fuse if fusions else None, memory
 
     def decode_example(
         self, example: Example, bev: Float[Array, "h w e"], elements: ElementOutput | None, *, deterministic: bool
     ) -> Prediction:
         """Return lanes and topology of every decoder layer; a host with priors reads them from the example."""
         raise NotImplementedError
+
+
+def start_memory(encoder: EncoderConfig, markers: MarkerFusionConfig | None) -> HostMemory:
+    """Return the memory of a host before the first frame of a sequence."""
+    return HostMemory(empty_memory(encoder), None if markers is None else empty_marker_memory(markers))
 
 
 def decode_lanes(

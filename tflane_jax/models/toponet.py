@@ -40,6 +40,8 @@ from tflane_jax.models.lane_decoder import (
 )
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
+from tflane_jax.models.marker_fusion import MarkerFusionConfig
+from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
 from tflane_jax.models.traffic_flow_module import (
     SpatialEncoder,
     TemporalEncoder,
@@ -75,6 +77,8 @@ class TopoNetConfig:
         traffic_flow: the TFM and its prior, or None.
         elements: traffic elements in the front view and in the scene graph, or None. They need cameras, and as many
             layers as the decoder.
+        markers: fiducial markers in the BEV encoder, or None.
+        sd_map: an SD map in the BEV encoder (SMERF), or None.
         denoising: noised lanes to train the decoder with, or None as in the paper.
     """
 
@@ -82,6 +86,8 @@ class TopoNetConfig:
     decoder: LaneDecoderConfig = LaneDecoderConfig()
     traffic_flow: TrafficFlowConfig | None = None
     elements: ElementDecoderConfig | None = None
+    markers: MarkerFusionConfig | None = None
+    sd_map: SdMapModuleConfig | None = None
     denoising: DenoisingConfig | None = None
 
     def build(self) -> TopoNet:

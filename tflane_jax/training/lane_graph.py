@@ -14,9 +14,8 @@ from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.losses.lane_cells import lane_cell_loss
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_denoising_losses, lane_graph_loss
 from tflane_jax.models.auxiliary import AUXILIARY
-from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.camera_encoder import empty_memory
+from tflane_jax.models.host import HostMemory, start_memory
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.scene import Example, Prediction
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
@@ -86,13 +85,13 @@ class LaneGraphTask:
         """Return the last decoder layer's answer for one example, a frame on its own."""
         return self.step(params, None, example)[1]
 
-    def start(self) -> BevMemory | None:
-        """Return the memory before the first frame of a sequence; None for a host without cameras."""
-        return empty_memory(self.model.encoder)
+    def start(self) -> HostMemory:
+        """Return the memory before the first frame of a sequence."""
+        return start_memory(self.model.encoder, self.model.markers)
 
     def step(
-        self, params: Params, memory: BevMemory | None, example: Example
-    ) -> tuple[BevMemory | None, Prediction]:
+        self, params: Params, memory: HostMemory | None, example: Example
+    ) -> tuple[HostMemory, Prediction]:
         """Return the memory for the next frame, and the answer for this one.
 
         The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a

@@ -1,0 +1,212 @@
+"""Marker fusion: tokens, gate, variants, and a host that must not notice markers that are not there."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example, make_example
+from tests.parameters import random_params
+from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
+from tflane_jax.models.marker_fusion import (
+    LaneNeighbours,
+    MarkerFusion,
+    MarkerFusionConfig,
+    MarkerTokens,
+    fusion_gate,
+    guide_frame,
+)
+from tflane_jax.priors.marker_memory import MarkerMemoryConfig
+from tflane_jax.priors.markers import MarkerPriorConfig
+from tflane_jax.scene import MarkerObservations, stack_examples
+from tflane_jax.training.lane_graph import LaneGraphTask
+
+LINES = PolylineEncoderConfig(
+    dim=8, layers=1, heads=2, hidden=8, dropout=0.0, bands=4, layout="interleaved", attend="points"
+)
+CONFIG = MarkerFusionConfig(
+    prior=MarkerPriorConfig(points=3, lanes=4), lines=LINES, heads=2,
+    memory=MarkerMemoryConfig(frames=3, decay=0.5, threshold=0.05),
+)  # fmt: skip
+HOST = LaneGraphTask(replace(BASELINE, markers=CONFIG))
+PLAIN = LaneGraphTask(BASELINE)
+POSE = np.array([[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)
+
+
+def observed(distance=10.0, lanes=2, seed=0, garbage=0.0, valid=True):
+    """Return one marker with some lanes, and room for another."""
+    rng, out = np.random.default_rng(seed), MarkerObservations.empty(2, 3, 5)
+    out.pose[:], out.lanes[:], out.residual[:], out.score[:] = garbage, garbage, garbage, garbage
+    if valid:
+        out.pose[0] = np.eye(4)
+        out.pose[0, 0, 3] = distance
+        out.residual[0], out.score[0], out.valid[0] = 0.0, 1.0, True
+        out.lane_valid[0, :lanes] = True
+        out.lanes[0, :lanes] = rng.uniform(-20, 20, (lanes, 5, 3))
+        out.successor[0, 0, 1] = lanes > 1
+    return out
+
+
+def seeing(markers, seed=0, **changes):
+    return make_example(seed).replace(markers=markers, previous_from_ego=POSE, **changes)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return random_params(HOST.init, seeing(observed()))
+
+
+@pytest.fixture(scope="module")
+def step():
+    return jax.jit(HOST.step)
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def without_markers(params):
+    """Return the parameters of the host that has none."""
+    if not isinstance(params, dict):
+        return params
+    return {name: without_markers(value) for name, value in params.items() if name not in ("markers", "marker_tokens")}
+
+
+def test_who_never_sees_a_marker_is_the_host_without_markers(params, step):
+    expected = jax.jit(PLAIN.step)(without_markers(params), PLAIN.start(), make_example(0))[1]
+    for markers in (None, observed(valid=False), observed(valid=False, garbage=np.nan), observed(lanes=0)):
+        same(step(params, HOST.start(), seeing(markers, has_previous=np.asarray(False)))[1], expected)
+        same(jax.jit(HOST.predict)(params, seeing(markers)), expected)
+    guided = step(params, HOST.start(), seeing(observed()))[1]
+    assert not np.array_equal(guided.lanes.points, expected.lanes.points)
+
+
+def test_cameras_may_have_markers_too():
+    model = replace(CAMERA_TOPONET, decoder=replace(CAMERA_TOPONET.decoder, dropout=0.0))
+    plain, host = LaneGraphTask(model), LaneGraphTask(replace(model, markers=CONFIG))
+    example = make_camera_example()
+    params = random_params(host.init, example)
+    expected = jax.jit(plain.predict)(without_markers(params), example)
+    predict = jax.jit(host.predict)
+    same(predict(params, example.replace(markers=observed(valid=False, garbage=np.nan))), expected)
+    guided = predict(params, example.replace(markers=observed()))
+    assert not np.array_equal(guided.lanes.points, expected.lanes.points)
+    assert np.isfinite(guided.lanes.points).all()
+
+
+def test_padding_may_hold_nan(params, step):
+    clean, dirty = (seeing(observed(garbage=value)) for value in (0.0, np.nan))
+    same(step(params, HOST.start(), clean), step(params, HOST.start(), dirty))
+    gradient = jax.jit(jax.grad(lambda p, e: HOST.loss(p, e, jax.random.key(0))[0]))
+    batches = [jax.tree.map(jnp.asarray, stack_examples([example])) for example in (clean, dirty)]
+    first, second = (gradient(params, batch) for batch in batches)
+    same(first, second)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(first))
+    assert np.abs(first["marker_tokens"]["lines"]["embed"]["kernel"]).max() > 0
+
+
+def test_stream_equals_scan_and_any_pattern_of_sight_is_one_program(params):
+    traces = []
+
+    @jax.jit
+    def one(memory, example):
+        traces.append(None)
+        return HOST.step(params, memory, example)
+
+    patterns = (True, False, False, False, False), (False, True, True, False, True)
+    for pattern in patterns:
+        frames = [
+            seeing(observed(seed=i, valid=seen), i, has_previous=np.asarray(i > 0)) for i, seen in enumerate(pattern)
+        ]
+        memory, answers = HOST.start(), []
+        for frame in frames:
+            memory, answer = one(memory, frame)
+            answers.append(answer)
+        scan = jax.jit(lambda frames: lax.scan(partial(HOST.step, params), HOST.start(), frames))
+        last, scanned = scan(jax.tree.map(jnp.asarray, stack_examples(frames)))
+        same(last, memory)
+        same(scanned, jax.tree.map(lambda *leaves: np.stack(leaves), *answers))
+    assert len(traces) == 1
+
+
+def test_a_gap_is_bridged_as_long_as_the_bank_remembers(params, step):
+    gap = [seeing(None, i, has_previous=np.asarray(True)) for i in range(1, 4)]
+    memory = step(params, HOST.start(), seeing(observed()))[0]
+    differs = []
+    for frame in gap:
+        memory, answer = step(params, memory, frame)
+        alone = step(params, HOST.start(), frame)[1]
+        differs.append(not np.array_equal(answer.lanes.points, alone.lanes.points))
+    assert differs == [True, True, False]
+
+
+def fused(config, guide, bev, position):
+    module = MarkerFusion(config)
+    tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
+    gate, valid = fusion_gate(guide, config)
+    variables = random_params(lambda key: module.init(key, bev, position, tokens, valid, gate))
+    return module.apply(variables, bev, position, tokens, valid, gate), variables, tokens
+
+
+def test_the_gate_is_the_confidence_and_its_variants():
+    rng = np.random.default_rng(0)
+    bev, position = (jnp.asarray(rng.normal(size=(5, 8)), jnp.float32) for _ in range(2))
+    near, far = (guide_frame(seeing(observed(d)), None, CONFIG)[0] for d in (10.0, 80.0))
+    np.testing.assert_allclose([near.gate, far.gate], np.exp([-0.25, -2.0]), rtol=1e-5)
+    out, variables, tokens = fused(CONFIG, near, bev, position)
+    variables = jax.tree.map(np.asarray, variables)
+    attention = variables["params"]["attention"]
+
+    def heads(x, name):
+        return (x @ attention[name]["kernel"] + attention[name]["bias"]).reshape(len(x), 2, 4).transpose(1, 0, 2)
+
+    seen = np.asarray(tokens)[np.asarray(near.valid)]
+    q, k, v = heads(np.asarray(bev + position), "query"), heads(seen, "key"), heads(seen, "value")
+    weights = np.exp(q @ k.transpose(0, 2, 1) / 2)
+    weights /= weights.sum(-1, keepdims=True)
+    found = (weights @ v).transpose(1, 0, 2).reshape(5, 8) @ attention["output"]["kernel"]
+    total = np.asarray(bev) + np.exp(-0.25) * (found + attention["output"]["bias"])  # Eq. (3)
+    normed = (total - total.mean(-1, keepdims=True)) / np.sqrt(total.var(-1, keepdims=True) + 1e-5)
+    norm = variables["params"]["norm"]
+    np.testing.assert_allclose(out, normed * norm["scale"] + norm["bias"], atol=1e-4)
+
+    uniform, hard = (replace(CONFIG, fusion=kind) for kind in ("uniform", "hard"))
+    same(fused(uniform, near, bev, position)[0], fused(uniform, far, bev, position)[0])
+    same(fused(hard, near, bev, position)[0], fused(uniform, near, bev, position)[0])
+    same(fused(hard, far, bev, position)[0], bev)
+    assert not np.array_equal(out, fused(CONFIG, far, bev, position)[0])
+
+
+@pytest.mark.parametrize("encoding", ["sine", "transformer", "mlp"])
+@pytest.mark.parametrize("connectivity", [False, True])
+def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
+    module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity))
+    guide = guide_frame(seeing(observed()), None, CONFIG)[0]
+    variables = random_params(module.init, guide)
+    tokens = np.asarray(module.apply(variables, guide))
+    assert tokens.shape == (4, 8)
+    np.testing.assert_array_equal(tokens[2:], 0.0)
+    half = module.apply(variables, guide.replace(weight=0.5 * guide.weight))
+    np.testing.assert_allclose(half, 0.5 * tokens, rtol=1e-6)
+    # Moving the second lane changes the first one's token only along an edge.
+    moved = guide.replace(points=guide.points.at[1].add(3.0))
+    changed = np.asarray(module.apply(variables, moved))
+    assert not np.allclose(changed[1], tokens[1])
+    assert np.array_equal(changed[0], tokens[0]) != connectivity
+
+
+def test_messages_follow_the_direction_of_edges():
+    module, tokens = LaneNeighbours(8), jnp.eye(4, 8)
+    edges = np.zeros((1, 4, 4), bool)
+    edges[0, 0, 1] = edges[0, 0, 2] = True
+    variables = random_params(module.init, tokens, edges)
+    out = np.asarray(module.apply(variables, tokens, edges))
+    after, before = (np.asarray(variables["params"][name]["kernel"]) for name in ("successors", "predecessors"))
+    expected = np.asarray(tokens).copy()
+    expected[0] += (after[1] + after[2]) / 2
+    expected[1:3] += before[0]
+    np.testing.assert_allclose(out, expected, rtol=1e-5)

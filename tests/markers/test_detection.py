@@ -251,8 +251,21 @@ def test_refinement_finds_its_way_back_and_stays_where_there_is_no_pattern():
     guess = expected + np.array([(1.5, -1.0), (-1.2, 0.8), (0.5, 1.4), (-1.0, -1.0)])
     cells = marker_cells(ARUCO, 21)
     assert np.abs(refine_corners(grey, guess, cells) - expected).max() < 0.1
-    for blank in (np.full_like(grey, 90), np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)):
-        np.testing.assert_array_equal(refine_corners(blank, guess, cells), guess)
+    np.testing.assert_array_equal(refine_corners(np.full_like(grey, 90), guess, cells), guess)
+    noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
+    assert np.abs(refine_corners(noise, guess, cells) - guess).max() < 0.6 * 10.5  # cells, pixels of a cell
+
+
+def test_what_hides_a_part_of_the_board_moves_the_corners_little():
+    """A post before the right margin, as dark as the square."""
+    truth = pose(12.0, 0.3, 2.0)
+    image = photo(AHEAD, {21: truth})
+    expected = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
+    right = round(float(expected[1, 0])) + 4
+    image[:, right : right + 9] = 25
+    found = find_markers(image)
+    assert found.marker_id.tolist() == [21]
+    assert np.abs(found.corners[0] - expected).max() < 0.25
 
 
 def test_enlarging_keeps_pixels_where_they_are():

@@ -30,8 +30,8 @@ _WINDOWS = (3, 13, 23)
 # Moves the corners by less than a ten-thousandth of a pixel.
 _NUDGE = 3e-8 * np.array([(1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-1.0, 1.0)])
 # Refinement: standard deviation of the blur of lens and pixels, pixels; most steps; how far a corner may move,
-# cells.
-_SPREAD, _STEPS, _REACH = 0.8, 12, 0.6
+# cells; misfit that halves a weight, share of the contrast.
+_SPREAD, _STEPS, _REACH, _DOUBT = 0.8, 12, 0.6, 0.15
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def refine_corners(
 ) -> Float[np.ndarray, "4 2"]:
     """Return the corners (pixels) of the black square for which its cells fit the image best.
 
-    Gauss-Newton on the sum of squares of a + b T(q) - I(H(q)) over points q of the marker and half a cell around it: T
+    Gauss-Newton with Cauchy weights on a + b T(q) - I(H(q)) over points q of the marker and half a cell around it: T
     the printed cells as a lens and pixels blur them, H the homography that the four corners fix, a and b brightness and
     contrast (solved for in each step). All edges of all cells count, not the four corners alone. Where it does not
     settle within a quarter of a cell of where it began, the corners are returned as they came.
@@ -262,7 +262,7 @@ def refine_corners(
         extra = float(np.sqrt(spread**2 - _SPREAD**2))
         picture = cv2.GaussianBlur(picture, (0, 0), extra, borderType=cv2.BORDER_REPLICATE)
     square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], np.float32)
-    now = corners.astype(np.float64)
+    now, weight = corners.astype(np.float64), np.ones_like(s)
     for _ in range(_STEPS):
         # The image and its slope, from the points and from half a pixel to either side of them.
         image_from_square = cv2.getPerspectiveTransform(square, now.astype(np.float32))
@@ -283,15 +283,19 @@ def refine_corners(
         by_corner = np.linalg.inv(at_corners.transpose(2, 0, 1).reshape(8, 8))
         along = np.einsum("cp,ckp->pk", slope, moves) @ by_corner
         unknown = np.column_stack([along, -np.ones_like(s), -template])
-        matrix = unknown.T @ unknown
+        brightness = seen(0.0, 0.0)
+        weighted = (unknown * weight[:, None]).T
+        matrix = weighted @ unknown
         if np.linalg.matrix_rank(matrix) != 10:
             return corners
-        step = np.linalg.solve(matrix, -unknown.T @ seen(0.0, 0.0))
+        step = np.linalg.solve(matrix, -weighted @ brightness)
         if not step[9] > 0.0:
             return corners
         now = now + step[:8].reshape(4, 2)
         if np.abs(now - corners).max() > max(_REACH * cell, 1.0) or not np.isfinite(now).all():
             return corners
+        # What stands before a part of the board fits badly and counts little.
+        weight = 1.0 / (1.0 + ((unknown @ step + brightness) / (_DOUBT * step[9])) ** 2)
         # cv2.remap looks at 1/32 of a pixel.
         if np.abs(step[:8]).max() < 0.02:
             return now

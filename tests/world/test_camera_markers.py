@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.world.camera_scene import FRONT, scene, street
+from tests.world import camera_scene
+from tests.world.camera_scene import scene, street
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import project
 from tflane_jax.logs import PlacedMarkers
@@ -21,6 +22,8 @@ from tflane_jax.world.ring_cameras import CameraRigConfig, draw_rig
 from tflane_jax.world.solid_shapes import box
 
 pytest.importorskip("cv2")
+
+FRONT = replace(camera_scene.FRONT, markers=True)
 
 CAMERA = draw_rig(0, CameraRigConfig(jitter=0.0, scale=0.4))[0]
 WEATHER = draw_weather(np.random.default_rng(0), FrontWeatherConfig(), 0.0)
@@ -185,6 +188,8 @@ def test_a_marker_of_the_log_is_drawn_and_found_and_none_change_nothing():
     assert empty.image.tobytes() == bare.image.tobytes()
     for family in (FAMILY, MarkerFamily.APRILTAG_36H11):
         placed = PlacedMarkers(np.array([17]), (ego @ local)[None], 1.0, family)
+        unasked = render_cameras(replace(plain, markers=placed), 0, replace(FRONT, markers=False))
+        assert unasked.image.tobytes() == bare.image.tobytes()
         views = render_cameras(replace(plain, markers=placed), 0, FRONT)
         found = detect(views, DetectorConfig(family))
         assert found.marker_id[found.valid].tolist() == [17]

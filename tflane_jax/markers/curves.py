@@ -128,7 +128,7 @@ class _Image:
 
 
 def _images(config: CurveConfig) -> Iterator[_Image]:
-    rig = CameraRigConfig(cameras=config.mounts, scale=config.scale, severity=config.severity)
+    rig = CameraRigConfig(cameras=config.mounts, scale=config.scale, severity=config.severity, markers=True)
     for seed in range(config.seeds):
         log, turns = street(seed, config), _turns(seed, config)
         markers = log.markers

@@ -104,7 +104,7 @@ def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
         weather=weather,
         paint=paint,
         scenery=scenery,
-        static=join([scenery.bodies, masts, marker_bodies(log.markers)]),
+        static=join([scenery.bodies, masts, marker_bodies(log.markers if config.markers else None)]),
         panorama=draw_panorama(log_stream(log, Stream.SKY), weather, 3072 if config.scale > LARGE else 1024),
         low=low,
         shade=shade,

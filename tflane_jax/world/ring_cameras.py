@@ -81,6 +81,7 @@ class CameraRigConfig:
         severity: scales the log's own weather and paint wear; 0 gives a clear day, fresh paint and a perfect camera.
         weather: kinds of weather, and what the camera does to its picture.
         element_pixels: a light or sign lower than this in the native image is not part of the truth.
+        markers: draw the scene's fiducial markers, which may hide what stands behind their boards.
     """
 
     cameras: tuple[CameraMount, ...] = NUSCENES_RING
@@ -90,6 +91,7 @@ class CameraRigConfig:
     severity: float = 1.0
     weather: FrontWeatherConfig = FrontWeatherConfig()
     element_pixels: float = 8.0
+    markers: bool = False
 
     @property
     def supersample(self) -> int:

@@ -17,7 +17,7 @@ What the paper leaves open, and the choice here (each an option):
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -67,13 +67,13 @@ class MarkerMemory:
     @classmethod
     def empty(cls, frames: int, lanes: int, points: int) -> MarkerMemory:
         """Return a bank that remembers nothing, for L lanes of K points a frame."""
-        nothing: Any = cls(
-            points=np.zeros((frames, lanes, points, 2), np.float32),
-            confidence=np.zeros((frames, lanes), np.float32),
-            successor=np.zeros((frames, lanes, lanes), bool),
-            valid=np.zeros((frames, lanes), bool),
-        )  # pyright: ignore[reportArgumentType]
-        return nothing
+        zeros: Any = np.zeros  # numpy's arrays stand for JAX's everywhere
+        return cls(
+            points=zeros((frames, lanes, points, 2), np.float32),
+            confidence=zeros((frames, lanes), np.float32),
+            successor=zeros((frames, lanes, lanes), bool),
+            valid=zeros((frames, lanes), bool),
+        )
 
 
 @struct.dataclass

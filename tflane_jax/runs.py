@@ -55,7 +55,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     system = system_of(config)
     data = system.load(config.data.source("train"), progress=progress)
     system.check(config, data)
-    arrays = system.examples(data)
+    arrays = system.examples(config, data)
     validation = system.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:

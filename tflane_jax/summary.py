@@ -66,7 +66,9 @@ def prediction_program(task: Task, example: Any, *, compiled: bool = True) -> Pr
 def training_program(
     task: Task, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
-    """Return what a whole update costs: loss, gradient, optimiser, moving average."""
+    """Return what a whole update costs: loss, gradient, optimiser, moving average; of clips for a task of clips."""
+    clip = getattr(task, "clip", 1)
+    example = example if clip == 1 else shapes_of(example, clip)
     optimizer, step = make_optimizer(optim, 1000), make_update_step(task, optim, 1000)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
     lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))

@@ -97,7 +97,7 @@ def observe(
     poses = {int(row): np.asarray(detected.pose[row], np.float64) for row, _ in known}
     known.sort(key=lambda pair: np.hypot(*poses[int(pair[0])][:2, 3]))
 
-    out, lanes_dropped = _empty(markers, lanes, points), 0
+    out, lanes_dropped = MarkerObservations.empty(markers, lanes, points), 0
     for slot, (row, entry) in enumerate(known[:markers]):
         pose = poses[int(row)]
         before = None if previous is None else _pose_of(previous, entry.marker_id)
@@ -132,16 +132,6 @@ def _pose_of(detected: Detected, marker_id: int) -> Float[np.ndarray, "4 4"] | N
     rows = _best(detected)
     rows = rows[np.asarray(detected.marker_id)[rows] == marker_id]
     return np.asarray(detected.pose[rows[0]], np.float64) if len(rows) else None
-
-
-def _empty(markers: int, lanes: int, points: int) -> MarkerObservations:
-    number = np.zeros(markers, np.int32)
-    return MarkerObservations(
-        marker_id=number, pose=np.tile(np.eye(4, dtype=np.float32), (markers, 1, 1)),
-        score=np.zeros(markers, np.float32), residual=np.zeros(markers, np.float32),
-        lanes=np.zeros((markers, lanes, points, 3), np.float32), lane_valid=np.zeros((markers, lanes), bool),
-        successor=np.zeros((markers, lanes, lanes), bool), valid=np.zeros(markers, bool),
-    )  # fmt: skip
 
 
 def _fill_lanes(

@@ -65,7 +65,7 @@ class System(Protocol):
         """Return a split, as `evaluate` takes it: in memory, or a `datasets.streaming.Streamed` of it."""
         ...
 
-    def examples(self, data: Any) -> Any:
+    def examples(self, config: Any, data: Any) -> Any:
         """Return the examples of a split: what training looks at, as `training.batches` takes it."""
         ...
 

@@ -78,7 +78,7 @@ class LaneCurveSystem:
         images = load_tusimple(dataset, progress=progress)
         return LabelledImages(images, tuple(dataset.truth(index) for index in range(len(dataset))))
 
-    def examples(self, data: LabelledImages) -> RoadImage:
+    def examples(self, config: RunConfig, data: LabelledImages) -> RoadImage:
         """Return the images with their lines."""
         return data.images
 

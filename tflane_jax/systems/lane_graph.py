@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from tflane_jax.config import LaneGraphSource, RunConfig
@@ -59,9 +60,11 @@ class LaneGraphSystem:
             return Streamed(dataset, select=select)
         return load_arrays(dataset, parts=TRAINING_PARTS, progress=progress)
 
-    def examples(self, data: Example | Streamed) -> Example | Streamed:
-        """Return the examples themselves."""
-        return data
+    def examples(self, config: RunConfig, data: Example | Streamed) -> Example | Streamed:
+        """Return the examples themselves, or the clips that they are in."""
+        task = config.task
+        assert isinstance(task, LaneGraphTask)
+        return data if task.clip == 1 else clips(data, task.clip)
 
     def shapes(self, config: RunConfig) -> Example:
         """Return shapes of the training parts of an example."""
@@ -186,6 +189,23 @@ def titles(dataset: Dataset, indices: Sequence[int]) -> list[str]:
     """Return a title for the picture of each example."""
     infos = [dataset.info(index) for index in indices]
     return [f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]
+
+
+def clips(data: Example | Streamed, length: int) -> Example:
+    """Return the examples of a split as clips of `length` successive frames, another axis behind the first.
+
+    Raises UserError where the clips would not lie within scenes, or the data are read while they are used.
+    """
+    if isinstance(data, Streamed):
+        raise UserError("clips are made of data in memory, and these are too many for it: train with fewer scenes")
+    frames = len(data.has_previous)
+    begins = ~np.asarray(data.has_previous)
+    inner = np.arange(frames) % length > 0
+    if frames % length or (begins & inner).any():
+        raise UserError(
+            f"scenes do not split into clips of {length} frames: set data.world.keyframes to a multiple of task.clip"
+        )
+    return jax.tree.map(lambda leaf: leaf.reshape(frames // length, length, *leaf.shape[1:]), data)
 
 
 def _source(config: RunConfig, split) -> LaneGraphSource:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+from jax import lax
 
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.metrics.frames import detections_from_prediction, truth_from_example
@@ -22,6 +23,12 @@ def predict_batch(task: Task, params: Params, batch: Any) -> Any:
     return jax.vmap(task.predict, in_axes=(None, 0))(params, batch)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def predict_stream(task: Any, params: Params, memory: Any, frames: Any) -> tuple[Any, Any]:
+    """Return the memory behind some frames (leading axis on every leaf) and the answers, one frame after the other."""
+    return lax.scan(functools.partial(task.step, params), memory, frames)
+
+
 def predictions(task: Task, params: Params, arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]:
     """Yield the answers for all examples in order: their indices and a stacked tree of numpy arrays.
 
@@ -35,10 +42,19 @@ def predictions(task: Task, params: Params, arrays: Any, batch_size: int) -> Ite
 
 
 def _answered(task: Task, params: Params, arrays: Any, batch_size: int) -> Iterator[tuple[range, Any, Any]]:
-    """Yield indices, examples and answers, the last two stacked; there may be more examples than indices."""
-    params = jax.device_put(params)
+    """Yield indices, examples and answers, the last two stacked; there may be more examples than indices.
+
+    A task that is trained on clips goes through the examples in order, as a stream with memory; where a scene begins,
+    `has_previous` empties it.
+    """
+    params, streams = jax.device_put(params), getattr(task, "clip", 1) > 1
+    memory = task.start() if streams else None  # pyright: ignore[reportAttributeAccessIssue]
     for indices, batch in ordered_batches(arrays, batch_size):
-        answers, kept = jax.device_get(predict_batch(task, params, batch)), slice(len(indices))
+        if streams:
+            memory, answers = predict_stream(task, params, memory, batch)
+        else:
+            answers = predict_batch(task, params, batch)
+        answers, kept = jax.device_get(answers), slice(len(indices))
         yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 
 

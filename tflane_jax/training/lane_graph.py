@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 from flax.traverse_util import flatten_dict
+from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
@@ -28,10 +29,13 @@ class LaneGraphTask:
     Attributes:
         model: the host, with or without priors.
         losses: weights of costs and losses.
+        clip: frames of a scene that training runs through with memory, one after the other; an example is then a clip,
+            a leading axis on every leaf, and evaluation streams through the scenes. 1: frames stand alone.
     """
 
     model: TopoNetConfig | BevFormerDetrConfig = TopoNetConfig()
     losses: LaneGraphLossConfig = LaneGraphLossConfig()
+    clip: int = 1
 
     @property
     def traffic_flow(self) -> TrafficFlowConfig | None:
@@ -39,27 +43,48 @@ class LaneGraphTask:
         return self.model.traffic_flow if isinstance(self.model, TopoNetConfig) else None
 
     def init(self, key: jax.Array, example: Example) -> Params:
-        """Return fresh parameters; `example` gives shapes only."""
+        """Return fresh parameters; `example`, or a clip, gives shapes only."""
+        if self.clip > 1:
+            example = jax.tree.map(lambda leaf: leaf[0], example)
         variables = self.model.build().init(key, example)
         return dict(variables["params"]) | {name: variables[name] for name in (STATISTICS,) if name in variables}
 
     def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
         """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout."""
         learned, statistics = split_statistics(params)
-        module, keys = self.model.build(), jax.random.split(key, len(batch.has_previous))
+        module, keys = self.model.build(), jax.random.split(key, len(jax.tree.leaves(batch)[0]))
 
-        def one(example, key):
+        def frame(memory, statistics, example, key):
             variables, streams = {"params": learned} | statistics, {"dropout": key}
-            kept = [STATISTICS, AUXILIARY]
-            outputs, state = module.apply(variables, example, train=True, mutable=kept, rngs=streams)
+            kept, method = [STATISTICS, AUXILIARY], type(module).step
+            (outputs, memory), state = module.apply(
+                variables, example, memory, train=True, method=method, mutable=kept, rngs=streams
+            )
             updated = {name: value for name, value in state.items() if name == STATISTICS}
             # Flax keeps what is sown in a tuple.
             flat: Any = flatten_dict(state.get(AUXILIARY, {}))
             said = {path[-1]: values[0] for path, values in flat.items()}
-            return outputs, said, updated
+            return memory, updated, (outputs, said)
 
-        train: Any = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
-        outputs, said, updated = train(batch, keys)
+        def alone(example, key):
+            _, updated, told = frame(None, statistics, example, key)
+            return told, updated
+
+        def clip(examples, key):
+            def body(carry, now):
+                memory, updated, told = frame(*carry, *now)
+                return (memory, updated), told
+
+            start = self.start(), statistics
+            (_, updated), told = lax.scan(body, start, (examples, jax.random.split(key, self.clip)))
+            return told, updated
+
+        train: Any = jax.vmap(alone if self.clip == 1 else clip, axis_name=BATCH_AXIS, out_axes=(0, None))
+        (outputs, said), updated = train(batch, keys)
+        if self.clip > 1:
+            outputs, said, batch = jax.tree.map(
+                lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (outputs, said, batch)
+            )
         if outputs.elements is None:
             loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
         elif batch.traffic_elements is None or batch.cameras is None:
@@ -97,6 +122,8 @@ class LaneGraphTask:
         The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a
         leading axis, `lax.scan(partial(task.step, params), task.start(), examples)`.
         """
+        # What depends on parameters alone must not be taken out of a scan: it would be rounded otherwise than in a stream.
+        params, example = lax.optimization_barrier((params, example))
         learned, statistics = split_statistics(params)
         module = self.model.build()
         variables = {"params": learned} | statistics

@@ -1,0 +1,96 @@
+"""Training on clips and evaluating streams: time is a scan, and what is remembered changes the answer."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.models.cases import BASELINE
+from tests.models.test_marker_fusion import CONFIG, observed, seeing
+from tests.parameters import random_params
+from tflane_jax.errors import UserError
+from tflane_jax.scene import shapes_of, stack_examples
+from tflane_jax.summary import training_program
+from tflane_jax.systems.lane_graph import clips
+from tflane_jax.training.evaluate import predictions
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.schedule import OptimConfig
+
+ALONE = LaneGraphTask(replace(BASELINE, markers=CONFIG))
+CLIPS = replace(ALONE, clip=3)
+
+
+def scenes(count=2, length=3, sight=(True, False, False)):
+    """Return frames of some scenes in order, markers in sight in some of them."""
+    return stack_examples([
+        seeing(observed(seed=s, valid=sight[i % len(sight)]), 10 * s + i, has_previous=np.asarray(i > 0))
+        for s in range(count) for i in range(length)
+    ])  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def params():
+    return random_params(ALONE.init, seeing(observed()))
+
+
+def test_clips_keep_the_order_and_stay_within_scenes():
+    frames = scenes()
+    cut = clips(frames, 3)
+    assert cut.lanes.points.shape == (2, 3, *frames.lanes.points.shape[1:])
+    np.testing.assert_array_equal(cut.bev[1, 2], frames.bev[5])
+    for length in (2, 4):
+        with pytest.raises(UserError, match="do not split into clips"):
+            clips(frames, length)
+    clips(scenes(length=4), 2)
+
+
+def test_the_loss_of_clips_is_that_of_their_frames_with_what_was_remembered(params):
+    key = jax.random.key(0)
+    unseen = jax.tree.map(jnp.asarray, scenes(sight=(False,)))
+    of_clips, of_frames = jax.jit(CLIPS.loss), jax.jit(ALONE.loss)
+    # Without a marker there is nothing to remember.
+    together, terms = of_clips(params, clips(unseen, 3), key)
+    apart, each = of_frames(params, unseen, key)
+    np.testing.assert_allclose(together, apart, rtol=1e-5)
+    assert terms.keys() == each.keys()
+    seen = jax.tree.map(jnp.asarray, scenes())
+    assert abs(float(of_clips(params, clips(seen, 3), key)[0] - of_frames(params, seen, key)[0])) > 1e-4
+
+
+def test_gradients_reach_the_encoder_through_what_is_remembered(params):
+    # Nothing but the memory shows the last two frames a marker; the first frame's loss is taken away.
+    examples = scenes(count=1)
+    examples.lanes.valid[0] = False
+    batch = jax.tree.map(jnp.asarray, clips(examples, 3))
+    gradient = jax.jit(jax.grad(lambda p: CLIPS.loss(p, batch, jax.random.key(0))[0]))(params)
+    assert np.abs(gradient["marker_tokens"]["lines"]["out"]["kernel"]).max() > 0
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_evaluation_streams_through_scenes(params, batch_size):
+    frames = scenes()
+    step, memory, expected = jax.jit(ALONE.step), ALONE.start(), []
+    for i in range(6):
+        memory, answer = step(params, memory, jax.tree.map(lambda leaf, i=i: leaf[i], frames))
+        expected.append(answer.lanes.points)
+    found = [answer.lanes.points for _, answer in predictions(CLIPS, params, frames, batch_size)]
+    np.testing.assert_array_equal(np.concatenate(found), np.stack(expected))
+    alone = [answer.lanes.points for _, answer in predictions(ALONE, params, frames, batch_size)]
+    differs = [not np.allclose(a, b, atol=1e-3) for a, b in zip(np.concatenate(alone), expected, strict=True)]
+    assert differs == [False, True, True] * 2
+
+
+def test_a_clip_initialises_as_a_frame(params):
+    clip = jax.tree.map(lambda leaf: leaf[0], clips(scenes(), 3))
+    shapes = jax.eval_shape(CLIPS.init, jax.random.key(0), clip)
+    assert jax.tree.map(lambda leaf: leaf.shape, shapes) == jax.tree.map(lambda leaf: leaf.shape, params)
+
+
+def test_the_summary_of_a_task_of_clips_counts_whole_clips():
+    shapes = shapes_of(seeing(observed()))
+    alone, together = (training_program(task, shapes, 2, OptimConfig(), compiled=False) for task in (ALONE, CLIPS))
+    # A loop's body may be counted once.
+    assert together.gflop > 0.9 * alone.gflop

@@ -122,7 +122,7 @@ class LaneGraphTask:
         The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a
         leading axis, `lax.scan(partial(task.step, params), task.start(), examples)`.
         """
-        # What depends on parameters alone must not be taken out of a scan: it would be rounded otherwise than in a stream.
+        # What depends on parameters alone must stay inside a scan: taken out, it is rounded otherwise than in a stream.
         params, example = lax.optimization_barrier((params, example))
         learned, statistics = split_statistics(params)
         module = self.model.build()

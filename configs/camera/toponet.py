@@ -2,6 +2,9 @@
 
     tflane train --config configs/camera/toponet.py
     tflane compare configs/camera/bevformer_detr.py configs/camera/toponet.py --seeds 0 1 2 --out runs/camera
+
+`toponet.py:plain`, without denoising queries, seed 0, test split: OLS 20.5, DET_l 17.8, TOP_ll 5.4 percent
+(docs/cameras.md).
 """
 
 from dataclasses import replace

@@ -35,7 +35,7 @@ def test_toponet_is_as_large_as_the_reference():
     assert count(elements) == ELEMENTS
     assert count(params) == TOPONET_LANES
 
-    assert memory.features.shape == MAP.shape
+    assert memory.bev.features.shape == MAP.shape
     assert answer.lanes.points.shape == (6, 200, 11, 3)
     assert answer.lanes.successor_logits.shape == (6, 200, 200)
     assert answer.elements.box.shape == (6, 100, 2, 2)

@@ -51,7 +51,7 @@ class PolylineEncoderConfig:
     Attributes:
         dim: channels of a token.
         layers, heads, hidden, dropout: of the transformer.
-        bands, temperature, layout: of the encoding of points.
+        bands, temperature, layout: of the encoding of points; 0 bands leave their coordinates as they are.
         attend: who looks at whom, "lines" (SMERF) or the "points" of one line (marker fusion).
     """
 
@@ -94,7 +94,9 @@ class PolylineEncoder(nn.Module):
         """
         config, (lines, count) = self.config, points.shape[:2]
         points, labels = jnp.where(valid[:, None, None], points, 0.0), jnp.where(valid[:, None], labels, 0.0)
-        x = temperature_encoding(points, config.bands, temperature=config.temperature, layout=config.layout)
+        x = points
+        if config.bands:
+            x = temperature_encoding(points, config.bands, temperature=config.temperature, layout=config.layout)
         embed = nn.Dense(config.dim, name="embed")
         sizes = TransformerConfig(config.heads, config.hidden, config.dropout)
         if config.attend == "lines":

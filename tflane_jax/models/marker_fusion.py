@@ -9,7 +9,7 @@ model without markers; Eq. (3) alone would normalise them once more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import flax.linen as nn
@@ -22,7 +22,6 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
-from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
     MarkerMemory,
@@ -84,38 +83,16 @@ class MarkerTokens(nn.Module):
         config, valid = self.config, guide.valid
         points = jnp.where(valid[:, None, None], config.range.normalise(guide.points), 0.0)
         count = points.shape[1]
-        if config.encoding == "sine":
-            nothing = jnp.zeros((len(points), 0))
-            x = PolylineEncoder(config.lines, name="lines")(points, nothing, valid, deterministic=deterministic)
-        elif config.encoding == "transformer":
-            x = RawTransformer(config.lines, name="lines")(points, deterministic=deterministic)
-        else:
+        if config.encoding == "mlp":
             x = Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2))
+        else:
+            sizes = config.lines if config.encoding == "sine" else replace(config.lines, bands=0)
+            nothing = jnp.zeros((len(points), 0))
+            x = PolylineEncoder(sizes, name="lines")(points, nothing, valid, deterministic=deterministic)
         x = jnp.where(valid[:, None], x, 0.0)
         if config.connectivity:
             x = jnp.where(valid[:, None], LaneNeighbours(config.lines.dim, name="neighbours")(x, guide.successor), 0.0)
         return x * guide.weight[:, None]  # Eq. (4)
-
-
-class RawTransformer(nn.Module):
-    """The transformer of III-A on raw coordinates (Table IV, "Transformer")."""
-
-    config: PolylineEncoderConfig
-
-    @nn.compact
-    def __call__(self, points: Float[Array, "n k 2"], *, deterministic: bool) -> Float[Array, "n c"]:
-        """Return one token for each line."""
-        config, (lines, count) = self.config, points.shape[:2]
-        x = nn.Dense(config.dim, name="embed")(points)
-        sizes = TransformerConfig(config.heads, config.hidden, config.dropout)
-        for i in range(config.layers):
-            over_lines = nn.vmap(
-                lambda layer, x: layer(x, jnp.zeros_like(x), deterministic=deterministic),
-                variable_axes={"params": None, "intermediates": 0},
-                split_rngs={"params": False, "dropout": True}, in_axes=0,
-            )  # fmt: skip
-            x = over_lines(EncoderLayer(sizes, name=f"layer_{i}"), x)
-        return nn.Dense(config.dim, name="out")(x.reshape(lines, count * config.dim))
 
 
 class LaneNeighbours(nn.Module):

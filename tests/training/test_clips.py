@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import BASELINE
+from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
@@ -94,3 +94,15 @@ def test_the_summary_of_a_task_of_clips_counts_whole_clips():
     alone, together = (training_program(task, shapes, 2, OptimConfig(), compiled=False) for task in (ALONE, CLIPS))
     # A loop's body may be counted once.
     assert together.gflop > 0.9 * alone.gflop
+
+
+def test_cameras_are_trained_on_clips_too():
+    """Batch statistics and the BEV memory go from frame to frame; shapes alone tell that they fit."""
+    task = LaneGraphTask(CAMERA_TOPONET, clip=2)
+    clip = stack_examples([make_camera_example(i).replace(has_previous=np.asarray(i > 0)) for i in range(2)])
+    params = jax.eval_shape(task.init, jax.random.key(0), clip)
+    batch = jax.tree.map(jnp.asarray, stack_examples([clip] * 3))
+    loss, terms = jax.eval_shape(task.loss, params, batch, jax.random.key(0))
+    assert loss.shape == ()
+    same = jax.tree.map(lambda a, b: a.shape == b.shape, terms["batch_stats"], params["batch_stats"])
+    assert all(jax.tree.leaves(same))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry import PerceptionRange, transform_points, yaw_pose
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import LaneGraph
 
@@ -76,18 +76,20 @@ def noised_lanes(
     truth = truth + noise.straighten * jax.random.uniform(bend, (count, 1, 1)) * (chord - truth)
     middle = truth.mean(1, keepdims=True)
     size = jnp.exp(noise.stretch * jax.random.normal(stretch, (count, 1, 1)))
-    line = turned(size * (truth - middle), noise.turn * jax.random.normal(turn, (count,))) + middle
-    moved = line.at[..., :2].add(noise.shift * jax.random.normal(shift, (count, 1, 2)))
+    angle = noise.turn * jax.random.normal(turn, (count,))
+    spot = middle[:, 0] + noise.shift * jnp.pad(jax.random.normal(shift, (count, 2)), ((0, 0), (0, 1)))
+    moved = placed(size * (truth - middle), angle, spot)
     # A lane of 24 m.
     along = jnp.concatenate([24.0 * (share - 0.5), jnp.zeros((1, truth.shape[1], 2))], -1)
     heading = jax.random.uniform(way, (count,), maxval=2 * jnp.pi)
-    anywhere = range_.denormalise(jax.random.uniform(place, (count, 1, 3)))
-    elsewhere = turned(jnp.broadcast_to(along, truth.shape), heading) + anywhere
+    anywhere = range_.denormalise(jax.random.uniform(place, (count, 3)))
+    elsewhere = placed(jnp.broadcast_to(along, truth.shape), heading, anywhere)
     return jnp.where(valid[:, None, None], moved, elsewhere)
 
 
-def turned(lines: Float[Array, "q p 3"], angle: Float[Array, " q"]) -> Float[Array, "q p 3"]:
-    """Return polylines turned about the origin, in the plane."""
-    cos, sin = jnp.cos(angle)[:, None], jnp.sin(angle)[:, None]
-    x, y = lines[..., 0], lines[..., 1]
-    return jnp.stack([cos * x - sin * y, sin * x + cos * y, lines[..., 2]], -1)
+def placed(
+    lines: Float[Array, "q p 3"], heading: Float[Array, " q"], spot: Float[Array, "q 3"]
+) -> Float[Array, "q p 3"]:
+    """Return polylines about the origin, turned in the plane and moved to their spots."""
+    pose = yaw_pose(spot[:, 0], spot[:, 1], heading).at[:, 2, 3].set(spot[:, 2])
+    return transform_points(pose, lines)

@@ -40,7 +40,7 @@ class OptimConfig:
         weight_decay: on kernels and embeddings only.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam).
         matrices: how the kernels of dense layers are updated. None of the papers has "muon" (Jordan et al. 2024), whose
-            updates are made orthogonal; small models get equally far in two thirds of the steps with it.
+            updates are made orthogonal; what it brings small models stands in docs/cameras.md.
         clip_norm: largest global gradient norm; inf for none.
         b1, b2, eps: of Adam.
         ema_decay: of the averaged parameters that are evaluated; 0 evaluates the parameters themselves.

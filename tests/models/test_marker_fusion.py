@@ -20,6 +20,7 @@ from tflane_jax.models.marker_fusion import (
     fusion_gate,
     guide_frame,
 )
+from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.priors.marker_memory import MarkerMemoryConfig
 from tflane_jax.priors.markers import MarkerPriorConfig
 from tflane_jax.scene import MarkerObservations, stack_examples
@@ -73,7 +74,7 @@ def without_markers(params):
     """Return the parameters of the host that has none."""
     if not isinstance(params, dict):
         return params
-    return {name: without_markers(value) for name, value in params.items() if name not in ("markers", "marker_tokens")}
+    return {name: without_markers(value) for name, value in params.items() if not name.startswith("marker")}
 
 
 def test_who_never_sees_a_marker_is_the_host_without_markers(params, step):
@@ -96,6 +97,13 @@ def test_cameras_may_have_markers_too():
     guided = predict(params, example.replace(markers=observed()))
     assert not np.array_equal(guided.lanes.points, expected.lanes.points)
     assert np.isfinite(guided.lanes.points).all()
+
+
+def test_every_layer_of_the_bev_encoder_has_a_fusion_of_its_own():
+    encoder = replace(BASELINE.encoder, dilations=(1, 2))
+    host = LaneGraphTask(replace(BASELINE, encoder=encoder, markers=CONFIG, sd_map=SMALL_SD_MAP))
+    shapes = jax.eval_shape(host.init, jax.random.key(0), seeing(observed()))
+    assert {f"{prior}_{layer}" for prior in ("markers", "sd_map") for layer in (0, 1)} <= shapes["encoder"].keys()
 
 
 def test_padding_may_hold_nan(params, step):
@@ -201,8 +209,8 @@ def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
 
 def test_messages_follow_the_direction_of_edges():
     module, tokens = LaneNeighbours(8), jnp.eye(4, 8)
-    edges = np.zeros((1, 4, 4), bool)
-    edges[0, 0, 1] = edges[0, 0, 2] = True
+    edges = np.zeros((4, 4), bool)
+    edges[0, 1] = edges[0, 2] = True
     variables = random_params(module.init, tokens, edges)
     out = np.asarray(module.apply(variables, tokens, edges))
     after, before = (np.asarray(variables["params"][name]["kernel"]) for name in ("successors", "predecessors"))

@@ -73,6 +73,24 @@ def test_a_distrusted_frame_asks_the_bank_too_and_stays_in_it():
     np.testing.assert_allclose(out[2].weight.reshape(4, LANES)[1:3, 0], np.sqrt([0.05, 0.225]), rtol=1e-6)
 
 
+def test_of_a_long_union_the_heaviest_lanes_guide_with_their_connectivity():
+    pair = seen(0.9)
+    pair.successor[0, 1] = True
+    frames = [pair, seen(0.4, lanes=1, at=2.0), NOTHING]
+    _, whole = run(frames)
+    _, cut = run(frames, replace(CONFIG, lanes=2))
+    _, enough = run(frames, replace(CONFIG, lanes=100))
+    jax.tree.map(np.testing.assert_array_equal, enough, whole)
+    # Of the bank's three lanes the two of the first frame weigh 0.9 / 4, that of the second 0.4 / 2.
+    np.testing.assert_array_equal(cut[2].points[:, 0], [[1.0, 0.0], [1.0, 1.0]])
+    np.testing.assert_array_equal(cut[2].successor, [[False, True], [False, False]])
+    np.testing.assert_array_equal(np.argwhere(whole[2].successor), [[2 * LANES, 2 * LANES + 1]])
+    assert cut[2].gate == whole[2].gate
+    assert cut[2].valid.all()
+    _, cut = run([NOTHING], replace(CONFIG, lanes=2))
+    assert not cut[0].valid.any()
+
+
 def test_the_oldest_is_forgotten_and_a_new_scene_begins_empty():
     _, out = run([seen(0.9)] + [NOTHING] * 4)
     assert [bool(used.valid.any()) for used in out] == [True, True, True, True, False]
@@ -145,8 +163,8 @@ def test_scan_equals_stream_bit_for_bit_and_is_traced_once():
 def test_gradients_are_finite_where_nothing_was_seen():
     def total(trust):
         frame = NOTHING.replace(confidence=trust)
-        return partial(remember, config=CONFIG)(
-            MarkerMemory.empty(4, LANES, POINTS), frame, HERE, np.asarray(False)
-        )[1].weight.sum()
+        return partial(remember, config=CONFIG)(MarkerMemory.empty(4, LANES, POINTS), frame, HERE, np.asarray(False))[
+            1
+        ].weight.sum()
 
     assert np.isfinite(jax.grad(total)(jnp.zeros(LANES))).all()

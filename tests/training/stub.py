@@ -15,14 +15,19 @@ def _host_sum(x):
 
 @dataclass(frozen=True)
 class LineTask:
-    """Fit y = w x + b with dropout noise. `blow_up` makes the term `explosive` infinite where x exceeds it."""
+    """Fit y = w x + b with dropout noise. `blow_up` makes the term `explosive` infinite where x exceeds it.
+
+    `second_layer` adds an offset of its own, so that two models differ by a module.
+    """
 
     features: int = 3
     blow_up: float = 1e9
+    second_layer: bool = False
 
     def init(self, key, example):
         kernel = jax.random.normal(key, (example["x"].shape[-1], self.features))
-        return {"line": {"kernel": kernel, "bias": jnp.zeros(self.features)}}
+        params = {"line": {"kernel": kernel, "bias": jnp.zeros(self.features)}}
+        return params | ({"second": {"offset": jnp.zeros(self.features)}} if self.second_layer else {})
 
     def loss(self, params, batch, key):
         x = batch["x"] * jax.random.bernoulli(key, 0.9, batch["x"].shape)
@@ -39,7 +44,8 @@ class LineTask:
         return self._apply(params, example["x"])
 
     def _apply(self, params, x):
-        return x @ params["line"]["kernel"] + params["line"]["bias"]
+        y = x @ params["line"]["kernel"] + params["line"]["bias"]
+        return y + params["second"]["offset"] if self.second_layer else y
 
 
 def line_arrays(examples: int = 20) -> dict[str, np.ndarray]:

@@ -162,6 +162,50 @@ def test_fine_tuning_starts_from_the_best_average(whole, tmp_path):
         run(tmp_path / "other", config=dataclasses.replace(config, steps=9), task=LineTask(features=2))
 
 
+def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
+    short = dataclasses.replace(CONFIG, steps=4)
+    for seed in (0, 1):
+        run(tmp_path / f"host_{seed}", config=dataclasses.replace(short, seeds=(seed,)))
+    still = dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0)
+    config = dataclasses.replace(CONFIG, steps=1, seeds=(0, 1), init_from=str(tmp_path / "host_{seed}"))
+    run(tmp_path / "run", config=config, optim=still)
+    tuned = Checkpoints(tmp_path / "run" / "checkpoints").params(1)["line"]["kernel"]
+    for i in (0, 1):
+        host = Checkpoints(tmp_path / f"host_{i}" / "checkpoints").params(4)["line"]["kernel"]
+        np.testing.assert_allclose(tuned[i], host, rtol=1e-6)
+    assert not np.array_equal(tuned[0], tuned[1])
+
+
+def test_parts_of_another_model_start_afresh_where_that_is_asked_for(whole, tmp_path, capsys):
+    config = dataclasses.replace(CONFIG, steps=1, init_from=str(whole))
+    more = LineTask(second_layer=True)
+    still = dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0)
+    with pytest.raises(UserError, match=r"second/.* is only here.*init_partly"):
+        run(tmp_path / "run", config=config, task=more, optim=still)
+    assert not (tmp_path / "run" / "config.json").exists()
+    partly = dataclasses.replace(config, init_partly=True)
+    run(tmp_path / "run", config=partly, task=more, optim=still)
+    assert "second start afresh" in capsys.readouterr().err
+    best = Checkpoints(whole / "checkpoints", best_metric="score")
+    start = Checkpoints(tmp_path / "run" / "checkpoints").params(1)
+    np.testing.assert_allclose(start["line"]["kernel"], best.params(best.find("best"))["line"]["kernel"], rtol=1e-6)
+    # And back: what only the other run has is left out.
+    run(tmp_path / "back", config=dataclasses.replace(partly, init_from=str(tmp_path / "run")), optim=still)
+    assert "second are left out" in capsys.readouterr().err
+    with pytest.raises(UserError, match=r"another model \(line/"):
+        run(tmp_path / "other", config=partly, task=LineTask(features=2), optim=still)
+
+
+def test_a_run_that_cannot_begin_leaves_no_run_behind(tmp_path):
+    with pytest.raises(UserError, match=r"optim\.warmup_steps"):
+        run(
+            tmp_path / "run",
+            config=dataclasses.replace(CONFIG, steps=1),
+            optim=dataclasses.replace(OPTIM, warmup_steps=9),
+        )
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
 def test_drawing_sees_every_evaluation(tmp_path):
     seen = []
     run(tmp_path / "run", draw=lambda folder, step, params, records: seen.append((folder, step, len(records))))

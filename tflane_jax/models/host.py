@@ -25,7 +25,7 @@ from tflane_jax.models.marker_fusion import (
     guide_frame,
 )
 from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion
-from tflane_jax.priors.marker_memory import MarkerMemory
+from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemory
 from tflane_jax.scene import Example, LaneGraph, Prediction
 
 
@@ -79,36 +79,47 @@ class Host(nn.Module):
             UserError: the example lacks what the model reads.
         """
         memory = memory or HostMemory()
-        fuse, markers = self._priors(example, memory.markers, deterministic=not train)
-        seen = look(self.encoder, example, memory.bev, train=train, fuse=fuse)
+        guide, markers = None, memory.markers
+        if self.config.markers is not None:
+            guide, markers = guide_frame(example, memory.markers, self.config.markers)
+        answer, bev = self.answer(example, memory.bev, guide, train=train)
+        return answer, HostMemory(bev, markers)
+
+    def answer(
+        self, example: Example, memory: BevMemory | None, guide: MarkerGuidance | None, *, train: bool = False
+    ) -> tuple[Prediction, BevMemory | None]:
+        """Return predictions and BEV features for the next frame, from what markers tell of this one: the part of
+        `step` that learns.
+        """
+        seen = look(self.encoder, example, memory, train=train, fuse=self._priors(example, guide, not train))
         elements = None
         if self.config.elements is not None and seen.front is not None:
             elements = self.elements(*seen.front, deterministic=not train)
-        answer = self.decode_example(example, seen.bev, elements, deterministic=not train)
-        return answer, HostMemory(seen.memory, markers)
+        return self.decode_example(example, seen.bev, elements, deterministic=not train), seen.memory
 
-    def _priors(
-        self, example: Example, memory: MarkerMemory | None, *, deterministic: bool
-    ) -> tuple[Fuse | None, MarkerMemory | None]:
-        """Return what the priors add to every layer of the BEV encoder, and the markers' memory for the next frame."""
+    def _priors(self, example: Example, guide: MarkerGuidance | None, deterministic: bool) -> Fuse | None:
+        """Return what the priors add to every layer of the BEV encoder."""
         markers, sd_map = self.config.markers, self.config.sd_map
         fusions = []
         if sd_map is not None:
             lines = self.sd_map_tokens(example.sd_map, deterministic=deterministic)
-            fusions.append(lambda bev, position: SdMapFusion(sd_map, name="sd_map")(bev, position, *lines))
-        if markers is not None:
-            guide, memory = guide_frame(example, memory, markers)
+            fusions.append(
+                lambda layer, bev, position: SdMapFusion(sd_map, name=f"sd_map_{layer}")(bev, position, *lines)
+            )
+        if markers is not None and guide is not None:
             tokens, (gate, valid) = self.marker_tokens(guide, deterministic=deterministic), fusion_gate(guide, markers)
             fusions.append(
-                lambda bev, position: MarkerFusion(markers, name="markers")(bev, position, tokens, valid, gate)
+                lambda layer, bev, position: MarkerFusion(markers, name=f"markers_{layer}")(
+                    bev, position, tokens, valid, gate
+                )
             )
 
         def fuse(layer: int, bev: Float[Array, "q c"], position: Float[Array, "q c"]) -> Float[Array, "q c"]:
             for each in fusions:
-                bev = each(bev, position)
+                bev = each(layer, bev, position)
             return bev
 
-        return fuse if fusions else None, memory
+        return fuse if fusions else None
 
     def decode_example(
         self, example: Example, bev: Float[Array, "h w e"], elements: ElementOutput | None, *, deterministic: bool

@@ -66,9 +66,10 @@ class MarkerFusionConfig:
 
 
 SMALL_MARKER_FUSION = MarkerFusionConfig(
+    memory=MarkerMemoryConfig(lanes=32),
     lines=PolylineEncoderConfig(
         dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
-    )
+    ),
 )
 
 
@@ -101,16 +102,14 @@ class LaneNeighbours(nn.Module):
     dim: int
 
     @nn.compact
-    def __call__(self, tokens: Float[Array, "n c"], successor: Bool[Array, "t l l"]) -> Float[Array, "n c"]:
+    def __call__(self, tokens: Float[Array, "n c"], successor: Bool[Array, "n n"]) -> Float[Array, "n c"]:
         """Return tokens that know the mean of their successors and of their predecessors."""
-        slots, lanes = successor.shape[:2]
-        x = tokens.reshape(slots, lanes, -1)
-        out = x
-        for name, edges in (("successors", successor), ("predecessors", successor.swapaxes(1, 2))):
-            weight = edges.astype(x.dtype)
-            mean = jnp.einsum("tij,tjc->tic", weight, x) / jnp.maximum(weight.sum(-1, keepdims=True), 1.0)
+        out = tokens
+        for name, edges in (("successors", successor), ("predecessors", successor.T)):
+            weight = edges.astype(tokens.dtype)
+            mean = weight @ tokens / jnp.maximum(weight.sum(-1, keepdims=True), 1.0)
             out = out + nn.Dense(self.dim, use_bias=False, name=name)(mean)
-        return out.reshape(tokens.shape)
+        return out
 
 
 class MarkerFusion(nn.Module):
@@ -142,9 +141,7 @@ class MarkerFusion(nn.Module):
         return jnp.where(valid.any(), fused, bev)
 
 
-def fusion_gate(
-    guide: MarkerGuidance, config: MarkerFusionConfig
-) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
+def fusion_gate(guide: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
     """Return c of Eq. (3) and the tokens that are looked at, for the variant of Table II."""
     if config.fusion == "gated":
         return guide.gate, guide.valid

@@ -36,6 +36,8 @@ class MarkerMemoryConfig:
         decay: gamma, in (0, 1]; 1 is the ablation without decay.
         exponent: alpha of Eq. (4), in (0, 1].
         threshold: epsilon; a frame trusted less is answered from the bank.
+        lanes: most lanes of the union that guide a frame, those with the largest weights; None is the whole union of
+            Eq. (4). The bank holds T L lanes, the encoder's time goes with those that guide.
         compensation: whether remembered lanes are moved by the ego motion.
         gate: c of Eq. (3) for what comes from the bank.
     """
@@ -44,6 +46,7 @@ class MarkerMemoryConfig:
     decay: float = 0.9
     exponent: float = 1.0
     threshold: float = 0.1
+    lanes: int | None = None
     compensation: Literal["ego_motion", "none"] = "ego_motion"
     gate: Literal["strongest", "one"] = "strongest"
 
@@ -84,14 +87,14 @@ class MarkerGuidance:
         points: (N, K, 2) metres, ego frame.
         weight: (N,) what each token is multiplied by; 0 where not valid.
         gate: () c of Eq. (3); 0 without guidance.
-        successor: (T, L, L) directed connectivity within each slot, N = T L.
+        successor: (N, N) directed connectivity, among lanes that were seen together.
         valid: (N,).
     """
 
     points: Float[Array, "n k 2"]
     weight: Float[Array, " n"]
     gate: Float[Array, ""]
-    successor: Bool[Array, "t l l"]
+    successor: Bool[Array, "n n"]
     valid: Bool[Array, " n"]
 
 
@@ -100,8 +103,8 @@ def guidance(observed: MarkerLanes, exponent: float = 1.0) -> MarkerGuidance:
     strongest = observed.frame_confidence
     share = observed.confidence / jnp.where(strongest > 0, strongest, 1.0)
     return MarkerGuidance(
-        points=observed.points, weight=_power(share, exponent), gate=jnp.asarray(strongest),
-        successor=observed.successor[None], valid=observed.valid,
+        points=jnp.asarray(observed.points), weight=_power(share, exponent), gate=jnp.asarray(strongest),
+        successor=jnp.asarray(observed.successor), valid=jnp.asarray(observed.valid),
     )  # fmt: skip
 
 
@@ -140,14 +143,25 @@ def remember(
     strongest = decayed.max(initial=0.0)
     from_bank = strongest if config.gate == "strongest" else jnp.where(strongest > 0, 1.0, 0.0)
     used = bank.valid & (retrieve | (age == 0))[:, None]
-    count, lanes, k = bank.points.shape[:3]
-    return bank, MarkerGuidance(
-        points=bank.points.reshape(count * lanes, k, 2),
-        weight=jnp.where(used, weight, 0.0).reshape(-1),
-        gate=jnp.where(retrieve, from_bank, alone.gate),
-        successor=bank.successor,
-        valid=used.reshape(-1),
-    )
+    gate = jnp.where(retrieve, from_bank, alone.gate)
+    return bank, _union(bank, jnp.where(used, weight, 0.0), used, gate, config.lanes)
+
+
+def _union(
+    bank: MarkerMemory, weight: Float[Array, "t l"], used: Bool[Array, "t l"], gate: Array, most: int | None
+) -> MarkerGuidance:
+    """Return the lanes of all slots in one row; the heaviest `most` of them, the youngest first among equals."""
+    slots, lanes, k = bank.points.shape[:3]
+    points, weight, used = bank.points.reshape(slots * lanes, k, 2), weight.reshape(-1), used.reshape(-1)
+    chosen = jnp.arange(slots * lanes)
+    if most is not None and most < slots * lanes:
+        chosen = jnp.argsort(jnp.where(used, -weight, jnp.inf), stable=True)[:most]
+    slot, lane = chosen // lanes, chosen % lanes
+    together = slot[:, None] == slot[None, :]
+    return MarkerGuidance(
+        points=points[chosen], weight=weight[chosen], gate=gate, valid=used[chosen],
+        successor=bank.successor[slot[:, None], lane[:, None], lane[None, :]] & together,
+    )  # fmt: skip
 
 
 def _push(newest: Array, slots: Array) -> Array:

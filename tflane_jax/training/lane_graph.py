@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 from flax.traverse_util import flatten_dict
@@ -17,9 +17,13 @@ from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_denoising_los
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.host import HostMemory, start_memory
+from tflane_jax.models.marker_fusion import guide_frame
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import Example, Prediction
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -52,39 +56,44 @@ class LaneGraphTask:
     def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
         """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout."""
         learned, statistics = split_statistics(params)
-        module, keys = self.model.build(), jax.random.split(key, len(jax.tree.leaves(batch)[0]))
+        module, start = self.model.build(), self.start()
+        guides = jax.vmap(self._guides)(batch)
 
-        def frame(memory, statistics, example, key):
+        def frame(bev, statistics, example, guide, key):
             variables, streams = {"params": learned} | statistics, {"dropout": key}
-            kept, method = [STATISTICS, AUXILIARY], type(module).step
-            (outputs, memory), state = module.apply(
-                variables, example, memory, train=True, method=method, mutable=kept, rngs=streams
+            kept, method = [STATISTICS, AUXILIARY], type(module).answer
+            (outputs, bev), state = module.apply(
+                variables, example, bev, guide, train=True, method=method, mutable=kept, rngs=streams
             )
             updated = {name: value for name, value in state.items() if name == STATISTICS}
             # Flax keeps what is sown in a tuple.
             flat: Any = flatten_dict(state.get(AUXILIARY, {}))
             said = {path[-1]: values[0] for path, values in flat.items()}
-            return memory, updated, (outputs, said)
+            return bev, updated, (outputs, said)
 
-        def alone(example, key):
-            _, updated, told = frame(None, statistics, example, key)
+        def alone(example, guide, key):
+            _, updated, told = frame(None, statistics, example, guide, key)
             return told, updated
 
-        def clip(examples, key):
+        def clip(examples, guides, key):
             def body(carry, now):
-                memory, updated, told = frame(*carry, *now)
-                return (memory, updated), told
+                bev, updated, told = frame(*carry, *now)
+                return (bev, updated), told
 
-            start = self.start(), statistics
-            (_, updated), told = lax.scan(body, start, (examples, jax.random.split(key, self.clip)))
+            frames = examples, guides, jax.random.split(key, self.clip)
+            # Unrolled: inside of a loop XLA compiles the gradient of a convolution to code 25 times slower on a CPU.
+            (_, updated), told = lax.scan(body, (start.bev, statistics), frames, unroll=self.clip)
             return told, updated
 
-        train: Any = jax.vmap(alone if self.clip == 1 else clip, axis_name=BATCH_AXIS, out_axes=(0, None))
-        (outputs, said), updated = train(batch, keys)
-        if self.clip > 1:
-            outputs, said, batch = jax.tree.map(
-                lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (outputs, said, batch)
-            )
+        if self.clip > 1 and start.bev is None:
+            # No frame needs what another one has learned.
+            batch, guides = _frames((batch, guides))
+        through_clips = self.clip > 1 and start.bev is not None
+        keys = jax.random.split(key, len(jax.tree.leaves(batch)[0]))
+        train: Any = jax.vmap(clip if through_clips else alone, axis_name=BATCH_AXIS, out_axes=(0, None))
+        (outputs, said), updated = train(batch, guides, keys)
+        if through_clips:
+            outputs, said, batch = _frames((outputs, said, batch))
         if outputs.elements is None:
             loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
         elif batch.traffic_elements is None or batch.cameras is None:
@@ -106,6 +115,20 @@ class LaneGraphTask:
             loss += terms["cells"]
         return loss, terms | updated
 
+    def _guides(self, example: Example) -> MarkerGuidance | None:
+        """Return what markers tell of a frame, or of each frame of a clip; there is nothing to learn in it."""
+        markers = self.model.markers
+        if markers is None:
+            return None
+        if self.clip == 1:
+            return guide_frame(example, None, markers)[0]
+
+        def body(memory, example):
+            guide, memory = guide_frame(example, memory, markers)
+            return memory, guide
+
+        return lax.scan(body, self.start().markers, example)[1]
+
     def predict(self, params: Params, example: Example) -> Prediction:
         """Return the last decoder layer's answer for one example, a frame on its own."""
         return self.step(params, None, example)[1]
@@ -114,9 +137,7 @@ class LaneGraphTask:
         """Return the memory before the first frame of a sequence."""
         return start_memory(self.model.encoder, self.model.markers)
 
-    def step(
-        self, params: Params, memory: HostMemory | None, example: Example
-    ) -> tuple[HostMemory, Prediction]:
+    def step(self, params: Params, memory: HostMemory | None, example: Example) -> tuple[HostMemory, Prediction]:
         """Return the memory for the next frame, and the answer for this one.
 
         The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a
@@ -130,3 +151,8 @@ class LaneGraphTask:
         result: Any = module.apply(variables, example, memory, method=type(module).step)
         outputs, following = result
         return following, jax.tree.map(lambda layers: layers[-1], outputs)
+
+
+def _frames(clips: T) -> T:
+    """Return the frames of a batch of clips, one after the other."""
+    return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), clips)

@@ -22,13 +22,14 @@ from tflane_jax.errors import UserError
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.batches import Prepare, batches, first_example
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.fine_tuning import starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config, write_json, write_text
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
-from tflane_jax.training.state import TrainState, init_states, per_seed, with_params
+from tflane_jax.training.state import init_states, per_seed, with_params
 from tflane_jax.training.step import make_multi_seed_step, make_update_step
 from tflane_jax.training.task import Params, Task
 
@@ -52,7 +53,9 @@ class TrainingConfig:
         checkpoint_every: steps between further checkpoints.
         keep_checkpoints: how many of the latest to keep, beside the best.
         best_metric: of the evaluation, higher is better.
-        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); None starts afresh.
+        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); `{seed}` in it stands for
+            the seed. None starts afresh.
+        init_partly: whether that run's model may have other parts: what it lacks starts afresh.
     """
 
     steps: int = 10_000
@@ -64,6 +67,7 @@ class TrainingConfig:
     keep_checkpoints: int = 2
     best_metric: str = "all/DET_l"
     init_from: str | None = None
+    init_partly: bool = False
 
 
 @dataclass
@@ -130,6 +134,7 @@ def train(
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
     if adaptive is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
+    optimizer = make_optimizer(optim, config.steps)
     with claimed(folder, start), StopRequest() as stop:
         # =============================================================================================================
         # Run folder
@@ -137,15 +142,11 @@ def train(
         if start == "resume" and (saved := read_config(folder)) != resolved:
             raise UserError(f"{folder} was started with another configuration ({_difference(saved, resolved)}): "
                             "resume it as it is, or start another run")  # fmt: skip
-        add_provenance(folder)
-        write_text(folder / "config.txt", resolved_text)
-        write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
         # =============================================================================================================
         # State: fresh, of another run, or resumed
         # =============================================================================================================
-        optimizer = make_optimizer(optim, config.steps)
         state = init_states(task, optimizer, config.seeds, first_example(arrays))
         window, metrics, seconds = _Window(), {}, 0.0
         memories = [Memory() for _ in config.seeds]
@@ -156,8 +157,12 @@ def train(
             metrics = manifest.progress["metrics"]
             memories = [Memory(**memory) for memory in manifest.progress.get("cycles", [])] or memories
         elif config.init_from is not None:
-            state = with_params(state, _params_of_run(Path(config.init_from), state), optimizer)
+            given = starting_params(config.init_from, state, config.seeds, partly=config.init_partly)
+            state = with_params(state, given, optimizer)
         first = step = int(np.max(state.step))
+        add_provenance(folder)
+        write_text(folder / "config.txt", resolved_text)
+        write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
 
         # =============================================================================================================
         # Compile
@@ -248,20 +253,6 @@ def _check(config: TrainingConfig) -> None:
 def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:
     """Return the record of values that every seed has one of."""
     return {"step": step, "split": split} | {name: v[0] if len(v) == 1 else v for name, v in values.items()}
-
-
-def _params_of_run(folder: Path, state: TrainState) -> Params:
-    """Return the best averaged parameters of another run (the last ones where none was evaluated)."""
-    settings = read_config(folder)["training"]
-    checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
-    step = checkpoints.best_step()
-    params = checkpoints.params(checkpoints.find("last") if step is None else step)
-    params = per_seed(params, settings["seeds"])[0]
-    wanted = per_seed(state.params, range(state.step.size))[0]
-    shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), tree) for tree in (params, wanted)]
-    if shapes[0] != shapes[1]:
-        raise UserError(f"training.init_from: {folder} holds another model ({_difference(*shapes)})")
-    return params
 
 
 def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:

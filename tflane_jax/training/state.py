@@ -46,9 +46,7 @@ def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Arr
     )
 
 
-def init_states(
-    task: Task, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any
-) -> TrainState:
+def init_states(task: Task, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any) -> TrainState:
     """Return the state of a run: without a seed axis for one seed, with a leading one for several."""
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
 
@@ -66,10 +64,9 @@ def _run_once(function: Callable[..., Any], *arguments: Any) -> Any:
     return compiled(*arguments)
 
 
-def with_params(state: TrainState, params: Params, optimizer: optax.GradientTransformation) -> TrainState:
-    """Return the state of a run that starts from given parameters, as fine-tuning does (all seeds from the same)."""
-    if state.step.ndim:
-        params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*state.step.shape, *leaf.shape)), params)
+def with_params(state: TrainState, params: Sequence[Params], optimizer: optax.GradientTransformation) -> TrainState:
+    """Return the state of a run that starts from given parameters, one for each seed, as fine-tuning does."""
+    params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *params) if state.step.ndim else params[0]
     learned, _ = split_statistics(params)
     opt_state = jax.vmap(optimizer.init)(learned) if state.step.ndim else optimizer.init(learned)
     params = jax.tree.map(jnp.array, params)

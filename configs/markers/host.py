@@ -1,0 +1,47 @@
+"""TopoNet's lane branch on single frames: what every model of `toponet_markers.py` begins with.
+
+    tflane compare configs/markers/host.py configs/markers/host.py:bevformer_detr --seeds 0 1 2 3 4 --jobs 2 \\
+        --out runs/markers/hosts
+
+The examples hold markers and an SD map all the same, so that hosts and models with priors share their data.
+"""
+
+from dataclasses import replace
+
+from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.sd_map import SdMapConfig
+from tflane_jax.world.simulate import WorldConfig
+
+# Twelve frames half a second apart, as in OpenLane-V2.
+WORLD = WorldConfig(keyframes=12)
+# A receiver off by two metres and a compass by one degree, on top of a map whose roads are off by 1.5 m.
+EXAMPLE = ExampleConfig(markers=MarkerConfig(), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
+
+
+def get_config() -> RunConfig:
+    """Return TopoNet."""
+    return RunConfig(
+        task=LaneGraphTask(TopoNetConfig(denoising=DenoisingConfig()), LaneGraphLossConfig(successor_weight=20.0)),
+        data=WorldData(train=400, val=10, test=100, world=WORLD, example=EXAMPLE),
+        optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),
+        training=TrainingConfig(steps=2500, batch_size=4, eval_every=2500),
+    )
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return BEVFormer-DETR, the host without a graph."""
+    config = get_config()
+    model = BevFormerDetrConfig(
+        config.task.model.encoder, LaneDecoderConfig(refine="fixed"), None, denoising=DenoisingConfig()
+    )
+    return {"bevformer_detr": replace(config, task=replace(config.task, model=model))}

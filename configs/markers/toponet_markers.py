@@ -1,0 +1,68 @@
+"""TopoNet with fiducial markers (Wu and Hu), and the other rows of the paper's Tables I to IV, on clips.
+
+    tflane compare configs/markers/host.py configs/markers/host.py:bevformer_detr --seeds 0 1 2 3 4 \\
+        --out runs/markers/hosts
+    tflane compare configs/markers/toponet_markers.py:{toponet,bevformer_detr,toponet_smerf} \\
+        configs/markers/toponet_markers.py --seeds 0 1 2 3 4 --out runs/markers/table_1
+
+Every row starts from the host of `host.py` that was trained with the same seed, and goes on for as many updates, with
+or without a prior: what is compared is what a prior adds to one host. Clips are of four frames, half a second apart.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
+from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
+from tflane_jax.models.toponet import TrafficFlowConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+
+MARKERS = SMALL_MARKER_FUSION
+HOSTS = "runs/markers/hosts"
+
+
+def get_config() -> RunConfig:
+    """Return the paper's system: gated fusion, full memory, transformer with positional encoding."""
+    return _tuned(markers=MARKERS)
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the other rows of each table, and what goes beyond the paper."""
+    memory = MARKERS.memory
+    assert memory is not None
+    table_1 = {
+        "bevformer_detr": _tuned("bevformer_detr"),
+        "toponet": _tuned(),
+        "toponet_smerf": _tuned(sd_map=SMALL_SD_MAP),
+    }
+    table_2 = {name: _tuned(markers=replace(MARKERS, fusion=name)) for name in ("uniform", "hard")}
+    table_3 = {
+        "no_memory": _tuned(markers=replace(MARKERS, memory=None)),
+        "no_decay": _tuned(markers=replace(MARKERS, memory=replace(memory, decay=1.0))),
+        "not_moved": _tuned(markers=replace(MARKERS, memory=replace(memory, compensation="none"))),
+    }
+    table_4 = {name: _tuned(markers=replace(MARKERS, encoding=name)) for name in ("mlp", "transformer")}
+    beyond = {
+        "connectivity": _tuned(markers=replace(MARKERS, connectivity=True)),
+        "everything": _tuned(markers=MARKERS, sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()),
+    }
+    return table_1 | table_2 | table_3 | table_4 | beyond
+
+
+def _tuned(host: str = "host", **priors: object) -> RunConfig:
+    """Return the training that goes on from a host, with priors."""
+    path = str(Path(__file__).with_name("host.py"))
+    config = load_config(path if host == "host" else f"{path}:{host}")
+    assert isinstance(config.task, LaneGraphTask)
+    # Denoising is for decoders that learn where lanes are from nothing.
+    model = replace(config.task.model, denoising=None, **priors)
+    return replace(
+        config,
+        task=replace(config.task, model=model, clip=4),
+        optim=replace(config.optim, lr=1e-3),
+        training=replace(
+            config.training, steps=600, batch_size=2, eval_every=600,
+            init_from=f"{HOSTS}/{host}/seed_{{seed}}", init_partly=True,
+        ),
+    )  # fmt: skip

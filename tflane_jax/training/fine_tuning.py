@@ -1,0 +1,78 @@
+"""Parameters to start from: those of another run, whole or as far as the two models are the same."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from flax.traverse_util import flatten_dict, unflatten_dict
+from tqdm import tqdm
+
+from tflane_jax.errors import UserError
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.run_folder import read_config
+from tflane_jax.training.state import TrainState, per_seed
+from tflane_jax.training.task import Params
+
+
+def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, partly: bool) -> list[Params]:
+    """Return the parameters that each seed starts from: the best averaged ones of a run (the last, where none was
+    evaluated).
+
+    Args:
+        reference: run folder; `{seed}` in it stands for the seed, so that each starts from a run of its own.
+        state: fresh.
+        seeds: of the state.
+        partly: keep the fresh parameters of what the run's model lacks, and leave out what only that one has.
+
+    Raises:
+        UserError: no such run, or it holds another model; where `partly`, one with nothing in common or with a
+            parameter of another shape.
+    """
+    return [
+        _params_of_run(Path(reference.replace("{seed}", str(seed))), fresh.params, partly=partly)
+        for seed, fresh in zip(seeds, per_seed(state, seeds), strict=True)
+    ]
+
+
+def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
+    settings = read_config(folder)["training"]
+    checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
+    step = checkpoints.best_step()
+    params = checkpoints.params(checkpoints.find("last") if step is None else step)
+    saved, wanted = (_flat(tree) for tree in (per_seed(params, settings["seeds"])[0], fresh))
+    for name in sorted(saved.keys() & wanted.keys()):
+        if _shape(saved[name]) != _shape(wanted[name]):
+            raise UserError(
+                f"training.init_from: {folder} holds another model ({name}: {_shape(saved[name])} there, "
+                f"{_shape(wanted[name])} here)"
+            )
+    added, dropped = sorted(wanted.keys() - saved.keys()), sorted(saved.keys() - wanted.keys())
+    if (added or dropped) and not partly:
+        where = "is only here" if added else "is only there"
+        raise UserError(
+            f"training.init_from: {folder} holds another model ({(added or dropped)[0]} {where}); "
+            "training.init_partly takes over what both have"
+        )
+    if len(added) == len(wanted):
+        raise UserError(f"training.init_from: {folder} holds another model, with no parameter of this one")
+    for names, what in ((added, "start afresh"), (dropped, "are left out")):
+        if names:
+            tqdm.write(f"from {folder}: {_modules(names)} {what}", file=sys.stderr)
+    return unflatten_dict({name: saved.get(name, value) for name, value in wanted.items()}, sep="/")
+
+
+def _flat(params: Mapping[str, Any]) -> dict[str, jax.Array]:
+    return flatten_dict(params, sep="/")  # pyright: ignore[reportReturnType]
+
+
+def _shape(leaf: jax.Array) -> tuple[tuple[int, ...], str]:
+    return leaf.shape, str(leaf.dtype)
+
+
+def _modules(names: Sequence[str]) -> str:
+    """Return the modules, two levels deep, that parameters belong to."""
+    return ", ".join(dict.fromkeys("/".join(name.split("/")[:-1][:2]) for name in names))

@@ -11,8 +11,8 @@ import importlib.util
 import json
 import multiprocessing
 import os
-import sys
 import time
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -115,40 +115,80 @@ def train_all(jobs: Sequence[Job], parallel: int) -> None:
             if train_run(job.config, job.folder, start=_start(job.folder)).stopped_by is not None:
                 raise KeyboardInterrupt  # what is written goes on when the same command is given again
         return
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    context = multiprocessing.get_context("spawn")
-    running: dict[int, tuple[Any, Job]] = {}
-    total = sum(job.config.training.steps for job in jobs)
-    with tqdm(total=total, desc=f"train {len(jobs)} runs", unit="step") as bar:
-        while waiting or running:
-            for slot in range(parallel):
-                if slot not in running and waiting:
-                    job = waiting.pop(0)
-                    job.log.parent.mkdir(parents=True, exist_ok=True)
-                    process = context.Process(target=_worker, args=(job, cores[slot::parallel]), daemon=True)
-                    process.start()
-                    running[slot] = process, job
+    with contextlib.ExitStack() as stack:
+        workers = [stack.enter_context(_Worker(slot, parallel)) for slot in range(parallel)]
+        total = sum(job.config.training.steps for job in jobs)
+        bar = stack.enter_context(tqdm(total=total, desc=f"train {len(jobs)} runs", unit="step"))
+        while waiting or any(worker.job for worker in workers):
+            for worker in workers:
+                if worker.job is None and waiting:
+                    others = {task for other in workers if other is not worker for task in other.tasks}
+                    # A worker goes on with models that it has compiled; with another's when nothing else is left.
+                    chosen = next((job for job in waiting if job.config.task not in others - worker.tasks), waiting[0])
+                    waiting.remove(chosen)
+                    worker.begin(chosen)
             time.sleep(1.0)
             bar.update(sum(min(_step(job.folder), job.config.training.steps) for job in jobs) - bar.n)
-            for slot, (process, job) in list(running.items()):
-                if process.exitcode is not None:
-                    del running[slot]
-                    if process.exitcode != 0:
-                        raise UserError(f"training {job.folder} failed: its messages are in {job.log}")
+            for worker in workers:
+                worker.check()
 
 
-def _worker(job: Job, cores: list[int]) -> None:
-    """Train in a process of its own: on its own cores, with its messages in a file."""
+class _Worker:
+    """A process on its own cores that trains one job after the other, and compiles every model once."""
+
+    def __init__(self, slot: int, parallel: int) -> None:
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        context = multiprocessing.get_context("spawn")
+        self._pipe, far = context.Pipe()
+        self._process: Any = context.Process(target=_train_jobs, args=(far, cores[slot::parallel]), daemon=True)
+        self.job: Job | None = None
+        self.tasks: set[Any] = set()
+
+    def __enter__(self) -> _Worker:
+        self._process.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # Between jobs, or with an error on its way: what is written goes on when the same command is given again.
+        self._process.terminate()
+        self._process.join()
+
+    def begin(self, job: Job) -> None:
+        """Let the process train a job."""
+        self.job = job
+        self.tasks.add(job.config.task)
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+        self._pipe.send(job)
+
+    def check(self) -> None:
+        """Take note of a job that is done; raise UserError where it failed."""
+        if self.job is None:
+            return
+        done = self._pipe.poll()
+        if (done and not self._pipe.recv()) or (not done and self._process.exitcode is not None):
+            raise UserError(f"training {self.job.folder} failed: its messages are in {self.job.log}")
+        if done:
+            self.job = None
+
+
+def _train_jobs(pipe: Any, cores: list[int]) -> None:
+    """Train what comes through the pipe and answer whether that went well: on its own cores, messages in a file."""
     if cores:
         os.sched_setaffinity(0, cores)  # XLA sizes its thread pool by this
-    with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
-        configure_jax()
-        try:
-            result = train_run(job.config, job.folder, start=_start(job.folder), progress=False)
-        except UserError as error:
-            print(f"tflane: {error}")
-            sys.exit(2)
-    sys.exit(0 if result.stopped_by is None else 1)
+    while True:
+        job = pipe.recv()
+        with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+            configure_jax()
+            try:
+                result = train_run(job.config, job.folder, start=_start(job.folder), progress=False)
+                well = result.stopped_by is None
+            except UserError as error:
+                print(f"tflane: {error}")
+                well = False
+            except Exception:
+                traceback.print_exc()
+                well = False
+        pipe.send(well)
 
 
 def _start(folder: Path):

@@ -19,11 +19,12 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.markers import PlacementConfig
 from tflane_jax.world.sd_map import SdMapConfig
 from tflane_jax.world.simulate import WorldConfig
 
-# Twelve frames half a second apart, as in OpenLane-V2.
-WORLD = WorldConfig(keyframes=12)
+# Eight frames half a second apart, as in OpenLane-V2.
+WORLD = WorldConfig(duration_s=5.6, keyframes=8, markers=PlacementConfig(side="both"))
 # A receiver off by two metres and a compass by one degree, on top of a map whose roads are off by 1.5 m.
 EXAMPLE = ExampleConfig(markers=MarkerConfig(), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
 
@@ -32,7 +33,7 @@ def get_config() -> RunConfig:
     """Return TopoNet."""
     return RunConfig(
         task=LaneGraphTask(TopoNetConfig(denoising=DenoisingConfig()), LaneGraphLossConfig(successor_weight=20.0)),
-        data=WorldData(train=400, val=10, test=100, world=WORLD, example=EXAMPLE),
+        data=WorldData(train=1000, val=15, test=100, world=WORLD, example=EXAMPLE),
         optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=2500, batch_size=4, eval_every=2500),
     )

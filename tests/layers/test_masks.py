@@ -4,8 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from tflane_jax.layers.masks import SpatialMask, key_mask, pair_mask
+from tflane_jax.layers.masks import SpatialMask, key_mask, pair_mask, reach_mask
 
 
 def random_bool(seed, *shape):
@@ -58,3 +61,23 @@ def test_no_quadrant_that_nobody_uses_is_built():
     """4,000 x 4,000 lanes without a mask of the host's own must not cost 16 MB."""
     mask = SpatialMask.from_validity(4000, random_bool(6, 30))
     assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 2 * 30
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.5, 20.0))
+def test_a_place_sees_the_lines_that_pass_within_reach(seed, reach):
+    rng = np.random.default_rng(seed)
+    places, lines, valid = rng.uniform(-20, 20, (6, 2)), rng.uniform(-20, 20, (4, 5, 2)), np.arange(4) < 3
+    expected = np.array(
+        [[shapely.LineString(line).distance(shapely.Point(place)) for line in lines] for place in places]
+    )
+    clear = np.abs(expected - reach) > 1e-3
+    lines[3] = np.nan
+    mask = np.asarray(reach_mask(jnp.asarray(places, jnp.float32), jnp.asarray(lines, jnp.float32), valid, reach))
+    np.testing.assert_array_equal(mask[clear], ((expected <= reach) & valid)[clear])
+
+
+def test_a_line_without_length_is_a_point():
+    mask = reach_mask(jnp.array([[3.0, 0.0], [3.1, 0.0]]), jnp.zeros((1, 2, 2)), jnp.ones(1, bool), 3.05)
+    np.testing.assert_array_equal(mask, [[True], [False]])
+    assert reach_mask(jnp.zeros((2, 2)), jnp.zeros((0, 2, 2)), jnp.ones(0, bool), 1.0).shape == (2, 0)

@@ -11,6 +11,7 @@ from jax import lax
 
 from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example, make_example
 from tests.parameters import random_params
+from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
 from tflane_jax.models.marker_fusion import (
     LaneNeighbours,
@@ -156,8 +157,8 @@ def fused(config, guide, bev, position):
     module = MarkerFusion(config)
     tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
     gate, valid = fusion_gate(guide, config)
-    variables = random_params(lambda key: module.init(key, bev, position, tokens, valid, gate))
-    return module.apply(variables, bev, position, tokens, valid, gate), variables, tokens
+    variables = random_params(lambda key: module.init(key, bev, position, tokens, key_mask(valid), gate))
+    return module.apply(variables, bev, position, tokens, key_mask(valid), gate), variables, tokens
 
 
 def test_the_gate_is_the_confidence_and_its_variants():

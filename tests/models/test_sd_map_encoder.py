@@ -151,7 +151,7 @@ def test_attention_to_the_map_matches_the_reference(path):
 def fused_with(config, tokens, valid):
     """Return the callback of a BEV encoder that fuses these tokens."""
 
-    def fuse(layer, bev, position):
+    def fuse(layer, places, bev, position):
         return SdMapFusion(config, name=f"sd_map_{layer}")(bev, position, tokens, valid)
 
     return fuse

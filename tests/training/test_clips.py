@@ -14,7 +14,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.scene import shapes_of, stack_examples
 from tflane_jax.summary import training_program
 from tflane_jax.systems.lane_graph import clips
-from tflane_jax.training.evaluate import predictions
+from tflane_jax.training.evaluate import Sightings, evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.schedule import OptimConfig
 
@@ -106,3 +106,16 @@ def test_cameras_are_trained_on_clips_too():
     assert loss.shape == ()
     same = jax.tree.map(lambda a, b: a.shape == b.shape, terms["batch_stats"], params["batch_stats"])
     assert all(jax.tree.leaves(same))
+
+
+def test_frames_are_shared_out_by_what_is_known_of_markers(params):
+    sightings = Sightings()
+    frames = [(False, False), (True, True), (False, True), (True, True), (False, True), (False, False), (True, False)]
+    told = [sightings.next(seen, has_previous) for seen, has_previous in frames]
+    assert told == ["before", "seen", "gap", "seen", "gap", "before", "seen"]
+    metrics = evaluate_lanes(CLIPS, params, scenes(), 4).compute()
+    assert [metrics[group]["frames"] for group in ("all", "seen", "gap", "before")] == [6, 2, 4, 0]
+    lanes = [metrics[group]["lanes"] for group in ("seen", "gap", "before")]
+    assert sum(lanes) == metrics["all"]["lanes"]
+    without = scenes().replace(markers=None)
+    assert "seen" not in evaluate_lanes(CLIPS, params, without, 4).compute()

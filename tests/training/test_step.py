@@ -11,7 +11,7 @@ from tflane_jax.training.batches import batch_indices
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, per_seed
-from tflane_jax.training.step import make_multi_seed_step, make_update_step, moving_average
+from tflane_jax.training.step import compiled_update, make_multi_seed_step, make_update_step, moving_average
 
 OPTIM = OptimConfig(lr=0.01, warmup_steps=2)
 STEPS = 20
@@ -25,6 +25,16 @@ def fresh(seeds=(0,)):
 
 def batch_of(seed, step, size=4):
     return jax.tree.map(lambda leaf: leaf[batch_indices(seed, step, 20, size)], ARRAYS)
+
+
+def test_trainings_of_one_model_share_a_compiled_update():
+    batch, other = batch_of(0, 0), batch_of(0, 0, size=3)
+    first = compiled_update(LineTask(), OPTIM, STEPS, 1, fresh(), batch)
+    assert compiled_update(LineTask(), OPTIM, STEPS, 1, fresh((7,)), batch) is first
+    assert compiled_update(LineTask(), OPTIM, STEPS, 1, fresh(), other) is not first
+    assert compiled_update(LineTask(blow_up=3.0), OPTIM, STEPS, 1, fresh(), batch) is not first
+    expected = make_update_step(LineTask(), OPTIM, STEPS)(fresh(), batch)
+    jax.tree.map(np.testing.assert_array_equal, first(fresh(), batch)[0].params, expected[0].params)
 
 
 def test_steps_are_plain_adamw_on_the_tasks_gradient():

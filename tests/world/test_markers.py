@@ -44,6 +44,18 @@ def test_a_marker_stands_right_of_the_approach_and_faces_its_traffic():
     assert (driver[:2] < 0.0).all()
 
 
+def test_boards_behind_a_junction_face_those_who_come_across():
+    crossing = lane_map(
+        segment(2, [(-50, -1.75), (0, -1.75)], [4]), segment(4, [(0, -1.75), (20, -1.75)], [5], is_intersection=True),
+        segment(5, [(20, -1.75), (60, -1.75)]),
+    )  # fmt: skip
+    near, both = (place_markers(crossing, 0, replace(EXACT, side=side)) for side in ("near", "both"))
+    assert (len(near.pose), len(both.pose)) == (1, 2)
+    far = both.pose[np.argmax(both.pose[:, 0, 3])]
+    np.testing.assert_allclose(far[:3, 3], [20.0, -3.5 - 0.5 - 0.8, 3.0], atol=1e-12)
+    np.testing.assert_allclose(far[:3, :3].T, [[0, -1, 0], [0, 0, 1], [-1, 0, 0]], atol=1e-12)
+
+
 def test_boards_are_turned_towards_the_road():
     straight, turned = (place_markers(two_lanes(), 0, PlacementConfig(toe_in=t, jitter=0.0)) for t in (0.0, 20.0))
     assert straight.pose[0, 1, 2] == pytest.approx(0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 
 def key_mask(valid_keys: Bool[Array, " k"]) -> Bool[Array, "1 k"]:
@@ -15,6 +15,27 @@ def key_mask(valid_keys: Bool[Array, " k"]) -> Bool[Array, "1 k"]:
 def pair_mask(valid_queries: Bool[Array, " q"], valid_keys: Bool[Array, " k"]) -> Bool[Array, "q k"]:
     """Return the mask under which valid queries see the valid keys, and invalid ones see nothing."""
     return valid_queries[:, None] & valid_keys[None, :]
+
+
+def reach_mask(
+    places: Float[Array, "q 2"], lines: Float[Array, "n p 2"], valid: Bool[Array, " n"], reach: float
+) -> Bool[Array, "q n"]:
+    """Return the mask under which a query sees the valid lines that pass within `reach` of its place.
+
+    Args:
+        places, lines: in one unit, that of `reach`; lines of at least two points. Invalid ones may hold anything.
+        valid: of the lines.
+        reach: largest distance.
+    """
+    lines = jnp.where(valid[:, None, None], lines, 0.0)
+    start, step = lines[:, :-1], lines[:, 1:] - lines[:, :-1]
+    # Coordinates apart: arrays whose last axis is 2 are slow on a CPU.
+    dx, dy = (places[:, None, None, i] - start[None, ..., i] for i in (0, 1))
+    sx, sy = (step[None, ..., i] for i in (0, 1))
+    square = sx**2 + sy**2
+    share = jnp.clip((dx * sx + dy * sy) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
+    distance = (dx - share * sx) ** 2 + (dy - share * sy) ** 2
+    return (distance.min(-1) <= reach**2) & valid[None, :]
 
 
 @struct.dataclass

@@ -136,8 +136,11 @@ class GroupedCenterlineMetrics:
     So `all` is the official number, occluded and clear share out its lanes and its vertices exactly, and its detections
     but for those in frames without lanes. Traffic elements count only in `all`.
 
+    Frames can be shared out, too: a group of frames is measured like `all`, on these frames alone.
+
     Args:
         groups: the groups to report.
+        frame_groups: names of groups of frames.
         occluded_below: visibility (share of the lane in direct line of sight) below which a lane is occluded.
         version: of the topology score.
     """
@@ -146,23 +149,31 @@ class GroupedCenterlineMetrics:
         self,
         groups: Sequence[str] = ("all", "occluded", "clear"),
         *,
+        frame_groups: Sequence[str] = (),
         occluded_below: float = 0.5,
         version: Version = "v2.1",
     ) -> None:
         self.version: Version = version
         self.occluded_below = occluded_below
-        self._metrics: dict[str, CenterlineMetrics] = {group: CenterlineMetrics(version) for group in groups}
+        self._frame_groups = frozenset(frame_groups)
+        self._metrics = {group: CenterlineMetrics(version) for group in (*groups, *frame_groups)}
 
     @property
     def protocol(self) -> str:
         """Name and version, to stand above every table of these numbers."""
         return f"OpenLane-V2 centerline {self.version}, occluded: visibility < {self.occluded_below:g}"
 
-    def update(self, detections: LaneDetections, truth: LaneTruth) -> None:
-        """Add one frame; raise UserError for arrays that do not fit together or a visibility that is not known."""
+    def update(self, detections: LaneDetections, truth: LaneTruth, frame_group: str | None = None) -> None:
+        """Add one frame, which may belong to a group of frames.
+
+        Raises UserError for arrays that do not fit together or a visibility that is not known.
+        """
         frame = match_frame(detections, truth, self.version)
         for group, metrics in self._metrics.items():
-            metrics.add(frame if group == "all" else frame.select(self._members(group, truth, frame.lanes)))
+            if group in ("all", frame_group):
+                metrics.add(frame)
+            elif group not in self._frame_groups:
+                metrics.add(frame.select(self._members(group, truth, frame.lanes)))
 
     def merge(self, other: Self) -> Self:
         """Return an accumulator of the frames of both, in this order (neither changes)."""

@@ -22,9 +22,10 @@ from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
 
-# What priors add to the BEV features of a layer: (number of the layer, features (q, c), position (q, c)) -> features.
+# What priors add to the BEV features of a layer: (number of the layer, places (q, 2) of the cells in [0, 1], features
+# (q, c), their position encodings (q, c)) -> features.
 # Modules that it uses are made inside it, so that their parameters stand below the layer that calls it.
-Fuse = Callable[[int, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
+Fuse = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ class BevEncoder(nn.Module):
                 looked_at = jnp.where(history.valid, initial, queries)
             queries = layer(config, name=f"layer_{i}")(
                 queries, position, (previous, looked_at), cells, tokens, reference, visible, shapes, deterministic,
-                None if fuse is None else partial(fuse, i),
+                None if fuse is None else partial(fuse, i, cell_points(config.grid)),
             )  # fmt: skip
         return queries
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
-from tflane_jax.layers.polyline_encoder import temperature_encoding
+from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.models.auxiliary import LaneCellHead
 from tflane_jax.models.bev_encoder import Fuse
 
@@ -60,18 +61,18 @@ class EvidenceEncoder(nn.Module):
             # Barriers, so that a prior that is absent leaves what an encoder without priors computes, to the bit.
             x = lax.optimization_barrier(x)
             if fuse is not None:
-                x = fuse(i, x.reshape(-1, x.shape[-1]), _positions(x)).reshape(x.shape)
+                places = cell_points(BevGrid(rows=x.shape[0], columns=x.shape[1]))
+                x = fuse(i, places, x.reshape(-1, x.shape[-1]), _positions(places, x)).reshape(x.shape)
                 x = lax.optimization_barrier(x)
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x
 
 
-def _positions(x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
+def _positions(places: np.ndarray, x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
     """Return the encoding of where cells lie, as many channels as the features have (a multiple of 4)."""
-    rows, columns, dim = x.shape
-    share = jnp.asarray(cell_points(BevGrid(rows=rows, columns=columns)), x.dtype)
-    return temperature_encoding(share, dim // 2, layout="blocks")
+    # With 8 bands the shortest wave is about two cells long.
+    return sine_encoding(jnp.asarray(places, x.dtype), x.shape[-1] // 4, lowest=0.125)
 
 
 def _norm(name: str) -> nn.GroupNorm:

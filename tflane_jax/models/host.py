@@ -22,9 +22,10 @@ from tflane_jax.models.marker_fusion import (
     MarkerTokens,
     empty_marker_memory,
     fusion_gate,
+    fusion_mask,
     guide_frame,
 )
-from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion
+from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, sd_map_mask
 from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemory
 from tflane_jax.scene import Example, LaneGraph, Prediction
 
@@ -104,19 +105,21 @@ class Host(nn.Module):
         if sd_map is not None:
             lines = self.sd_map_tokens(example.sd_map, deterministic=deterministic)
             fusions.append(
-                lambda layer, bev, position: SdMapFusion(sd_map, name=f"sd_map_{layer}")(bev, position, *lines)
+                lambda layer, places, *bev: SdMapFusion(sd_map, name=f"sd_map_{layer}")(
+                    *bev, *lines, sd_map_mask(example.sd_map, places, sd_map)
+                )
             )
         if markers is not None and guide is not None:
             tokens, (gate, valid) = self.marker_tokens(guide, deterministic=deterministic), fusion_gate(guide, markers)
             fusions.append(
-                lambda layer, bev, position: MarkerFusion(markers, name=f"markers_{layer}")(
-                    bev, position, tokens, valid, gate
+                lambda layer, places, *bev: MarkerFusion(markers, name=f"markers_{layer}")(
+                    *bev, tokens, fusion_mask(guide, valid, places, markers), gate
                 )
             )
 
-        def fuse(layer: int, bev: Float[Array, "q c"], position: Float[Array, "q c"]) -> Float[Array, "q c"]:
+        def fuse(layer: int, places: Any, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
             for each in fusions:
-                bev = each(layer, bev, position)
+                bev = each(layer, places, bev, position)
             return bev
 
         return fuse if fusions else None

@@ -15,12 +15,12 @@ from typing import Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
-from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.masks import key_mask, reach_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
@@ -47,6 +47,13 @@ class MarkerFusionConfig:
             below (Table II).
         hard_threshold: confidence from which on "hard" trusts a marker.
         heads: of the attention to the tokens.
+        width: channels of that attention; None: those of the BEV features.
+        norm: where the LayerNorm of Eq. (3) stands. "sum": around the sum, as written. "query": on the BEV features as
+            they ask, F + c Attn(LayerNorm(F), ..), silent at first, so that a host can go on from where it is.
+            BEVFormer's features are normalised already where a prior comes in; those of BEV evidence are not, and
+            Eq. (3) as written is a shock to a host trained without it.
+        reach: a BEV cell looks only at lanes that pass within so many metres of it. None: at all of them, as Eq. (3) is
+            written, and has to learn from their tokens which are near; that takes longer than a small model trains.
         query_position: add their positions to the BEV features where they look at the tokens. Eq. (3) writes none;
             SMERF does, and BEV features of a convolution do not know where they are.
         connectivity: let lanes know their successors and predecessors (the paper's future work).
@@ -60,13 +67,16 @@ class MarkerFusionConfig:
     fusion: Literal["gated", "uniform", "hard"] = "gated"
     hard_threshold: float = 0.5
     heads: int = 4
+    width: int | None = None
+    norm: Literal["sum", "query"] = "sum"
+    reach: float | None = None
     query_position: bool = True
     connectivity: bool = False
     range: PerceptionRange = BevGrid().range
 
 
 SMALL_MARKER_FUSION = MarkerFusionConfig(
-    memory=MarkerMemoryConfig(lanes=32),
+    memory=MarkerMemoryConfig(lanes=32), width=64, norm="query", reach=4.0,
     lines=PolylineEncoderConfig(
         dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
     ),
@@ -123,22 +133,26 @@ class MarkerFusion(nn.Module):
         bev: Float[Array, "q c"],
         position: Float[Array, "q c"],
         tokens: Float[Array, "n d"],
-        valid: Bool[Array, " n"],
+        mask: Bool[Array, "#q n"],
         gate: Float[Array, ""],
     ) -> Float[Array, "q c"]:
-        """Return the BEV features after the fusion; exactly those that came in where no token is valid.
+        """Return the BEV features after the fusion; exactly those that came in where there is no token to look at.
 
         Args:
             bev, position: features of the cells, and of where they are.
             tokens: of all lanes that guide.
-            valid: of the tokens.
+            mask: which cell may look at which token.
             gate: c of Eq. (3), as `fusion_gate` gives it.
         """
-        query = bev + position if self.config.query_position else bev
-        attention = MultiHeadAttention(bev.shape[-1], self.config.heads, name="attention")
-        found = attention(query, tokens, tokens, key_mask(valid))
-        fused = nn.LayerNorm(epsilon=1e-5, name="norm")(bev + gate * found)  # Eq. (3)
-        return jnp.where(valid.any(), fused, bev)
+        config, channels = self.config, bev.shape[-1]
+        norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
+        query = norm(bev) if added else bev
+        attention = MultiHeadAttention(
+            config.width or channels, config.heads, out=channels, silent=added, name="attention"
+        )
+        found = attention(query + position if config.query_position else query, tokens, tokens, mask)
+        fused = bev + gate * found
+        return jnp.where(mask.any(), fused if added else norm(fused), bev)  # Eq. (3)
 
 
 def fusion_gate(guide: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
@@ -149,6 +163,15 @@ def fusion_gate(guide: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Floa
     if config.fusion == "uniform":
         return one, guide.valid
     return one, guide.valid & (guide.gate >= config.hard_threshold)
+
+
+def fusion_mask(
+    guide: MarkerGuidance, valid: Bool[Array, " n"], places: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
+) -> Bool[Array, "#q n"]:
+    """Return which BEV cell may look at which token; `places` of the cells are in [0, 1] of the range."""
+    if config.reach is None:
+        return key_mask(valid)
+    return reach_mask(config.range.denormalise(jnp.asarray(places)), guide.points, valid, config.reach)
 
 
 def guide_frame(

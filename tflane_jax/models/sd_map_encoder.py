@@ -4,7 +4,7 @@ A host encodes the map once a frame, and fuses it in every layer of its BEV enco
 
     tokens, valid = SdMapEncoder(config, name="sd_map")(example.sd_map)
 
-    def fuse(layer, bev, position):
+    def fuse(layer, places, bev, position):
         return SdMapFusion(config, name=f"sd_map_{layer}")(bev, position, tokens, valid)
 
 The BEV encoder takes `fuse`; the parameters of a fusion stand below the layer that calls it.
@@ -18,10 +18,10 @@ from typing import Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from tflane_jax.layers.attention import MultiHeadAttention
-from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.masks import key_mask, reach_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
 from tflane_jax.scene import SdMap
@@ -35,6 +35,7 @@ class SdMapModuleConfig:
         prior: coordinates and labels.
         lines: from polylines to tokens.
         heads: of the attention to the tokens.
+        width, norm, reach: see `MarkerFusionConfig`; SMERF's are the defaults.
         absent: where no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias
             of the attention's output and normalises, as the published code does with an empty map beside a full one.
     """
@@ -42,10 +43,16 @@ class SdMapModuleConfig:
     prior: SdMapPriorConfig = SdMapPriorConfig()
     lines: PolylineEncoderConfig = PolylineEncoderConfig()
     heads: int = 4
+    width: int | None = None
+    norm: Literal["sum", "query"] = "sum"
+    reach: float | None = None
     absent: Literal["nothing", "reference"] = "nothing"
 
 
-SMALL_SD_MAP = SdMapModuleConfig(lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0))
+SMALL_SD_MAP = SdMapModuleConfig(
+    # A road is some 7 m to each side of its line, and the line a few metres off.
+    lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0), width=64, norm="query", reach=10.0,
+)
 
 # Points on a line of the map that stands for an absent one.
 POINTS = 11
@@ -86,13 +93,34 @@ class SdMapFusion(nn.Module):
         position: Float[Array, "q c"],
         tokens: Float[Array, "r d"],
         valid: Bool[Array, " r"],
+        mask: Bool[Array, "q r"] | None = None,
     ) -> Float[Array, "q c"]:
-        """Return the BEV features after the fusion; where no line is valid, see `SdMapModuleConfig.absent`."""
-        dim, present = bev.shape[-1], valid.any()
-        attention = MultiHeadAttention(dim, self.config.heads, name="attention")
-        found = attention(bev + position, tokens, tokens, key_mask(valid))
-        if self.config.absent == "reference":
+        """Return the BEV features after the fusion; where no line is valid, see `SdMapModuleConfig.absent`.
+
+        Args:
+            bev, position: features of the cells, and of where they are.
+            tokens, valid: of the lines.
+            mask: which cell may look at which line, see `sd_map_mask`; None: at all that are valid.
+        """
+        config, channels, present = self.config, bev.shape[-1], valid.any()
+        norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
+        attention = MultiHeadAttention(
+            config.width or channels, config.heads, out=channels, silent=added, name="attention"
+        )
+        query = norm(bev) if added else bev
+        found = attention(query + position, tokens, tokens, key_mask(valid) if mask is None else mask)
+        if config.absent == "reference":
             # Attention over nothing is 0 before the output's projection there, and behind it here.
             found = jnp.where(present, found, attention.variables["params"]["output"]["bias"][None])
-        fused = nn.LayerNorm(epsilon=1e-5, name="norm")(bev + found)
-        return fused if self.config.absent == "reference" else jnp.where(present, fused, bev)
+        fused = bev + found if added else norm(bev + found)
+        return fused if config.absent == "reference" else jnp.where(present, fused, bev)
+
+
+def sd_map_mask(
+    sd_map: SdMap | None, places: Float[ArrayLike, "q 2"], config: SdMapModuleConfig
+) -> Bool[Array, "q r"] | None:
+    """Return which BEV cell may look at which line of the map; `places` of the cells are in [0, 1] of the range."""
+    if sd_map is None or config.reach is None:
+        return None
+    cells = config.prior.range.denormalise(jnp.asarray(places))
+    return reach_mask(cells, jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.reach)

@@ -26,7 +26,7 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.scene import ElementPrediction, Example, LanePrediction, shapes_of, stack_examples
 from tflane_jax.systems.base import Evaluation, Model, spread
 from tflane_jax.training.batches import first_example
-from tflane_jax.training.evaluate import evaluate_lanes, predictions
+from tflane_jax.training.evaluate import Sightings, evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import Draw
 from tflane_jax.training.records import Record
@@ -46,7 +46,10 @@ class LaneGraphSystem:
     )  # fmt: skip
     compared: tuple[str, ...] = (
         "all/OLS", "all/DET_t", "all/TOP_lt",
-        *(f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall") for group in ("all", "occluded", "clear")),
+        *(
+            f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall")
+            for group in ("all", "occluded", "clear", *Sightings.groups)
+        ),
     )  # fmt: skip
     errors: tuple[str, ...] = ()
 

@@ -63,7 +63,8 @@ def evaluate_lanes(
 ) -> GroupedCenterlineMetrics:
     """Return the filled accumulator of OpenLane-V2's centerline metrics (groups all, occluded, clear) of a dataset.
 
-    Traffic elements are measured where the task predicts them and the examples have them.
+    Traffic elements are measured where the task predicts them and the examples have them. Examples that have markers
+    are measured by what is known of markers as well, see `Sightings`.
 
     Args:
         task: predicts lanes.
@@ -74,16 +75,36 @@ def evaluate_lanes(
     Raises:
         ValueError: the task predicts no lanes.
     """
-    metrics = GroupedCenterlineMetrics()
+    sightings, metrics = Sightings(), None
     for indices, batch, answer in _answered(task, params, arrays, batch_size):
         if answer.lanes is None:
             raise ValueError("this task predicts no lanes, so there is nothing to measure")
         both = answer.elements is not None and batch.traffic_elements is not None
         found = answer.lanes, answer.elements if both else None
         true = batch.lanes, batch.traffic_elements if both else None
+        metrics = metrics or GroupedCenterlineMetrics(frame_groups=sightings.groups if batch.markers else ())
         for row in range(len(indices)):
             metrics.update(
                 detections_from_prediction(*jax.tree.map(lambda leaf, i=row: leaf[i], found)),
                 truth_from_example(*jax.tree.map(lambda leaf, i=row: leaf[i], true)),
+                sightings.next(batch.markers.valid[row].any(), batch.has_previous[row]) if batch.markers else None,
             )
-    return metrics
+    return metrics or GroupedCenterlineMetrics()
+
+
+class Sightings:
+    """Shares out the frames of scenes, in order, by what is known of markers in them.
+
+    "seen": a marker is detected; "gap": none is, but one was before in this scene; "before": none was yet.
+    """
+
+    groups: tuple[str, ...] = ("seen", "gap", "before")
+
+    def __init__(self) -> None:
+        self._ever = False
+
+    def next(self, seen: Any, has_previous: Any) -> str:
+        """Return the group of the next frame."""
+        before = self._ever and bool(has_previous)
+        self._ever = before or bool(seen)
+        return "seen" if seen else "gap" if before else "before"

@@ -30,7 +30,7 @@ from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config, write_json, write_text
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, per_seed, with_params
-from tflane_jax.training.step import make_multi_seed_step, make_update_step
+from tflane_jax.training.step import compiled_update
 from tflane_jax.training.task import Params, Task
 
 Evaluate = Callable[[Params], dict[str, float]]
@@ -170,12 +170,9 @@ def train(
         began = time.perf_counter()
         feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size, prepare)
         batch = next(feed, None)
-        if len(config.seeds) == 1:
-            update = make_update_step(task, optim, config.steps)
-        else:
-            update = make_multi_seed_step(task, optim, config.steps, batch="per_seed")
+        update = None
         if batch is not None:  # a run that is complete has no next batch
-            update = update.lower(state, batch).compile()
+            update = compiled_update(task, optim, config.steps, len(config.seeds), state, batch)
         compile_seconds = time.perf_counter() - began
         if progress:
             tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -45,6 +46,27 @@ def make_multi_seed_step(
     """
     update = _update(task, optim, steps)
     return _guarded(jax.vmap(update, in_axes=(0, 0 if batch == "per_seed" else None)))
+
+
+def compiled_update(
+    task: Task, optim: OptimConfig, steps: int, seeds: int, state: TrainState, batch: Any
+) -> UpdateStep:
+    """Return the update of one or several seeds (batches of their own), compiled for these shapes.
+
+    A process compiles it once: trainings that differ in their seeds or in what they start from share it.
+    """
+    leaves, tree = jax.tree.flatten((state, batch))
+    return _compiled(task, optim, steps, seeds, tree, tuple(jax.typeof(leaf) for leaf in leaves))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(task: Task, optim: OptimConfig, steps: int, seeds: int, tree: Any, types: tuple[Any, ...]) -> UpdateStep:
+    if seeds == 1:
+        update: Any = make_update_step(task, optim, steps)
+    else:
+        update = make_multi_seed_step(task, optim, steps, batch="per_seed")
+    shapes = [jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in types]
+    return update.lower(*jax.tree.unflatten(tree, shapes)).compile()
 
 
 def _guarded(update: UpdateStep) -> UpdateStep:

@@ -33,6 +33,8 @@ class PlacementConfig:
     Attributes:
         per: "approach": a marker at every approach of a junction, split or merge; "scene": one of these for each map,
             as in the paper.
+        side: "near": only there, before the junction; "both": also behind it, to the right of the lanes that leave it,
+            facing those who come across, who see it from farther away and until they have passed.
         size: side of the black square, metres (paper: 1).
         height: of the marker's middle above the road, metres.
         setback: from the kerb to the marker's middle, metres.
@@ -42,6 +44,7 @@ class PlacementConfig:
     """
 
     per: Literal["approach", "scene"] = "approach"
+    side: Literal["near", "both"] = "near"
     size: float = 1.0
     height: float = 3.0
     setback: float = 0.8
@@ -54,13 +57,15 @@ def place_markers(vector_map: VectorMap, seed: int, config: PlacementConfig = Pl
     """Return the markers of a map, in no particular order: to the right of each approach, facing its traffic.
 
     An approach is all lanes that end side by side where an intersection, a split or a merge begins. The marker stands
-    behind the kerb to the right of the lanes' end. Where that would be in the middle of another lane there is none.
+    behind the kerb to the right of the lanes' end (`side`: or beyond the junction as well). Where that would be in the
+    middle of another lane there is none.
     The same map and seed give the same bits. A map without such places, or without lanes, has no marker.
     """
-    segments = [vector_map.segments[i] for i in _approach_lanes(vector_map.segments)]
-    right, heading = _ends(segments)
-    chosen = _rightmost(right, heading)
-    right, heading = right[chosen], heading[chosen]
+    lanes = vector_map.segments
+    sides = [_roadside([lanes[i] for i in _approach_lanes(lanes)], end=-1)]
+    if config.side == "both":
+        sides.append(_roadside([lanes[i] for i in _exit_lanes(lanes)], end=0))
+    right, heading = (np.concatenate(values) for values in zip(*sides, strict=True))
     sideways = np.stack([np.sin(heading), -np.cos(heading)], -1)
     to_kerb = _kerb_distance(right[:, :2], sideways, vector_map.road_boundaries)
     place = right + np.pad((to_kerb + config.setback)[:, None] * sideways, ((0, 0), (0, 1)))
@@ -97,11 +102,20 @@ def _approach_lanes(segments: dict[int, LaneSegment]) -> list[int]:
     ]  # fmt: skip
 
 
-def _ends(segments: list[LaneSegment]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Return the last point of each lane's right boundary, and the heading there."""
-    right = np.array([s.right[-1] for s in segments]).reshape(-1, 3)
-    step = np.array([s.centerline[-1] - s.centerline[-2] for s in segments]).reshape(-1, 3)
-    return right, np.arctan2(step[:, 1], step[:, 0])
+def _exit_lanes(segments: dict[int, LaneSegment]) -> list[int]:
+    """Return the ids of the lanes outside of intersections that begin where an intersection ends."""
+    onward = {j for s in segments.values() if s.vehicle and s.is_intersection for j in s.successors}
+    return [i for i, s in segments.items() if i in onward and s.vehicle and not s.is_intersection]
+
+
+def _roadside(segments: list[LaneSegment], *, end: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Return the end (-1) or the start (0) of the right boundary of the rightmost lanes, and their headings there."""
+    right = np.array([s.right[end] for s in segments]).reshape(-1, 3)
+    first = -2 if end else 0
+    step = np.array([s.centerline[first + 1] - s.centerline[first] for s in segments]).reshape(-1, 3)
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    chosen = _rightmost(right, heading)
+    return right[chosen], heading[chosen]
 
 
 def _rightmost(right: Float[np.ndarray, "n 3"], heading: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:

@@ -7,6 +7,7 @@ and any run of it can be evaluated or drawn by itself.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import json
 import multiprocessing
@@ -83,28 +84,53 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
     # Seed by seed, so that a comparison stopped early has pairs.
     train_all([plan[name][i] for i in range(len(seeds)) for name in plan], jobs)
 
-    data = system.load(source)
     variants: list[Variant] = []
     remarks: dict[str, dict[str, str]] = {}
     models: dict[str, Model] = {}
     protocol = ""
     for name, trainings in plan.items():
-        measured: dict[str, list[dict[str, float]]] = {name: []}
+        measured: dict[str, list[dict[str, float]]] = {}
         for job in tqdm(trainings, desc=f"evaluate {name}", unit="run"):
-            run = open_run(job.folder, "last")
-            task, params, size = run.config.task, run.params[0], run.config.evaluation.batch_size
-            models.setdefault(name, Model(task, params))
-            ways = {name: task} | {f"{name}, {way}": other for way, other in system.inference_variants(task).items()}
-            for way, used in ways.items():
-                evaluation = system.evaluate(used, params, data, size)
-                protocol = evaluation.protocol
-                measured.setdefault(way, []).append(evaluation.scores())
+            found = _measured(job)
+            protocol = found["protocol"]
+            for way, scores in found["ways"].items():
+                measured.setdefault(f"{name}, {way}" if way else name, []).append(scores)
+        run = open_run(trainings[0].folder, "last")
+        models[name] = Model(run.config.task, run.params[0])
         remarks[name] = system.remarks(models[name])
         variants += [Variant(way, tuple(scores)) for way, scores in measured.items()]
     picture = None
     if importlib.util.find_spec("matplotlib") is not None:
-        picture = system.draw_comparison(models, source, data, out / "comparison.png")
+        picture = system.draw_comparison(models, source, _test_data(first), out / "comparison.png")
     return _report(system, variants, remarks, protocol, out, picture, seeds)
+
+
+def _measured(job: Job) -> dict[str, Any]:
+    """Return the protocol and the scores of each way to use a run, at its last step; measured once, kept beside it."""
+    path, source = job.folder.with_name(f"{job.folder.name}.scores.json"), job.config.data.source("test")
+    run = open_run(job.folder, "last")
+    # Of which run and data: it may have been trained anew since, or the test split be another.
+    of = [run.step, (job.folder / "config.json").stat().st_mtime_ns, repr(source)]
+    with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if kept["of"] == of:
+            return kept
+    system, task, params = system_of(job.config), run.config.task, run.params[0]
+    data, ways = _test_data(job.config), {"": task} | system.inference_variants(task)
+    every = {way: system.evaluate(used, params, data, run.config.evaluation.batch_size) for way, used in ways.items()}
+    found = {"of": of, "protocol": every[""].protocol, "ways": {way: one.scores() for way, one in every.items()}}
+    write_json(path, found)
+    return found
+
+
+def _test_data(config: RunConfig) -> Any:
+    """Return the examples of the test split, which a process loads once."""
+    return _loaded(config.data.source("test"), type(system_of(config)))
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(source: Any, system: type[System]) -> Any:
+    return system().load(source, progress=False)
 
 
 def train_all(jobs: Sequence[Job], parallel: int) -> None:
@@ -182,6 +208,8 @@ def _train_jobs(pipe: Any, cores: list[int]) -> None:
             try:
                 result = train_run(job.config, job.folder, start=_start(job.folder), progress=False)
                 well = result.stopped_by is None
+                if well:
+                    _measured(job)
             except UserError as error:
                 print(f"tflane: {error}")
                 well = False

@@ -73,6 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
     _data(commands)
     _summary(commands)
     _compare(commands)
+    _sweep(commands)
     _score(commands)
     _markers(commands)
     _demo(commands)
@@ -232,6 +233,17 @@ def _compare(commands) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, sharing the cores (default 1)")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/compare"), help="default runs/compare")
+    parser.set_defaults(takes_overrides=True)
+
+
+def _sweep(commands) -> None:
+    parser = _command(commands, "sweep", "evaluate trained models while a setting of their test data changes",
+                      module="sweep", function="run", epilog=_OVERRIDES)  # fmt: skip
+    parser.add_argument("runs", metavar="[NAME=]FOLDER", nargs="+",
+                        help="run folders, or folders with one for each seed as compare leaves them")  # fmt: skip
+    parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
+    parser.add_argument("--values", nargs="+", required=True, help="of the setting")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.set_defaults(takes_overrides=True)
 
 

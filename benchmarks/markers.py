@@ -1,0 +1,65 @@
+"""What markers and their memory cost a host that streams: one frame, with the memory of the frames before it.
+
+    python -m benchmarks.markers --out runs/bench
+
+The models are those of `configs/markers/`. Without memory a frame's own markers guide it; with memory the bank is
+moved, aged and looked up in every frame, whether a marker is in sight or not.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks.timing import compile_jax, interleave, machine, markdown_table, save, summarise
+from tflane_jax.config import load_config
+from tflane_jax.datasets.loading import for_training, load_arrays
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.training.lane_graph import LaneGraphTask
+
+CONFIG = Path(__file__).parent.parent / "configs" / "markers" / "toponet_markers.py"
+MODELS = {"markers, no memory": ":no_memory", "markers, memory": "", "host": ":toponet"}
+
+
+def run(out: Path, seconds: float = 20.0) -> dict[str, Any]:
+    """Run everything, print the table, write `markers.json` and `markers.md` into `out`, and return the record."""
+    config = load_config(str(CONFIG))
+    source = config.data.source("val")
+    assert isinstance(source, ProceduralConfig)
+    one_scene = ProceduralConfig("val", scenes=1, world=source.world, example=source.example)
+    frames = for_training(load_arrays(ProceduralDataset(one_scene), progress=False))
+    frame = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), frames)
+    compiled = {}
+    for name, ablation in MODELS.items():
+        task = load_config(f"{CONFIG}{ablation}").task
+        assert isinstance(task, LaneGraphTask)
+        params = jax.jit(task.init)(jax.random.key(0), jax.tree.map(lambda leaf: jnp.asarray(leaf[:4]), frames))
+        compiled[name] = compile_jax(task.step, params, task.start(), frame)
+    times = interleave({name: entry.program for name, entry in compiled.items()}, seconds)
+    results = summarise(times, next(iter(compiled)))
+    rows = [
+        [name, f"{r['median_ms']:.2f}", f"{r['least_ms']:.2f}", f"{r['ratio']:.3f}", f"{compiled[name].seconds:.1f}"]
+        for name, r in results.items()
+    ]
+    table = markdown_table(["a frame of a stream", "median ms", "least ms", "ratio", "compile s"], rows)
+    record = {"machine": machine(), "results": results}
+    print(table)
+    save(out, "markers", record, table)
+    return record
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser.add_argument("--seconds", type=float, default=20.0)
+    options = parser.parse_args()
+    run(options.out, options.seconds)
+
+
+if __name__ == "__main__":
+    main()

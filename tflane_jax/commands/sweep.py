@@ -1,0 +1,23 @@
+"""`tflane sweep`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from tflane_jax.errors import UserError
+from tflane_jax.training.runtime import configure_jax
+
+
+def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
+    """Evaluate trained models over the values of a setting."""
+    from tflane_jax.sweep import sweep
+
+    pairs = [reference.partition("=") for reference in options.runs]
+    models = {name if path else Path(name).name: Path(path or name) for name, _, path in pairs}
+    if len(models) < len(pairs):
+        raise UserError("two of the folders have the same name: write NAME=FOLDER to tell them apart")
+    configure_jax()
+    sweep(models, options.setting, options.values, options.out, overrides)
+    return 0

@@ -1,0 +1,46 @@
+"""Scores of several models against a setting of the data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+
+Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
+"""By model: for each value of the setting, for each seed, metrics by name."""
+
+
+def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], metrics: Sequence[str]) -> Path:
+    """Write one panel for each metric, a line for each model (mean of its seeds) in a band of one standard deviation.
+
+    Args:
+        path: .png, .pdf or .svg.
+        scores: see there.
+        setting, values: of the horizontal axis; values that are no numbers are evenly spaced.
+        metrics: names in `scores`.
+    """
+    try:
+        places, ticks = np.array([float(value) for value in values]), None
+    except ValueError:
+        places, ticks = np.arange(len(values), dtype=float), values
+    columns = min(3, len(metrics))
+    figure, axes = new_figure(-(-len(metrics) // columns), columns, panel=(4.2, 2.9))
+    for ax, metric in zip(axes.flat, metrics, strict=False):
+        for number, (model, by_value) in enumerate(scores.items()):
+            percent = [100.0 * np.array([each[metric] for each in seeds]) for seeds in by_value]
+            mean = np.array([seeds.mean() for seeds in percent])
+            spread = np.array([seeds.std(ddof=1) if len(seeds) > 1 else 0.0 for seeds in percent])
+            ax.plot(places, mean, color=f"C{number}", marker="o", ms=3, lw=1.4, label=model)
+            ax.fill_between(places, mean - spread, mean + spread, color=f"C{number}", alpha=0.15, lw=0)
+        ax.set_title(f"{metric}, percent", fontsize=9, loc="left")
+        ax.set_xlabel(setting.rpartition(".")[2].replace("_", " "), fontsize=8)
+        if ticks is not None:
+            ax.set_xticks(places, ticks)
+        ax.tick_params(labelsize=7)
+        ax.grid(alpha=0.3, lw=0.5)
+    axes.flat[0].legend(fontsize=7, frameon=False)
+    hide_unused(axes, len(metrics))
+    return save_figure(figure, path)

@@ -1,0 +1,91 @@
+"""Evaluate trained models while one setting of their test data changes: score against occlusion, noise, density."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.config import apply_overrides
+from tflane_jax.errors import UserError
+from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.runs import Run, open_run
+from tflane_jax.systems import system_of
+
+
+def sweep(
+    models: Mapping[str, Path], setting: str, values: Sequence[str], out: Path, overrides: Sequence[str] = ()
+) -> Path:
+    """Evaluate every run of every model with each value of the setting; print and save a table and a plot.
+
+    Args:
+        models: run folder by name, or a folder that holds a run folder for each seed.
+        setting: of the configuration, by its dotted name; of the data, for it changes nothing in a trained model.
+        values: of the setting, as on the command line.
+        out: folder for `sweep.md`, `sweep.json` and `sweep.png`.
+        overrides: other settings, `--name value`, for all.
+
+    Returns:
+        The Markdown file.
+
+    Raises:
+        UserError: no run, or a setting that is none of the data's.
+    """
+    if not setting.startswith("data."):
+        raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
+    runs = {name: runs_below(folder) for name, folder in models.items()}
+    scores: dict[str, list[list[dict[str, float]]]] = {name: [] for name in runs}
+    protocol = ""
+    total = len(values) * sum(map(len, runs.values()))
+    with tqdm(total=total, unit="run") as bar:
+        for value in values:
+            loaded: dict[Any, Any] = {}
+            for name, trained in runs.items():
+                found = []
+                for run in trained:
+                    bar.set_description(f"{setting} = {value}: {name}")
+                    changed = apply_overrides(run.config, [f"--{setting}", value, *overrides])
+                    source, system = changed.data.source("test"), system_of(changed)
+                    if source not in loaded:
+                        loaded = {source: system.load(source)}
+                    size = changed.evaluation.batch_size
+                    for params in run.params:
+                        evaluation = system.evaluate(run.config.task, params, loaded[source], size)
+                        found.append(evaluation.scores())
+                    protocol = evaluation.protocol
+                    bar.update()
+                scores[name].append(found)
+    every = [each for by_value in scores.values() for found in by_value for each in found]
+    metrics = [name for name in system.compared if all(name in each for each in every)]
+    rows = [
+        {setting: value, "model": name} | {metric: _mean_and_spread(scores[name][i], metric) for metric in metrics}
+        for i, value in enumerate(values) for name in scores
+    ]  # fmt: skip
+    title = f"{protocol}, test split, percent (mean ± std over seeds)"
+    print("\n" + format_table(rows, title=title))
+    out.mkdir(parents=True, exist_ok=True)
+    meta = {"protocol": protocol, "setting": setting, "values": list(values), "scores": scores}
+    written = list(save_table(out / "sweep", rows, meta, title=title))
+    if importlib.util.find_spec("matplotlib") is not None:
+        from tflane_jax.plots.sweep import save_sweep
+
+        written.append(save_sweep(out / "sweep.png", scores, setting, values, metrics))
+    print("\nwritten:", *written, sep="\n  ")
+    return written[0]
+
+
+def runs_below(folder: Path) -> list[Run]:
+    """Return the run of a folder, or those of its subfolders, at their last step; raises UserError for none."""
+    folders = [folder] if (folder / "config.json").is_file() else sorted(p.parent for p in folder.glob("*/config.json"))
+    if not folders:
+        raise UserError(f"{folder} is no run folder, and holds none")
+    return [open_run(each, "last") for each in folders]
+
+
+def _mean_and_spread(scores: Sequence[Mapping[str, float]], metric: str) -> str:
+    values = 100.0 * np.array([each[metric] for each in scores])
+    return f"{values.mean():.1f}" + (f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else "")

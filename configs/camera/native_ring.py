@@ -1,0 +1,23 @@
+"""Scenes in the seven cameras of Argoverse 2 at their native 2048 x 1550, to be written in OpenLane-V2's layout.
+
+    tflane data export --config configs/camera/native_ring.py --out data/world
+    tflane train --config configs/camera/toponet_r50.py --data.root data/world --training.batch_size 1 \\
+        --training.steps 2 --optim.epoch_steps 0 --optim.warmup_steps 0
+
+The second command makes two updates of the paper's size, for who has no OpenLane-V2 at hand.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.simulate import WorldConfig
+
+
+def get_config() -> RunConfig:
+    """Return two scenes of two frames in each split."""
+    example = ExampleConfig(sensor=None, cameras=CameraRigConfig(ARGOVERSE2_RING, scale=1.0))
+    small = load_config(str(Path(__file__).with_name("toponet.py")))
+    return replace(small, data=WorldData(2, 1, 1, WorldConfig(keyframes=2), example))

@@ -1,6 +1,7 @@
 """Training on clips and evaluating streams: time is a scan, and what is remembered changes the answer."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.scene import shapes_of, stack_examples
 from tflane_jax.summary import training_program
-from tflane_jax.systems.lane_graph import clips
+from tflane_jax.systems.lane_graph import clips, predict_examples
 from tflane_jax.training.evaluate import Sightings, evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.training.schedule import OptimConfig
@@ -81,6 +82,16 @@ def test_evaluation_streams_through_scenes(params, batch_size):
     alone = [answer.lanes.points for _, answer in predictions(ALONE, params, frames, batch_size)]
     differs = [not np.allclose(a, b, atol=1e-3) for a, b in zip(np.concatenate(alone), expected, strict=True)]
     assert differs == [False, True, True] * 2
+
+
+def test_single_frames_of_a_stream_are_drawn_with_what_is_remembered(params):
+    frames = scenes()
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(6)]
+    (found,) = [answer.lanes.points for _, answer in predictions(CLIPS, params, frames, 6)]
+    examples, lanes, elements = predict_examples(CLIPS, params, SimpleNamespace(example=each.__getitem__), [5, 1, 3])
+    np.testing.assert_array_equal(lanes.points, found[[5, 1, 3]])
+    np.testing.assert_array_equal(examples.bev, frames.bev[[5, 1, 3]])
+    assert elements is None
 
 
 def test_a_clip_initialises_as_a_frame(params):

@@ -182,10 +182,26 @@ def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
 def predict_examples(
     task: Any, params: Params, dataset: Dataset, indices: Sequence[int]
 ) -> tuple[Example, LanePrediction, ElementPrediction | None]:
-    """Return some examples whole, with truth and all, and what is predicted for them; all stacked, numpy."""
+    """Return some examples whole, with truth and all, and what is predicted for them; all stacked, numpy.
+
+    A task of clips goes through each example's scene up to it.
+    """
     examples = stack_examples([dataset.example(index) for index in indices])
-    (_, answer), = predictions(task, params, examples, len(indices))  # fmt: skip
+    if task.clip == 1:
+        (_, answer), = predictions(task, params, examples, len(indices))  # fmt: skip
+    else:
+        every = [_streamed(task, params, dataset, index) for index in indices]
+        answer = jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
     return examples, answer.lanes, answer.elements
+
+
+def _streamed(task: Any, params: Params, dataset: Dataset, index: int) -> Any:
+    """Return the answer for an example, as a stack of one, from the stream that its scene is."""
+    frames = [dataset.example(index)]
+    while frames[0].has_previous:
+        frames.insert(0, dataset.example(index - len(frames)))
+    *_, (_, answer) = predictions(task, params, stack_examples(frames), 1)
+    return answer
 
 
 def titles(dataset: Dataset, indices: Sequence[int]) -> list[str]:

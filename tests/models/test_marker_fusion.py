@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example, make_example
+from tests.models.cases import BASELINE, CAMERA_TOPONET, WITH_TRAFFIC, make_camera_example, make_example
 from tests.parameters import random_params
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoderConfig
@@ -19,12 +19,13 @@ from tflane_jax.models.marker_fusion import (
     MarkerFusionConfig,
     MarkerTokens,
     fusion_gate,
+    fusion_mask,
     guide_frame,
 )
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.priors.marker_memory import MarkerMemoryConfig
 from tflane_jax.priors.markers import MarkerPriorConfig
-from tflane_jax.scene import MarkerObservations, stack_examples
+from tflane_jax.scene import MarkerObservations, SdMap, stack_examples
 from tflane_jax.training.lane_graph import LaneGraphTask
 
 LINES = PolylineEncoderConfig(
@@ -105,6 +106,24 @@ def test_every_layer_of_the_bev_encoder_has_a_fusion_of_its_own():
     host = LaneGraphTask(replace(BASELINE, encoder=encoder, markers=CONFIG, sd_map=SMALL_SD_MAP))
     shapes = jax.eval_shape(host.init, jax.random.key(0), seeing(observed()))
     assert {f"{prior}_{layer}" for prior in ("markers", "sd_map") for layer in (0, 1)} <= shapes["encoder"].keys()
+
+
+def test_traffic_markers_and_a_map_guide_one_model_together():
+    rng = np.random.default_rng(3)
+    sd_map = SdMap(rng.uniform(-20, 20, (3, 11, 2)).astype(np.float32), np.zeros(3, np.int32), np.ones(3, bool))
+    every = LaneGraphTask(replace(WITH_TRAFFIC, markers=CONFIG, sd_map=SMALL_SD_MAP))
+    seen = seeing(observed()).replace(sd_map=sd_map)
+    params = random_params(every.init, seen)
+    predict = jax.jit(every.predict)
+    whole = predict(params, seen).lanes.points
+    assert np.isfinite(whole).all()
+    absent = {
+        "markers": seen.markers.replace(valid=np.zeros_like(seen.markers.valid)),
+        "sd_map": sd_map.replace(valid=np.zeros(3, bool)),
+        "traffic_flow": jax.tree.map(np.zeros_like, seen.traffic_flow),
+    }
+    for name, nothing in absent.items():
+        assert not np.array_equal(predict(params, seen.replace(**{name: nothing})).lanes.points, whole), name
 
 
 def test_padding_may_hold_nan(params, step):
@@ -188,6 +207,30 @@ def test_the_gate_is_the_confidence_and_its_variants():
     same(fused(hard, near, bev, position)[0], fused(uniform, near, bev, position)[0])
     same(fused(hard, far, bev, position)[0], bev)
     assert not np.array_equal(out, fused(CONFIG, far, bev, position)[0])
+
+
+def test_a_fusion_that_begins_silent_leaves_the_host_as_it_was_trained():
+    module = MarkerFusion(replace(CONFIG, norm="query", width=16))
+    bev, position, tokens = (jnp.asarray(np.random.default_rng(i).normal(size=(5, 8)), jnp.float32) for i in range(3))
+    arguments = bev, position, tokens, jnp.ones((1, 5), bool)
+    same(module.apply(module.init(jax.random.key(0), *arguments, 0.7), *arguments, 0.7), bev)
+    learned = random_params(lambda key: module.init(key, *arguments, 0.7))
+    change, half = (module.apply(learned, *arguments, gate) - bev for gate in (0.7, 0.35))
+    assert np.abs(change).max() > 1e-3
+    np.testing.assert_allclose(half, change / 2, rtol=1e-4, atol=1e-6)
+
+
+def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
+    guide, config = guide_frame(seeing(observed()), None, CONFIG)[0], replace(CONFIG, reach=1.0, norm="query")
+    start = guide.points[int(np.argmax(guide.valid)), 0]
+    places = CONFIG.range.normalise(jnp.stack([start, start + 500.0]))
+    mask = fusion_mask(guide, guide.valid, places, config)
+    np.testing.assert_array_equal(mask.any(1), [True, False])
+    tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
+    arguments, module = (jnp.ones((2, 8)), jnp.zeros((2, 8)), tokens, mask, guide.gate), MarkerFusion(config)
+    out = module.apply(random_params(lambda key: module.init(key, *arguments)), *arguments)
+    same(out[1], jnp.ones(8))
+    assert not np.array_equal(out[0], jnp.ones(8))
 
 
 @pytest.mark.parametrize("encoding", ["sine", "transformer", "mlp"])

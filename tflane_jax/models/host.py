@@ -105,15 +105,15 @@ class Host(nn.Module):
         if sd_map is not None:
             lines = self.sd_map_tokens(example.sd_map, deterministic=deterministic)
             fusions.append(
-                lambda layer, places, *bev: SdMapFusion(sd_map, name=f"sd_map_{layer}")(
-                    *bev, *lines, sd_map_mask(example.sd_map, places, sd_map)
+                lambda layer, places, bev, position: SdMapFusion(sd_map, name=f"sd_map_{layer}")(
+                    bev, position, *lines, sd_map_mask(example.sd_map, places, sd_map)
                 )
             )
         if markers is not None and guide is not None:
             tokens, (gate, valid) = self.marker_tokens(guide, deterministic=deterministic), fusion_gate(guide, markers)
             fusions.append(
-                lambda layer, places, *bev: MarkerFusion(markers, name=f"markers_{layer}")(
-                    *bev, tokens, fusion_mask(guide, valid, places, markers), gate
+                lambda layer, places, bev, position: MarkerFusion(markers, name=f"markers_{layer}")(
+                    bev, position, tokens, fusion_mask(guide, valid, places, markers), gate
                 )
             )
 

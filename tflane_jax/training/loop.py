@@ -170,7 +170,7 @@ def train(
         began = time.perf_counter()
         feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size, prepare)
         batch = next(feed, None)
-        update = None
+        update: Any = None
         if batch is not None:  # a run that is complete has no next batch
             update = compiled_update(task, optim, config.steps, len(config.seeds), state, batch)
         compile_seconds = time.perf_counter() - began

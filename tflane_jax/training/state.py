@@ -64,9 +64,9 @@ def _run_once(function: Callable[..., Any], *arguments: Any) -> Any:
     return compiled(*arguments)
 
 
-def with_params(state: TrainState, params: Sequence[Params], optimizer: optax.GradientTransformation) -> TrainState:
+def with_params(state: TrainState, given: Sequence[Params], optimizer: optax.GradientTransformation) -> TrainState:
     """Return the state of a run that starts from given parameters, one for each seed, as fine-tuning does."""
-    params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *params) if state.step.ndim else params[0]
+    params: Params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given) if state.step.ndim else given[0]
     learned, _ = split_statistics(params)
     opt_state = jax.vmap(optimizer.init)(learned) if state.step.ndim else optimizer.init(learned)
     params = jax.tree.map(jnp.array, params)

@@ -175,8 +175,10 @@ class _Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # Between jobs, or with an error on its way: what is written goes on when the same command is given again.
-        self._process.terminate()
+        if self.job is None and self._process.exitcode is None:
+            self._pipe.send(None)
+        else:  # an error is on its way: what is written goes on when the same command is given again
+            self._process.terminate()
         self._process.join()
 
     def begin(self, job: Job) -> None:
@@ -201,8 +203,7 @@ def _train_jobs(pipe: Any, cores: list[int]) -> None:
     """Train what comes through the pipe and answer whether that went well: on its own cores, messages in a file."""
     if cores:
         os.sched_setaffinity(0, cores)  # XLA sizes its thread pool by this
-    while True:
-        job = pipe.recv()
+    while (job := pipe.recv()) is not None:
         with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
             configure_jax()
             try:

@@ -39,7 +39,11 @@ def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
     ]  # fmt: skip
     assert [len(seeds) for seeds in content["meta"]["scores"]["one"]] == [2, 2]
     assert (tmp_path / "out" / "sweep.png").stat().st_size > 5_000
-    again = sweep({"one": folder / "one" / "seed_0"}, "data.world.severity", ["0"], tmp_path / "again")
+    one = {"one": folder / "one" / "seed_0"}
+    again = sweep(one, "data.world.severity", ["0"], tmp_path / "again", metrics=["all/recall"])
+    assert again.read_text().splitlines()[2].split("|")[1:-1] == [" data.world.severity ", " model ", " all/recall "]
+    with pytest.raises(UserError, match="no metric all/wit, only all/DET_l, "):
+        sweep(one, "data.world.severity", ["0"], tmp_path / "again", metrics=["all/wit"])
     first = json.loads(again.with_suffix(".json").read_text())["meta"]["scores"]["one"][0][0]
     assert first == content["meta"]["scores"]["one"][0][0]
 

@@ -243,6 +243,7 @@ def _sweep(commands) -> None:
                         help="run folders, or folders with one for each seed as compare leaves them")  # fmt: skip
     parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
     parser.add_argument("--values", nargs="+", required=True, help="of the setting")
+    parser.add_argument("--metrics", nargs="+", help="to show, say all/DET_l gap/recall (default: as compare does)")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.set_defaults(takes_overrides=True)
 

@@ -18,8 +18,9 @@ from tflane_jax.systems import system_of
 
 
 def sweep(
-    models: Mapping[str, Path], setting: str, values: Sequence[str], out: Path, overrides: Sequence[str] = ()
-) -> Path:
+    models: Mapping[str, Path], setting: str, values: Sequence[str], out: Path, overrides: Sequence[str] = (), *,
+    metrics: Sequence[str] | None = None,
+) -> Path:  # fmt: skip
     """Evaluate every run of every model with each value of the setting; print and save a table and a plot.
 
     Args:
@@ -28,12 +29,13 @@ def sweep(
         values: of the setting, as on the command line.
         out: folder for `sweep.md`, `sweep.json` and `sweep.png`.
         overrides: other settings, `--name value`, for all.
+        metrics: "group/name" of those to show; None shows all that `tflane compare` does. The JSON file has every one.
 
     Returns:
         The Markdown file.
 
     Raises:
-        UserError: no run, or a setting that is none of the data's.
+        UserError: no run, a setting that is none of the data's, or a metric that there is not.
     """
     if not setting.startswith("data."):
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
@@ -60,7 +62,10 @@ def sweep(
                     bar.update()
                 scores[name].append(found)
     every = [each for by_value in scores.values() for found in by_value for each in found]
-    metrics = [name for name in system.compared if all(name in each for each in every)]
+    known = [name for name in every[0] if all(name in each for each in every)]
+    if unknown := set(metrics or ()) - set(known):
+        raise UserError(f"no metric {min(unknown)}, only {', '.join(known)}")
+    metrics = metrics or [name for name in system.compared if name in known]
     rows = [
         {setting: value, "model": name} | {metric: _mean_and_spread(scores[name][i], metric) for metric in metrics}
         for i, value in enumerate(values) for name in scores

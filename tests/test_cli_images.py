@@ -1,6 +1,5 @@
 """The commands for lane lines in one image, on tiny networks and few images."""
 
-import functools
 import json
 import shutil
 
@@ -12,8 +11,6 @@ from tests.shared import ROOT, shared_path
 from tflane_jax.cli import main
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.scoring.tusimple import read_predictions, read_truth
-from tflane_jax.training import loop
-from tflane_jax.training.step import make_update_step
 
 pytest.importorskip("cv2")
 
@@ -43,29 +40,6 @@ def config(tmp_path_factory):
     path = tmp_path_factory.mktemp("configs") / "tiny.py"
     path.write_text(CONFIG)
     return path
-
-
-class OneProgram:
-    """An update step that compiles once, however many trainings ask for it."""
-
-    def __init__(self, *arguments):
-        self.update, self.compiled = make_update_step(*arguments), None
-
-    def lower(self, state, batch):
-        if self.compiled is None:
-            self.compiled = self.update.lower(state, batch).compile()
-        return self
-
-    def compile(self):
-        return self.compiled
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_update_program():
-    """Compile once for all trainings of this file, which differ in nothing that the update depends on."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "make_update_step", functools.cache(OneProgram))
-        yield
 
 
 @pytest.fixture(scope="module")

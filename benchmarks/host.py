@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import Compiled, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import load_config
 from tflane_jax.datasets.loading import for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
@@ -72,7 +72,7 @@ def inference(batch: Example, seconds: float) -> dict[str, Any]:
             params = jax.jit(task.init)(jax.random.key(0), one)
             predict = jax.vmap(task.predict, in_axes=(None, 0)) if batched else task.predict
             compiled[name] = compile_jax(predict, params, batch if batched else one)
-        return _measured(compiled, seconds)
+        return measure(compiled, seconds)
 
     return {
         "inference, batch 1": measured(tasks(), batched=False),
@@ -88,7 +88,7 @@ def training(batch: Example, seconds: float) -> dict[str, Any]:
     for name, task in tasks().items():
         params = jax.jit(task.init)(jax.random.key(0), one)
         compiled[name] = compile_jax(_gradient(task), params, batch)
-    return {f"loss and gradient, batch {BATCH}": _measured(compiled, seconds)}
+    return {f"loss and gradient, batch {BATCH}": measure(compiled, seconds)}
 
 
 def seeds(batch: Example, seconds: float) -> dict[str, Any]:
@@ -108,7 +108,7 @@ def seeds(batch: Example, seconds: float) -> dict[str, Any]:
         ),
         "vmap": together,
     }
-    return {f"{SEEDS} seeds, batch {BATCH} each": _measured(compiled, seconds)}
+    return {f"{SEEDS} seeds, batch {BATCH} each": measure(compiled, seconds)}
 
 
 def first_step() -> dict[str, Any]:
@@ -141,14 +141,6 @@ def _gradient(task: LaneGraphTask):
         return task.loss(params, batch, jax.random.key(0))[0]
 
     return jax.value_and_grad(loss)
-
-
-def _measured(compiled: dict[str, Compiled], seconds: float) -> dict[str, Any]:
-    times = interleave({name: entry.program for name, entry in compiled.items()}, seconds)
-    rows = summarise(times, next(iter(compiled)))
-    for name, entry in compiled.items():
-        rows[name]["compile_s"] = entry.seconds
-    return rows
 
 
 def run(out: Path, seconds: float = 10.0) -> dict[str, Any]:

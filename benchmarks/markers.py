@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.timing import compile_jax, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import load_config
 from tflane_jax.datasets.loading import for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
@@ -39,10 +39,9 @@ def run(out: Path, seconds: float = 20.0) -> dict[str, Any]:
         assert isinstance(task, LaneGraphTask)
         params = jax.jit(task.init)(jax.random.key(0), jax.tree.map(lambda leaf: jnp.asarray(leaf[:4]), frames))
         compiled[name] = compile_jax(task.step, params, task.start(), frame)
-    times = interleave({name: entry.program for name, entry in compiled.items()}, seconds)
-    results = summarise(times, next(iter(compiled)))
+    results = measure(compiled, seconds)
     rows = [
-        [name, f"{r['median_ms']:.2f}", f"{r['least_ms']:.2f}", f"{r['ratio']:.3f}", f"{compiled[name].seconds:.1f}"]
+        [name, f"{r['median_ms']:.2f}", f"{r['least_ms']:.2f}", f"{r['ratio']:.3f}", f"{r['compile_s']:.1f}"]
         for name, r in results.items()
     ]
     table = markdown_table(["a frame of a stream", "median ms", "least ms", "ratio", "compile s"], rows)

@@ -77,6 +77,13 @@ def summarise(times: Mapping[str, np.ndarray], reference: str) -> dict[str, dict
     }
 
 
+def measure(compiled: Mapping[str, Compiled], seconds: float) -> dict[str, dict[str, float]]:
+    """Return `summarise` of compiled programs that run in turn, the first as reference, with `compile_s`."""
+    times = interleave({name: entry.program for name, entry in compiled.items()}, seconds)
+    rows = summarise(times, next(iter(compiled)))
+    return {name: row | {"compile_s": compiled[name].seconds} for name, row in rows.items()}
+
+
 def machine() -> dict[str, Any]:
     """Return provenance, processor and threads."""
     return provenance() | {"processor": _processor(), "cores": os.cpu_count(), "load": list(os.getloadavg())}

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from tests.models.cases import BASELINE
-from tflane_jax.compare import compare
+from tflane_jax.compare import Job, _Worker, compare
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
 from tflane_jax.errors import UserError
 from tflane_jax.training.lane_graph import LaneGraphTask
@@ -21,6 +21,15 @@ CONFIG = RunConfig(
     TrainingConfig(steps=2, batch_size=1),
     EvaluationConfig(pictures=0),
 )
+
+
+def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
+    with _Worker(0, 1) as worker:
+        worker.begin(Job(CONFIG, tmp_path / "runs" / "seed_0"))
+        worker._process.kill()
+        worker._process.join()
+        with pytest.raises(UserError, match=r"seed_0 failed: its messages are in .*seed_0\.log"):
+            worker.check()
 
 
 @pytest.mark.slow

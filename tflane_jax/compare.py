@@ -7,7 +7,6 @@ and any run of it can be evaluated or drawn by itself.
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib.util
 import json
 import multiprocessing
@@ -26,7 +25,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import open_run, train_run
-from tflane_jax.systems import Model, System, system_of
+from tflane_jax.systems import Model, System, load_test_data, system_of
 from tflane_jax.training.run_folder import write_json
 from tflane_jax.training.runtime import configure_jax
 
@@ -101,36 +100,26 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
         variants += [Variant(way, tuple(scores)) for way, scores in measured.items()]
     picture = None
     if importlib.util.find_spec("matplotlib") is not None:
-        picture = system.draw_comparison(models, source, _test_data(first), out / "comparison.png")
+        picture = system.draw_comparison(models, source, load_test_data(first), out / "comparison.png")
     return _report(system, variants, remarks, protocol, out, picture, seeds)
 
 
 def _measured(job: Job) -> dict[str, Any]:
     """Return the protocol and the scores of each way to use a run, at its last step; measured once, kept beside it."""
     path, source = job.folder.with_name(f"{job.folder.name}.scores.json"), job.config.data.source("test")
-    run = open_run(job.folder, "last")
     # Of which run and data: it may have been trained anew since, or the test split be another.
-    of = [run.step, (job.folder / "config.json").stat().st_mtime_ns, repr(source)]
+    of = [_step(job.folder), (job.folder / "config.json").stat().st_mtime_ns, repr(source)]
     with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
         kept = json.loads(path.read_text(encoding="utf-8"))
         if kept["of"] == of:
             return kept
+    run = open_run(job.folder, "last")
     system, task, params = system_of(job.config), run.config.task, run.params[0]
-    data, ways = _test_data(job.config), {"": task} | system.inference_variants(task)
+    data, ways = load_test_data(job.config), {"": task} | system.inference_variants(task)
     every = {way: system.evaluate(used, params, data, run.config.evaluation.batch_size) for way, used in ways.items()}
     found = {"of": of, "protocol": every[""].protocol, "ways": {way: one.scores() for way, one in every.items()}}
     write_json(path, found)
     return found
-
-
-def _test_data(config: RunConfig) -> Any:
-    """Return the examples of the test split, which a process loads once."""
-    return _loaded(config.data.source("test"), type(system_of(config)))
-
-
-@functools.lru_cache(maxsize=1)
-def _loaded(source: Any, system: type[System]) -> Any:
-    return system().load(source, progress=False)
 
 
 def train_all(jobs: Sequence[Job], parallel: int) -> None:
@@ -192,11 +181,15 @@ class _Worker:
         """Take note of a job that is done; raise UserError where it failed."""
         if self.job is None:
             return
-        done = self._pipe.poll()
-        if (done and not self._pipe.recv()) or (not done and self._process.exitcode is not None):
+        if not self._pipe.poll():
+            return
+        try:
+            well = self._pipe.recv()
+        except (EOFError, OSError):  # the process is no more
+            well = False
+        if not well:
             raise UserError(f"training {self.job.folder} failed: its messages are in {self.job.log}")
-        if done:
-            self.job = None
+        self.job = None
 
 
 def _train_jobs(pipe: Any, cores: list[int]) -> None:

@@ -54,7 +54,13 @@ def parameter_counts(params: Any, depth: int = 1) -> dict[str, int]:
 
 def shapes_of_params(task: Task, example: Any) -> Any:
     """Return the shapes of a task's parameters; raises as the model does where an example does not fit it."""
-    return jax.eval_shape(task.init, jax.random.key(0), example)
+    return jax.eval_shape(task.init, jax.random.key(0), _trained_on(task, example))
+
+
+def _trained_on(task: Task, example: Any) -> Any:
+    """Return the shapes of what a task trains on: the example, or a clip of them."""
+    clip = getattr(task, "clip", 1)
+    return example if clip == 1 else shapes_of(example, clip)
 
 
 def prediction_program(task: Task, example: Any, *, compiled: bool = True) -> Program:
@@ -67,8 +73,7 @@ def training_program(
     task: Task, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
     """Return what a whole update costs: loss, gradient, optimiser, moving average; of clips for a task of clips."""
-    clip = getattr(task, "clip", 1)
-    example = example if clip == 1 else shapes_of(example, clip)
+    example = _trained_on(task, example)
     optimizer, step = make_optimizer(optim, 1000), make_update_step(task, optim, 1000)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
     lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))

@@ -5,16 +5,15 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
+from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.config import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import Run, open_run
-from tflane_jax.systems import system_of
+from tflane_jax.systems import load_test_data, system_of
 
 
 def sweep(
@@ -45,18 +44,14 @@ def sweep(
     total = len(values) * sum(map(len, runs.values()))
     with tqdm(total=total, unit="run") as bar:
         for value in values:
-            loaded: dict[Any, Any] = {}
             for name, trained in runs.items():
                 found = []
                 for run in trained:
                     bar.set_description(f"{setting} = {value}: {name}")
                     changed = apply_overrides(run.config, [f"--{setting}", value, *overrides])
-                    source, system = changed.data.source("test"), system_of(changed)
-                    if source not in loaded:
-                        loaded = {source: system.load(source)}
-                    size = changed.evaluation.batch_size
+                    system, data, size = system_of(changed), load_test_data(changed), changed.evaluation.batch_size
                     for params in run.params:
-                        evaluation = system.evaluate(run.config.task, params, loaded[source], size)
+                        evaluation = system.evaluate(run.config.task, params, data, size)
                         found.append(evaluation.scores())
                     protocol = evaluation.protocol
                     bar.update()
@@ -66,10 +61,10 @@ def sweep(
     if unknown := set(metrics or ()) - set(known):
         raise UserError(f"no metric {min(unknown)}, only {', '.join(known)}")
     metrics = metrics or [name for name in system.compared if name in known]
-    rows = [
-        {setting: value, "model": name} | {metric: _mean_and_spread(scores[name][i], metric) for metric in metrics}
-        for i, value in enumerate(values) for name in scores
-    ]  # fmt: skip
+    rows = []
+    for i, value in enumerate(values):
+        variants = [Variant(name, tuple(by_value[i])) for name, by_value in scores.items()]
+        rows += [{setting: value} | row for row in compact(variants, metrics)]
     title = f"{protocol}, test split, percent (mean ± std over seeds)"
     print("\n" + format_table(rows, title=title))
     out.mkdir(parents=True, exist_ok=True)
@@ -89,8 +84,3 @@ def runs_below(folder: Path) -> list[Run]:
     if not folders:
         raise UserError(f"{folder} is no run folder, and holds none")
     return [open_run(each, "last") for each in folders]
-
-
-def _mean_and_spread(scores: Sequence[Mapping[str, float]], metric: str) -> str:
-    values = 100.0 * np.array([each[metric] for each in scores])
-    return f"{values.mean():.1f}" + (f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else "")

@@ -13,7 +13,7 @@ from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.scene import shapes_of, stack_examples
-from tflane_jax.summary import training_program
+from tflane_jax.summary import parameter_counts, shapes_of_params, training_program
 from tflane_jax.systems.lane_graph import clips, predict_examples
 from tflane_jax.training.evaluate import Sightings, evaluate_lanes, predictions
 from tflane_jax.training.lane_graph import LaneGraphTask
@@ -92,6 +92,11 @@ def test_single_frames_of_a_stream_are_drawn_with_what_is_remembered(params):
     np.testing.assert_array_equal(lanes.points, found[[5, 1, 3]])
     np.testing.assert_array_equal(examples.bev, frames.bev[[5, 1, 3]])
     assert elements is None
+
+
+def test_a_summary_of_clips_needs_one_frame(params):
+    counts = parameter_counts(shapes_of_params(CLIPS, shapes_of(seeing(observed()))))
+    assert sum(counts.values()) == sum(leaf.size for leaf in jax.tree.leaves(params))
 
 
 def test_a_clip_initialises_as_a_frame(params):

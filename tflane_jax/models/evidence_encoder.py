@@ -71,7 +71,7 @@ class EvidenceEncoder(nn.Module):
 
 def _positions(places: np.ndarray, x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
     """Return the encoding of where cells lie, as many channels as the features have (a multiple of 4)."""
-    # With 8 bands the shortest wave is about two cells long.
+    # With 8 bands of 25 x 50 cells the shortest waves are two and three cells long.
     return sine_encoding(jnp.asarray(places, x.dtype), x.shape[-1] // 4, lowest=0.125)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 from tflane_jax.config import RunConfig
 from tflane_jax.systems.base import Evaluation, Model, System, spread
 from tflane_jax.training.lane_curve import LaneCurveTask
 
-__all__ = ["Evaluation", "Model", "System", "spread", "system_of"]
+__all__ = ["Evaluation", "Model", "System", "load_test_data", "spread", "system_of"]
 
 
 def system_of(config: RunConfig) -> System:
@@ -19,3 +22,13 @@ def system_of(config: RunConfig) -> System:
     from tflane_jax.systems.lane_graph import LaneGraphSystem
 
     return LaneGraphSystem()
+
+
+def load_test_data(config: RunConfig) -> Any:
+    """Return the examples of a configuration's test split; the last ones asked for stay in memory."""
+    return _loaded(config.data.source("test"), type(system_of(config)))
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(source: Any, system: type[System]) -> Any:
+    return system().load(source)

@@ -58,61 +58,73 @@ def deformable_attention(
     return total.reshape(*views, queries, heads * channels)
 
 
-class _Taps(NamedTuple):
-    """The cells around the locations of N = queries * heads rows of J = levels * points.
+class _Corners(NamedTuple):
+    """The two by two cells that a bilinear sample reads, of N = queries * heads rows of J = levels * points.
 
-    The four of a location come first: upper left, upper right, lower left, lower right.
+    All four lie in the map: where a location has some of its cells outside, the four next to them stand in, and
+    weights that fall off to zero within one cell (`_hat`) leave out what the sample does not touch.
 
     Attributes:
-        row: of the table (cells * heads, d) of a value (cells, heads, d).
-        factor: bilinear weight times the attention's, zero outside.
-        weight: bilinear weight.
-        dx, dy: its derivatives by the location.
+        row: of the upper left one, in the table (cells * heads, d) of a value (cells, heads, d).
+        x, y: from its centre to the location, in cells, in [-1, 2).
     """
 
-    row: Int[Array, "*rounds 4 n j"]
-    factor: Float[Array, "*rounds 4 n j"]
-    weight: Float[Array, "*rounds 4 n j"]
-    dx: Float[Array, "*rounds 4 n j"]
-    dy: Float[Array, "*rounds 4 n j"]
+    row: Int[Array, "*rounds n j"]
+    x: Float[Array, "*rounds n j"]
+    y: Float[Array, "*rounds n j"]
 
 
-def _taps(shapes, start, location, weight) -> _Taps:
-    """Return the taps of some queries; see `_sum_of_samples` for the arguments."""
+def _corners(shapes, start, location, weight) -> _Corners:
+    """Return the cells of some queries; see `_sum_of_samples` for the arguments."""
     queries, heads, levels, points = weight.shape
-    location = location.reshape(1, queries * heads, levels * points, 2)
+    location = location.reshape(queries * heads, levels * points, 2)
+    height, width = (_by_sample([shape[i] for shape in shapes], points) for i in (0, 1))
+    begin = _by_sample(np.cumsum([0] + [h * w for h, w in shapes])[:-1], points)
 
-    def by_level(values):
-        return jnp.array(np.repeat(values, points), jnp.int32)[None, None]
+    def along(axis, size):
+        real = size.astype(location.dtype)
+        position = location[..., axis] * real - 0.5
+        # False for NaN too. At -1 a location touches nothing.
+        position = jnp.where((position > -1.0) & (position < real), position, -1.0)
+        first = jnp.clip(jnp.floor(position), 0.0, jnp.maximum(real - 2.0, 0.0))
+        return first.astype(jnp.int32), position - first
 
-    h, w = (by_level([shape[i] for shape in shapes]) for i in (0, 1))
-    begin = by_level(np.cumsum([0] + [h * w for h, w in shapes])[:-1])
-    width, height = w.astype(location.dtype), h.astype(location.dtype)
-    right, lower = (jnp.array(bit, bool)[:, None, None] for bit in ((0, 1, 0, 1), (0, 0, 1, 1)))
-    px, py = location[..., 0] * width - 0.5, location[..., 1] * height - 0.5
-    # False for NaN too. What lies further out touches no cell.
-    near = (px > -1.0) & (px < width) & (py > -1.0) & (py < height)
-    px, py = jnp.where(near, px, 0.0), jnp.where(near, py, 0.0)
-    left, upper = jnp.floor(px), jnp.floor(py)
-    x, y = left.astype(jnp.int32) + right, upper.astype(jnp.int32) + lower
-    wx = jnp.where(right, px - left, 1.0 - (px - left))
-    wy = jnp.where(lower, py - upper, 1.0 - (py - upper))
-    inside = near & (x >= 0) & (x < w) & (y >= 0) & (y < h)
+    (column, x), (line, y) = along(0, width), along(1, height)
     head = start[:, None] * heads + jnp.arange(heads, dtype=jnp.int32)[None]
-    row = jnp.where(inside, begin + y * w + x, 0) * heads + head.reshape(1, -1, 1)
-    bilinear = jnp.where(inside, wx * wy, 0.0)
-    dx = jnp.where(inside, jnp.where(right, wy, -wy), 0.0) * width
-    dy = jnp.where(inside, jnp.where(lower, wx, -wx), 0.0) * height
-    arrays = row, bilinear * weight.reshape(1, *location.shape[1:3]), bilinear, dx, dy
-    return _Taps(*(jnp.broadcast_to(x, (4, *location.shape[1:3])) for x in arrays))
+    return _Corners((begin + line * width + column) * heads + head.reshape(-1, 1), x, y)
 
 
-# XLA computes taps anew for every channel that is gathered. What a loop makes is computed once and written down; two
-# rounds are the fewest that it does not unroll.
+def _by_sample(values, points) -> Int[Array, "1 j"]:
+    """Return a number of each level for each of its points."""
+    return jnp.array(np.repeat(values, points), jnp.int32)[None]
+
+
+def _hat(offset, several):
+    """Return the weights of the first and the second cell; `several`: false where an axis has but one cell."""
+    first, second = (jnp.maximum(1.0 - jnp.abs(offset - place), 0.0) for place in (0.0, 1.0))
+    return first, jnp.where(several, second, 0.0)
+
+
+def _slope(offset, several):
+    """Return the derivatives of `_hat`; at a kink, that to the right."""
+    first, second = (
+        jnp.where(jnp.abs(offset - place) < 1.0, jnp.where(offset < place, 1.0, -1.0), 0.0) for place in (0.0, 1.0)
+    )
+    return first, jnp.where(several, second, 0.0)
+
+
+def _neighbours(shapes, heads, points) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each sample (J,) how many rows of the table further its right and its lower cells stand."""
+    right, lower = ([heads * (w > 1) for _, w in shapes], [heads * w * (h > 1) for h, w in shapes])
+    return np.repeat(right, points), np.repeat(lower, points)
+
+
+# XLA computes weights anew for every channel that they multiply. What a loop makes is computed once and written down;
+# two rounds are the fewest that it does not unroll.
 _ROUNDS = 2
-# Samples of one step on a CPU. Backward, the samples are written down, and 512 KiB of float32 stay in the cache of a
-# core; forward, only the taps are, and a step should still be worth the work of several cores.
-_FORWARD_STEP, _BACKWARD_STEP = 2**22, 2**17
+# Samples of one step on a CPU. Backward, the samples are written down, and should stay in a cache; forward, only the
+# weights are, and a step should still be worth the work of several cores.
+_FORWARD_STEP, _BACKWARD_STEP = 2**20, 2**18
 
 
 def _in_steps(arrays: Sequence[Array], samples: int, size: int) -> tuple[Array, ...]:
@@ -121,11 +133,6 @@ def _in_steps(arrays: Sequence[Array], samples: int, size: int) -> tuple[Array, 
     steps = max(1, min(queries, samples // size)) if jax.default_backend() == "cpu" else 1
     padded = (jnp.pad(x, [(0, -queries % (steps * _ROUNDS))] + [(0, 0)] * (x.ndim - 1)) for x in arrays)
     return tuple(x.reshape(steps, _ROUNDS, -1, *x.shape[1:]) for x in padded)
-
-
-def _written_taps(shapes, *part) -> _Taps:
-    """Return the taps of a step, whose arrays have an axis of rounds first."""
-    return _Taps(*lax.map(lambda one: tuple(_taps(shapes, *one)), part))
 
 
 def _sum_of_samples(
@@ -141,18 +148,34 @@ def _sum_of_samples(
     table = value.reshape(-1, value.shape[-1])
     parts = _in_steps((start, location, weight), weight.size * 4 * table.shape[1], _FORWARD_STEP)
     if len(parts[0]) == 1:  # too little to be worth a loop
-        total = _sum_of_taps(table, _taps(shapes, *(x.reshape(-1, *x.shape[3:]) for x in parts)))
+        total = _sum_of_step(shapes, table, *(x.reshape(1, -1, *x.shape[3:]) for x in parts))
     else:
-        total = lax.map(lambda part: _sum_of_taps(table, _written_taps(shapes, *part)), parts)
+        total = lax.map(lambda part: _sum_of_step(shapes, table, *part), parts)
     return total.reshape(-1, *value.shape[1:])[: len(start)].astype(value.dtype)
 
 
-def _sum_of_taps(table: Float[Array, "t d"], taps: _Taps) -> Float[Array, "n d"]:
-    """Return the sum with a term per tap: samples as an array of their own would take most of the time to write."""
-    total: Any = jnp.zeros((1, 1), taps.factor.dtype)
-    for tap, j in np.ndindex(4, taps.row.shape[-1]):
-        rows, factors = (x[..., tap, :, j].reshape(-1) for x in (taps.row, taps.factor))
-        total = total + table.at[rows].get(mode="promise_in_bounds") * factors[:, None]
+def _sum_of_step(shapes, table, start, location, weight) -> Float[Array, "n d"]:
+    """Return the sums of a step, whose arrays have an axis of rounds first, with a term for each cell of each sample.
+
+    Samples as an array of their own would take most of the time to write.
+    """
+    heads, points = weight.shape[2], weight.shape[4]
+    right, lower = _neighbours(shapes, heads, points)
+
+    def written(part):
+        corners, weight = _corners(shapes, *part), part[2].reshape(-1, len(right))
+        down = (y * weight for y in _hat(corners.y, lower[None] > 0))
+        return corners.row, *_hat(corners.x, right[None] > 0), *down
+
+    parts = start, location, weight
+    arrays = lax.map(written, parts) if len(start) > 1 else [x[None] for x in written([x[0] for x in parts])]
+    total: Any = jnp.zeros((1, 1), weight.dtype)
+    for j in range(len(right)):
+        row, left_x, right_x, upper_y, lower_y = (x[..., j].reshape(-1) for x in arrays)
+        for along, x in ((0, left_x), (right[j], right_x)):
+            for down, y in ((0, upper_y), (lower[j], lower_y)):
+                cells = table.at[row + (along + down)].get(mode="promise_in_bounds")
+                total = total + cells * (x * y)[:, None]
     return total
 
 
@@ -178,20 +201,29 @@ def _attend_backward(shapes, residuals, cotangent):
 
 def _step_backward(shapes, table, total, start, location, weight, cotangent):
     """Add the gradient by the value to `total`; return it and the gradients by x, y and weight."""
-    taps = _written_taps(shapes, start, location, weight)
-    taps = _Taps(*(x.swapaxes(1, 2).reshape(-1, 4 * x.shape[-1]) for x in taps))
-    rows, cotangent = len(taps.row), cotangent.reshape(-1, table.shape[1])
-    total = total.at[taps.row].add(cotangent[:, None] * taps.factor[..., None], mode="promise_in_bounds")
-    sampled = table.at[taps.row].get(mode="promise_in_bounds")
-    products = jnp.einsum("nkd,nd->nk", sampled, cotangent)
+    heads, points = weight.shape[2], weight.shape[4]
+    right, lower = (x[None] for x in _neighbours(shapes, heads, points))
+    parts = start, location, weight
+    corners = _Corners(*lax.map(lambda part: tuple(_corners(shapes, *part)), parts))
+    row, x, y = (array.reshape(-1, right.size) for array in corners)
+    weight, cotangent = weight.reshape(row.shape), cotangent.reshape(len(row), table.shape[1])
+    across, down = _hat(x, right > 0), _hat(y, lower > 0)
+    # Upper left, upper right, lower left, lower right.
+    rows = jnp.stack([row + below + beside for below in (0, lower) for beside in (0, right)], 1).reshape(len(row), -1)
+    factors = jnp.stack([b * a * weight for b in down for a in across], 1).reshape(rows.shape)
+    total = total.at[rows].add(cotangent[:, None] * factors[..., None], mode="promise_in_bounds")
+    sampled = table.at[rows].get(mode="promise_in_bounds")
+    products = jnp.einsum("nkd,nd->nk", sampled, cotangent).reshape(len(row), 4, -1)
 
-    def summed(factor):
+    def summed(across, down):
         # Over the four. Written out: as the reduction of an array it would take half of the time of a step.
-        first, second, third, fourth = jnp.split(products * factor, 4, -1)
-        return first + second + third + fourth
+        upper, lower = (across[0] * products[:, 2 * i] + across[1] * products[:, 2 * i + 1] for i in (0, 1))
+        return down[0] * upper + down[1] * lower
 
-    weight = weight.reshape(rows, -1)
-    return total, (summed(taps.dx) * weight, summed(taps.dy) * weight, summed(taps.weight))
+    height, width = (_by_sample([shape[i] for shape in shapes], points).astype(weight.dtype) for i in (0, 1))
+    by_x = summed(_slope(x, right > 0), down) * width * weight
+    by_y = summed(across, _slope(y, lower > 0)) * height * weight
+    return total, (by_x, by_y, summed(across, down))
 
 
 _attend.defvjp(_attend_forward, _attend_backward)

@@ -1,0 +1,64 @@
+"""The marker paper's Table II from camera images: markers and their ablations on the small camera TopoNet, on clips.
+
+    tflane compare configs/camera/toponet.py --seeds 0 --out runs/camera
+    C=configs/markers/cameras.py
+    tflane compare $C:toponet $C:uniform $C:hard $C --seeds 0 1 2 --jobs 2 --out runs/markers/cameras
+
+Every row goes on from the host that the first command trains, one for all seeds: those of the second command vary the
+new parameters and the order of the clips. Boards stand in the images too, but there are too few pixels to read one:
+detections are drawn as in `toponet_markers.py` (paper, section IV-A).
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.world.markers import PlacementConfig
+
+HOST = "runs/camera/toponet/seed_0"
+
+
+def get_config() -> RunConfig:
+    """Return gated fusion with full memory."""
+    host = load_config(str(Path(__file__).parents[1] / "camera/toponet.py"))
+    assert isinstance(host.task, LaneGraphTask)
+    assert isinstance(host.task.model, TopoNetConfig)
+    assert isinstance(host.data, WorldData)
+    assert host.data.example.cameras is not None
+    world = replace(host.data.world, markers=PlacementConfig(side="both"))
+    example = replace(
+        host.data.example, cameras=replace(host.data.example.cameras, markers=True), markers=MarkerConfig()
+    )
+    markers = replace(SMALL_MARKER_FUSION, range=host.task.model.decoder.range)
+    # Denoising is for decoders that learn where lanes are from nothing.
+    model = replace(host.task.model, denoising=None, markers=markers)
+    return replace(
+        host,
+        task=replace(host.task, model=model, clip=4),
+        data=replace(host.data, world=world, example=example),
+        optim=replace(host.optim, ema_decay=0.99),
+        training=replace(
+            host.training, steps=300, batch_size=2, eval_every=300, init_from=HOST, init_partly=True
+        ),
+    )  # fmt: skip
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the other rows of the table, and no memory."""
+    config = get_config()
+    assert isinstance(config.task, LaneGraphTask)
+    markers = config.task.model.markers
+
+    def with_markers(changed: object) -> RunConfig:
+        return replace(config, task=replace(config.task, model=replace(config.task.model, markers=changed)))
+
+    return {
+        "toponet": with_markers(None),
+        "uniform": with_markers(replace(markers, fusion="uniform")),
+        "hard": with_markers(replace(markers, fusion="hard")),
+        "no_memory": with_markers(replace(markers, memory=None)),
+    }

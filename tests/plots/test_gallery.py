@@ -38,6 +38,16 @@ def test_sizes_that_do_not_fit_are_named(tmp_path):
         save_examples(tmp_path / "a.png", EXAMPLES, titles=["only one"])
 
 
+def test_many_models_take_further_lines(tmp_path):
+    one_line, two_lines = (
+        imread(save_examples(tmp_path / f"{count}.png", EXAMPLES, {f"{n}": PREDICTIONS for n in range(count)})).shape
+        for count in (4, 9)
+    )
+    assert two_lines[1] == one_line[1]  # 11 panels in lines of six
+    assert two_lines[0] > 1.7 * one_line[0]
+
+
+
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (1, 4), (5, 3)])
 def test_contact_sheet_shows_no_more_than_there_is(tmp_path, size, count):
     out = show_dataset(FakeDataset(FakeConfig(size=size)), count, tmp_path / "sheet.png")

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from tflane_jax.datasets.base import Dataset
 
 _PANEL_WIDTH = 4.8  # inches
+# Panels beside each other that a reader still sees whole; more go on in further lines.
+_MOST_COLUMNS = 7
 
 Tree = TypeVar("Tree")
 
@@ -45,7 +47,7 @@ def save_examples(
     view: PerceptionRange = VIEW,
     threshold: float = 0.3,
 ) -> Path:
-    """Write one row per example: truth | evidence and traffic | one column per model.
+    """Write one row per example: truth | evidence and traffic | one panel per model; many models take several lines.
 
     Args:
         path: .png, .pdf or .svg.
@@ -67,9 +69,14 @@ def save_examples(
     sizes = {"titles": len(titles)} | {name: len(stacked.points) for name, stacked in predictions.items()}
     if any(size != count for size in sizes.values()):
         raise ValueError(f"{count} examples, but {sizes}")
-    figure, axes = new_figure(count, 2 + len(predictions), panel=_panel(view), footer=0.5)
+    panels = 2 + len(predictions)
+    lines = -(-panels // _MOST_COLUMNS)
+    figure, axes = new_figure(count * lines, -(-panels // lines), panel=_panel(view), footer=0.5)
     for row, title in enumerate(titles):
-        example, (truth, seen, *columns) = _pick(examples, row), axes[row]
+        example, (truth, seen, *places) = _pick(examples, row), axes[row * lines : (row + 1) * lines].flat
+        columns, unused = places[: len(predictions)], places[len(predictions) :]
+        for ax in unused:
+            ax.set_axis_off()
         draw_scene(
             truth, example, layers=("hidden", "areas", "lanes", "elements"), ground=ground, view=view,
             title=f"{title}: truth",

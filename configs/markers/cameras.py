@@ -33,9 +33,8 @@ def get_config() -> RunConfig:
     example = replace(
         host.data.example, cameras=replace(host.data.example.cameras, markers=True), markers=MarkerConfig()
     )
-    markers = replace(SMALL_MARKER_FUSION, range=host.task.model.decoder.range)
     # Denoising is for decoders that learn where lanes are from nothing.
-    model = replace(host.task.model, denoising=None, markers=markers)
+    model = replace(host.task.model, denoising=None, markers=SMALL_MARKER_FUSION)
     return replace(
         host,
         task=replace(host.task, model=model, clip=4),
@@ -51,7 +50,7 @@ def ablations() -> dict[str, RunConfig]:
     """Return the other rows of the table, and no memory."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
-    markers = config.task.model.markers
+    markers = SMALL_MARKER_FUSION
 
     def with_markers(changed: object) -> RunConfig:
         return replace(config, task=replace(config.task, model=replace(config.task.model, markers=changed)))

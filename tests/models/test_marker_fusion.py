@@ -223,8 +223,7 @@ def test_a_fusion_that_begins_silent_leaves_the_host_as_it_was_trained():
 def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
     guide, config = guide_frame(seeing(observed()), None, CONFIG)[0], replace(CONFIG, reach=1.0, norm="query")
     start = guide.points[int(np.argmax(guide.valid)), 0]
-    places = CONFIG.range.normalise(jnp.stack([start, start + 500.0]))
-    mask = fusion_mask(guide, guide.valid, places, config)
+    mask = fusion_mask(guide, guide.valid, jnp.stack([start, start + 500.0]), config)
     np.testing.assert_array_equal(mask.any(1), [True, False])
     tokens = jnp.asarray(np.random.default_rng(1).normal(size=(len(guide.valid), 8)), jnp.float32)
     arguments, module = (jnp.ones((2, 8)), jnp.zeros((2, 8)), tokens, mask, guide.gate), MarkerFusion(config)
@@ -236,7 +235,7 @@ def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
 @pytest.mark.parametrize("encoding", ["sine", "transformer", "mlp"])
 @pytest.mark.parametrize("connectivity", [False, True])
 def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
-    module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity))
+    module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity), BASELINE.decoder.range)
     guide = guide_frame(seeing(observed()), None, CONFIG)[0]
     variables = random_params(module.init, guide)
     tokens = np.asarray(module.apply(variables, guide))

@@ -47,7 +47,7 @@ class Host(nn.Module):
     """A model from an example to the predictions of every decoder layer; subclasses say how lanes are decoded.
 
     Attributes:
-        config: has `encoder`, and `elements`, `markers` and `sd_map`, each None in a host without.
+        config: has `encoder` and `decoder`, and `elements`, `markers` and `sd_map`, each None in a host without.
     """
 
     config: Any
@@ -58,7 +58,7 @@ class Host(nn.Module):
         if config.elements is not None:
             self.elements = ElementDecoder(config.elements)
         if config.markers is not None:
-            self.marker_tokens = MarkerTokens(config.markers)
+            self.marker_tokens = MarkerTokens(config.markers, config.decoder.range)
         if config.sd_map is not None:
             self.sd_map_tokens = SdMapEncoder(config.sd_map)
 
@@ -105,21 +105,22 @@ class Host(nn.Module):
         if sd_map is not None:
             lines = self.sd_map_tokens(example.sd_map, deterministic=deterministic)
             fusions.append(
-                lambda layer, places, bev, position: SdMapFusion(sd_map, name=f"sd_map_{layer}")(
-                    bev, position, *lines, sd_map_mask(example.sd_map, places, sd_map)
+                lambda layer, cells, bev, position: SdMapFusion(sd_map, name=f"sd_map_{layer}")(
+                    bev, position, *lines, sd_map_mask(example.sd_map, cells, sd_map)
                 )
             )
         if markers is not None and guide is not None:
             tokens, (gate, valid) = self.marker_tokens(guide, deterministic=deterministic), fusion_gate(guide, markers)
             fusions.append(
-                lambda layer, places, bev, position: MarkerFusion(markers, name=f"markers_{layer}")(
-                    bev, position, tokens, fusion_mask(guide, valid, places, markers), gate
+                lambda layer, cells, bev, position: MarkerFusion(markers, name=f"markers_{layer}")(
+                    bev, position, tokens, fusion_mask(guide, valid, cells, markers), gate
                 )
             )
 
         def fuse(layer: int, places: Any, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
+            cells = self.config.decoder.range.denormalise(jnp.asarray(places))
             for each in fusions:
-                bev = each(layer, places, bev, position)
+                bev = each(layer, cells, bev, position)
             return bev
 
         return fuse if fusions else None

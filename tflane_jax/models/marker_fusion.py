@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask, reach_mask
@@ -57,7 +57,6 @@ class MarkerFusionConfig:
         query_position: add their positions to the BEV features where they look at the tokens. Eq. (3) writes none;
             SMERF does, and BEV features of a convolution do not know where they are.
         connectivity: let lanes know their successors and predecessors (the paper's future work).
-        range: the box that coordinates are normalised by.
     """
 
     prior: MarkerPriorConfig = MarkerPriorConfig()
@@ -72,7 +71,6 @@ class MarkerFusionConfig:
     reach: float | None = None
     query_position: bool = True
     connectivity: bool = False
-    range: PerceptionRange = BevGrid().range
 
 
 SMALL_MARKER_FUSION = MarkerFusionConfig(
@@ -84,15 +82,21 @@ SMALL_MARKER_FUSION = MarkerFusionConfig(
 
 
 class MarkerTokens(nn.Module):
-    """Polylines to one token each (III-A), and on request what they know of their neighbours."""
+    """Polylines to one token each (III-A), and on request what they know of their neighbours.
+
+    Attributes:
+        config: see there.
+        range: the host's, by which coordinates are normalised.
+    """
 
     config: MarkerFusionConfig
+    range: PerceptionRange
 
     @nn.compact
     def __call__(self, guide: MarkerGuidance, *, deterministic: bool = True) -> Float[Array, "n c"]:
         """Return the tokens, scaled by their weights (Eq. 4); 0 where not valid."""
         config, valid = self.config, guide.valid
-        points = jnp.where(valid[:, None, None], config.range.normalise(guide.points), 0.0)
+        points = jnp.where(valid[:, None, None], self.range.normalise(guide.points), 0.0)
         count = points.shape[1]
         if config.encoding == "mlp":
             x = Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2))
@@ -166,12 +170,12 @@ def fusion_gate(guide: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Floa
 
 
 def fusion_mask(
-    guide: MarkerGuidance, valid: Bool[Array, " n"], places: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
+    guide: MarkerGuidance, valid: Bool[Array, " n"], cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
 ) -> Bool[Array, "#q n"]:
-    """Return which BEV cell may look at which token; `places` of the cells are in [0, 1] of the range."""
+    """Return which BEV cell, centred at (x, y) in metres, may look at which token."""
     if config.reach is None:
         return key_mask(valid)
-    return reach_mask(config.range.denormalise(jnp.asarray(places)), guide.points, valid, config.reach)
+    return reach_mask(jnp.asarray(cells), guide.points, valid, config.reach)
 
 
 def guide_frame(

@@ -117,10 +117,9 @@ class SdMapFusion(nn.Module):
 
 
 def sd_map_mask(
-    sd_map: SdMap | None, places: Float[ArrayLike, "q 2"], config: SdMapModuleConfig
+    sd_map: SdMap | None, cells: Float[ArrayLike, "q 2"], config: SdMapModuleConfig
 ) -> Bool[Array, "q r"] | None:
-    """Return which BEV cell may look at which line of the map; `places` of the cells are in [0, 1] of the range."""
+    """Return which BEV cell, centred at (x, y) in metres, may look at which line of the map; None: at all."""
     if sd_map is None or config.reach is None:
         return None
-    cells = config.prior.range.denormalise(jnp.asarray(places))
-    return reach_mask(cells, jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.reach)
+    return reach_mask(jnp.asarray(cells), jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.reach)

@@ -3,7 +3,7 @@
 import dataclasses
 import enum
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +13,8 @@ from tests.shared import ROOT
 from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, apply_overrides, load_ablations, load_config
 from tflane_jax.config_io import from_json, settings, to_json, to_text
 from tflane_jax.errors import UserError
+from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 
@@ -138,6 +140,21 @@ def test_overrides_change_what_they_name(arguments, changed):
     assert differing == changed
 
 
+def test_parts_are_switched_on_and_off():
+    arguments = [
+        "--data.example.markers.simulation.jump", "0.2", "--data.example.markers", "default",
+        "--task.model.markers.memory", "None", "--task.model.traffic-flow=None",
+        "--task.model.markers", "MarkerFusionConfig",
+    ]  # fmt: skip
+    config = apply_overrides(FLOW, arguments)
+    model = FLOW.task.model
+    assert config.data.example == replace(
+        FLOW.data.example, markers=MarkerConfig(simulation=MarkerSimulationConfig(jump=0.2))
+    )
+    assert config.task.model == replace(model, traffic_flow=None, markers=MarkerFusionConfig(memory=None))
+    assert apply_overrides(config, ["--task.model.traffic_flow", "default"]).task.model.traffic_flow is not None
+
+
 def test_settings_of_other_data_can_be_changed():
     config = RunConfig(data=OpenLaneV2Data(Path("a")))
     arguments = ["--data.image.scale", "0.25", "--data.augmentation.grid-mask", "0.7", "--data.root", "b"]
@@ -156,6 +173,9 @@ def test_settings_of_other_data_can_be_changed():
         (["--training.steps"], "Missing value"),
         (["--task.losses.matcher", "magic"], "invalid choice 'magic'"),
         (["stray"], "stray"),
+        (["--task.model.markers", "on"], r"--task\.model\.markers takes None, default, MarkerFusionConfig, not 'on'"),
+        (["--task.model.markers"], "takes None, default"),
+        (["--data", "OpenLaneV2Data"], "OpenLaneV2Data has no defaults for all of its settings"),
     ],
 )
 def test_overrides_that_are_wrong_are_named_in_a_line(arguments, message):

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from tflane_jax.config_io import settings
+from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Keyframes
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import ExampleConfig
@@ -245,11 +245,15 @@ def _named_errors(path: Path):
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
 
+    A part that may be absent, or of several classes, is chosen before all else, wherever it stands: `--a.b None`,
+    `--a.b default` or `--a.b NameOfItsClass`, with its defaults.
+
     Raises:
         UserError: an unknown setting (with the names closest to it), or a value of the wrong type.
     """
     import tyro
 
+    config, arguments = _choose_parts(config, arguments)
     _check_names(config, arguments)
     said = io.StringIO()
     try:
@@ -264,13 +268,37 @@ def override_names(config: RunConfig) -> list[str]:
     return [name for name, value in settings(config) if not dataclasses.is_dataclass(value)]
 
 
+def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfig, list[str]]:
+    """Return the configuration with the parts that are chosen, and the other arguments."""
+    left = list(arguments)
+    while chosen := [i for i, argument in enumerate(left) if choices(config, _setting(argument))]:
+        # A part before what is inside it.
+        at = min(chosen, key=lambda i: _setting(left[i]).count("."))
+        name, kinds = _setting(left[at]), choices(config, _setting(left[at]))
+        _, equals, value = left.pop(at).partition("=")
+        if not equals:
+            value = left.pop(at) if at < len(left) else ""
+        if value not in kinds:
+            raise UserError(
+                f"setting --{name} takes {', '.join(kinds)}, not {value!r}; its own settings are --{name}..."
+            )
+        try:
+            config = with_setting(config, name, kinds[value]())
+        except TypeError:
+            raise UserError(f"{value} has no defaults for all of its settings: choose it in a config file") from None
+    return config, left
+
+
+def _setting(argument: str) -> str:
+    """Return the name of the setting that an argument changes; "" for a value."""
+    return argument.partition("=")[0].removeprefix("--").replace("-", "_") if argument.startswith("--") else ""
+
+
 def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
     known = override_names(config)
     for argument in arguments:
-        if not argument.startswith("--"):
-            continue
-        name = argument[2:].partition("=")[0].replace("-", "_")
-        if name not in known and name.replace(".no_", ".") not in known:
+        name = _setting(argument)
+        if name and name not in known and name.replace(".no_", ".") not in known:
             close = _closest(name, known)
             hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
             raise UserError(f"unknown setting --{name}: {hint}")

@@ -100,6 +100,30 @@ def _value(hint: Any, content: Any, path: str) -> Any:
     raise UserError(f"setting {path} cannot be {content!r:.80}")
 
 
+def choices(config: Any, name: str) -> dict[str, Any]:
+    """Return the nested configurations between which a setting chooses, by the names of their classes.
+
+    "None" is among them where the setting may be absent, and "default" for the first class then. Nothing for a setting
+    that is no such choice, or that `config` does not have.
+    """
+    owner, _, field = name.rpartition(".")
+    for part in owner.split(".") if owner else ():
+        config = getattr(config, part, None)
+    hint = typing.get_type_hints(type(config)).get(field) if dataclasses.is_dataclass(config) else None
+    kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
+    named = {kind.__name__: kind for kind in kinds if dataclasses.is_dataclass(kind)}
+    if named and type(None) in kinds:
+        return {"None": type(None), "default": next(iter(named.values())), **named}
+    return named
+
+
+def with_setting(config: T, name: str, value: Any) -> T:
+    """Return the configuration with one setting, named with dots, replaced."""
+    first, _, rest = name.partition(".")
+    changes: dict[str, Any] = {first: with_setting(getattr(config, first), rest, value) if rest else value}
+    return dataclasses.replace(config, **changes)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
 def _member(kinds: tuple[Any, ...], content: Any, path: str) -> Any:
     """Read the member of a union that fits: None, the class that is named, or the first plain type."""
     if content is None and type(None) in kinds:

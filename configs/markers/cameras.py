@@ -2,7 +2,8 @@
 
     tflane compare configs/camera/toponet.py --seeds 0 --out runs/camera
     C=configs/markers/cameras.py
-    tflane compare toponet=$C:toponet uniform=$C:uniform hard=$C:hard markers=$C --seeds 0 1 2 --jobs 2 --out runs/markers/cameras
+    tflane compare toponet=$C:toponet uniform=$C:uniform hard=$C:hard markers=$C --seeds 0 1 2 --jobs 2 \\
+        --out runs/markers/cameras
 
 Every row goes on from the host that the first command trains, one for all seeds: those of the second command vary the
 new parameters and the order of the clips. Boards stand in the images too, but there are too few pixels to read one:

@@ -111,7 +111,7 @@ def choices(config: Any, name: str) -> dict[str, Any]:
         config = getattr(config, part, None)
     hint = typing.get_type_hints(type(config)).get(field) if dataclasses.is_dataclass(config) else None
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
-    named = {kind.__name__: kind for kind in kinds if dataclasses.is_dataclass(kind)}
+    named = {kind.__name__: kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
     if named and type(None) in kinds:
         return {"None": type(None), "default": next(iter(named.values())), **named}
     return named

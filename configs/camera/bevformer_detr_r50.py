@@ -19,7 +19,7 @@ def get_config() -> RunConfig:
     toponet = load_config(str(Path(__file__).with_name("toponet_r50.py")))
     losses = LaneGraphLossConfig(points_weight=0.0075, control_points=5)
     assert isinstance(toponet.data, OpenLaneV2Data)
-    model = paper_config(control_points=5)
-    encoder = replace(model.encoder, bev=replace(model.encoder.bev, capacity=toponet.task.model.encoder.bev.capacity))
-    task = LaneGraphTask(replace(model, encoder=encoder), losses)
+    assert isinstance(toponet.task, LaneGraphTask)
+    # The same encoder.
+    task = LaneGraphTask(replace(paper_config(control_points=5), encoder=toponet.task.model.encoder), losses)
     return replace(toponet, task=task, data=replace(toponet.data, image=BASELINE_LARGE))

@@ -42,6 +42,7 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return BEVFormer-DETR, the host without a graph."""
     config = get_config()
+    assert isinstance(config.task, LaneGraphTask)
     model = BevFormerDetrConfig(
         config.task.model.encoder, LaneDecoderConfig(refine="fixed"), None, denoising=DenoisingConfig()
     )

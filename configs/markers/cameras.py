@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.markers.simulation import MarkerConfig
-from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
+from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.training.lane_graph import LaneGraphTask
 from tflane_jax.world.markers import PlacementConfig
@@ -53,7 +53,7 @@ def ablations() -> dict[str, RunConfig]:
     assert isinstance(config.task, LaneGraphTask)
     markers = SMALL_MARKER_FUSION
 
-    def with_markers(changed: object) -> RunConfig:
+    def with_markers(changed: MarkerFusionConfig | None) -> RunConfig:
         return replace(config, task=replace(config.task, model=replace(config.task.model, markers=changed)))
 
     return {

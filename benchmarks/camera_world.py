@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.timing import machine, markdown_table, save
-from tflane_jax.world.camera_sensor import render_cameras
-from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
+from tflane_jax.world.cameras.sensor import render_cameras
 from tflane_jax.world.simulate import WorldConfig, simulate
 
 

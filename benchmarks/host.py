@@ -28,7 +28,7 @@ from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
 from tflane_jax.scene import Example
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 CONFIGS = Path(__file__).parent.parent / "configs" / "tf_lane"
 BATCH = 8

@@ -19,7 +19,7 @@ from benchmarks.timing import compile_jax, machine, markdown_table, measure, sav
 from tflane_jax.config import load_config
 from tflane_jax.datasets.loading import for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 CONFIG = Path(__file__).parent.parent / "configs" / "markers" / "toponet_markers.py"
 MODELS = {"markers, no memory": ":no_memory", "markers, memory": "", "host": ":toponet"}

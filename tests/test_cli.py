@@ -16,7 +16,7 @@ from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_elements, fake_pre
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser, main
 from tflane_jax.scene import Prediction
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.records import read_records
 
 CONFIG = '''"""A tiny model for the tests of the command line."""
@@ -26,7 +26,7 @@ from dataclasses import replace
 from tflane_jax.config import EvaluationConfig, RunConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
@@ -70,7 +70,7 @@ def fakes():
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
             patch.setattr(LaneGraphTask, function.__name__, function)
-        for module in ("systems.lane_graph", "commands.predict_lanes"):
+        for module in ("tasks.lane_graph_system", "commands.predict_lanes"):
             patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
         yield
 
@@ -247,7 +247,7 @@ def test_every_command_has_help(capsys):
 def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
     import signal
 
-    from tflane_jax.systems import lane_graph
+    from tflane_jax.tasks import lane_graph
 
     def interrupting(*arguments):
         os.kill(os.getpid(), signal.SIGINT)

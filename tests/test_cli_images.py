@@ -18,7 +18,7 @@ CONFIG = '''
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.lstr import LstrConfig
-from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 

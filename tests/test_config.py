@@ -16,7 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 GOLDEN = Path(__file__).parent / "golden_configs"
 FLOW = RunConfig(task=LaneGraphTask(TopoNetConfig(traffic_flow=TrafficFlowConfig())))

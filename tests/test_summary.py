@@ -8,7 +8,7 @@ from tests.shared import ROOT
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params
-from tflane_jax.systems import system_of
+from tflane_jax.tasks import system_of
 from tflane_jax.training.task import split_statistics
 
 LSTR = ROOT / "configs" / "gtn_lane" / "lstr.py"

@@ -30,8 +30,8 @@ from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig
 from tflane_jax.errors import UserError
-from tflane_jax.training.lane_curve import LaneCurveTask
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.simulate import WorldConfig

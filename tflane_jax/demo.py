@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.compare import compare
+from tflane_jax.ablations.compare import compare
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.task import Params
 
 PLATFORMS = ("cpu", "cuda")

@@ -18,7 +18,7 @@ import numpy as np
 from tflane_jax.config import RunConfig, Source
 from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.errors import UserError
-from tflane_jax.systems import system_of
+from tflane_jax.tasks import system_of
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance

@@ -12,7 +12,7 @@ from pathlib import Path
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
 def get_config() -> RunConfig:

@@ -11,7 +11,7 @@ from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.bevformer_detr import paper_config
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
 def get_config() -> RunConfig:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
 from tflane_jax.world.simulate import WorldConfig
 
 

@@ -20,10 +20,10 @@ from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
-from tflane_jax.world.ring_cameras import CameraRigConfig
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 # MapTR's range. At 240 x 144 pixels a lane line is less than a pixel wide at 20 m.
 TRUTH = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))

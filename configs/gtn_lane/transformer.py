@@ -11,9 +11,9 @@ from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
-from tflane_jax.losses.lane_curve import LaneCurveLossConfig
+from tflane_jax.losses.lane_shape import LaneCurveLossConfig
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig
-from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 

@@ -17,8 +17,8 @@ from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
-from tflane_jax.world.markers import PlacementConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.roads.markers import PlacementConfig
 
 HOST = "runs/camera/toponet/seed_0"
 

@@ -16,11 +16,11 @@ from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
-from tflane_jax.world.markers import PlacementConfig
-from tflane_jax.world.sd_map import SdMapConfig
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
 from tflane_jax.world.simulate import WorldConfig
 
 # Eight frames half a second apart, as in OpenLane-V2.

@@ -16,7 +16,7 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.models.toponet import TrafficFlowConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 MARKERS = SMALL_MARKER_FUSION
 HOSTS = "runs/markers/hosts"

@@ -11,7 +11,7 @@ from dataclasses import replace
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 

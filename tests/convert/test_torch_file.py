@@ -22,7 +22,7 @@ from tests.convert.torch_files import Call, Storage, named, of, storage, tensor,
 from tflane_jax.convert.torch_file import read_checkpoint, read_state_dict
 from tflane_jax.convert.torch_pickle import ALLOWED
 from tflane_jax.errors import UserError
-from tflane_jax.plain_pickle import Sealed
+from tflane_jax.files.plain_pickle import Sealed
 
 RNG = np.random.default_rng(0)
 GRID = np.arange(24, dtype=np.float32).reshape(4, 6)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
 from tflane_jax.scene import LineType, RoadUser
+from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
 
 
 def segment(number, centerline, successors=(), *, width=3.5, left=LineType.DASHED, right=LineType.SOLID, **other):

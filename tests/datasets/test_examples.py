@@ -12,9 +12,9 @@ from tflane_jax.datasets.examples import make_example, occluder_boxes, traffic_f
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
 from tflane_jax.geometry.cameras import project
-from tflane_jax.logs import MapElement
 from tflane_jax.scene import stack_examples
-from tflane_jax.world.ring_cameras import CameraRigConfig
+from tflane_jax.scene.logs import MapElement
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 ROAD = lane_map(segment(0, [(900.0, -2000.0), (1100.0, -2000.0)]))
 POSES = drive(30)

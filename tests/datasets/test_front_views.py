@@ -9,7 +9,7 @@ from tflane_jax.datasets import cache
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset, load_road_images
 from tflane_jax.datasets.leaves import IMAGE_PARTS, example_leaves, image_from_leaves
 from tflane_jax.errors import UserError
-from tflane_jax.world.front_view import FrontWorldConfig
+from tflane_jax.world.front_view.views import FrontWorldConfig
 
 SMALL = FrontViewConfig(split="val", images=3, first=5)
 

@@ -11,7 +11,7 @@ from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.geojson import Origin, RoadLines, read_geojson, sd_map_around, to_ego
 from tflane_jax.errors import UserError
 from tflane_jax.scene import SdCategory
-from tflane_jax.world.sd_map import SdMapConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
 
 
 def earth(latitude, longitude):

@@ -12,8 +12,8 @@ from tflane_jax.datasets.areas import BOUNDARY_MARGIN, clip_ring, crop_areas
 from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
-from tflane_jax.logs import MapElement
 from tflane_jax.scene import AreaType
+from tflane_jax.scene.logs import MapElement
 
 RANGE = PerceptionRange()
 NO_BOXES, NO_BUILDINGS = np.zeros((0, 7)), np.zeros((0, 5))

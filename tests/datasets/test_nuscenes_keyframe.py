@@ -8,8 +8,8 @@ import pytest
 from tests.shared import shared_path
 from tflane_jax.datasets.openlane_frames import SUBSETS
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, fit_image
+from tflane_jax.files.images import read_image
 from tflane_jax.geometry import inside_image, invert_pose, project
-from tflane_jax.images import read_image
 
 
 @pytest.fixture(scope="module")

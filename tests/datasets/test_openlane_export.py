@@ -15,7 +15,7 @@ from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scoring.openlane_v2 import read_segment_truth, read_truth
-from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, NUSCENES_RING
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING
 
 SIZES = ExampleConfig(lanes=5, segments=4, areas=2, elements=3)
 NATIVE = ImageConfig(divisor=16)

@@ -32,7 +32,7 @@ from tflane_jax.datasets.view_images import (
 )
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import project
-from tflane_jax.systems import system_of
+from tflane_jax.tasks import system_of
 from tflane_jax.training.batches import batches
 
 SIZES = ExampleConfig(lanes=5, segments=4, areas=2, elements=3)
@@ -243,10 +243,10 @@ def test_the_command_line_names_it(whole):
 
 def test_a_world_too_large_for_memory_is_streamed(tmp_path, monkeypatch):
     kept = cached(FakeDataset(FakeConfig(5)), root=tmp_path, workers=1, progress=False)
-    monkeypatch.setattr("tflane_jax.systems.lane_graph.open_dataset", lambda source, progress: kept)
+    monkeypatch.setattr("tflane_jax.tasks.lane_graph_system.open_dataset", lambda source, progress: kept)
     system, source = system_of(RunConfig()), RunConfig().data.source("train")
     whole = system.load(source)
-    monkeypatch.setattr("tflane_jax.systems.lane_graph.IN_MEMORY", 1000)
+    monkeypatch.setattr("tflane_jax.tasks.lane_graph_system.IN_MEMORY", 1000)
     large = system.load(source)
     assert isinstance(large, Streamed)
     for one, other in zip(*(batches(data, (3,), range(4), 2) for data in (whole, large)), strict=True):

@@ -13,7 +13,7 @@ from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.loading import count, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
-from tflane_jax.world.ring_cameras import CameraRigConfig
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 CONFIG = ProceduralConfig(split="val", scenes=2, first=5)
 

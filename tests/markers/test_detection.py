@@ -19,7 +19,8 @@ from tflane_jax.markers.detection import (
     refine_corners,
     solve_square,
 )
-from tflane_jax.markers.patterns import (
+from tflane_jax.scene import CameraViews
+from tflane_jax.scene.marker_patterns import (
     MarkerFamily,
     board_cells,
     board_size,
@@ -28,9 +29,8 @@ from tflane_jax.markers.patterns import (
     marker_cells,
     marker_count,
 )
-from tflane_jax.scene import CameraViews
-from tflane_jax.world.camera_pictures import paint_picture
-from tflane_jax.world.front_view_camera import FrontCamera, camera_pose
+from tflane_jax.world.cameras.pictures import paint_picture
+from tflane_jax.world.render.camera import FrontCamera, camera_pose
 
 cv2 = pytest.importorskip("cv2")
 

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
-from tflane_jax.logs import PlacedMarkers
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.simulation import SimulatedMarkers
 from tflane_jax.markers.store import MarkerStore, UnknownMarkerWarning, store_of
-from tflane_jax.world.markers import marker_pose
+from tflane_jax.scene.logs import PlacedMarkers
+from tflane_jax.world.roads.markers import marker_pose
 
 RANGE = PerceptionRange()
 SIZES = {"markers": 3, "lanes": 6, "points": 5}

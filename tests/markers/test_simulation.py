@@ -12,7 +12,6 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.datasets.marker_observations import marker_observations
 from tflane_jax.geometry import PerceptionRange, invert_pose, relative_pose, yaw_pose
-from tflane_jax.logs import PlacedMarkers
 from tflane_jax.markers.simulation import (
     PERFECT,
     MarkerConfig,
@@ -21,7 +20,8 @@ from tflane_jax.markers.simulation import (
     simulate_detections,
     visible,
 )
-from tflane_jax.world.markers import marker_pose
+from tflane_jax.scene.logs import PlacedMarkers
+from tflane_jax.world.roads.markers import marker_pose
 from tflane_jax.world.simulate import simulate
 
 NOISY = MarkerSimulationConfig(detection_sigma=float("inf"), jump=0.0)

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import transform_points
-from tflane_jax.logs import PlacedMarkers
 from tflane_jax.markers.store import (
     MarkerStore,
     StaleMarkerWarning,
@@ -25,7 +24,8 @@ from tflane_jax.markers.store import (
     save_store,
     store_of,
 )
-from tflane_jax.world.markers import marker_pose
+from tflane_jax.scene.logs import PlacedMarkers
+from tflane_jax.world.roads.markers import marker_pose
 
 DAY = datetime.date(2025, 7, 11)
 

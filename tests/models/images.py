@@ -7,7 +7,7 @@ from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 
 HEIGHT, WIDTH = 40, 64
 ROWS = np.linspace(160, 710, 12) / 720

@@ -17,8 +17,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.losses.lane_graph import LaneGraphLossConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import TrafficFlow, stack_examples
-from tflane_jax.systems import system_of
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks import system_of
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.task import split_statistics
 
 TASKS = {

@@ -14,7 +14,7 @@ from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_denoising_los
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
 from tflane_jax.scene import LaneGraph, LanePrediction, stack_examples
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 RANGE = PerceptionRange()
 QUIET = DenoisingConfig(2, shift=0.0, turn=0.0, stretch=0.0, straighten=0.0)

@@ -22,7 +22,7 @@ from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
-from tflane_jax.losses.lane_curve import (
+from tflane_jax.losses.lane_shape import (
     LaneCurveLossConfig,
     LaneCurveTargets,
     lane_curve_loss,

@@ -26,7 +26,7 @@ from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.priors.marker_memory import MarkerMemoryConfig
 from tflane_jax.priors.markers import MarkerPriorConfig
 from tflane_jax.scene import MarkerObservations, SdMap, stack_examples
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 LINES = PolylineEncoderConfig(
     dim=8, layers=1, heads=2, hidden=8, dropout=0.0, bands=4, layout="interleaved", attend="points"

@@ -12,7 +12,7 @@ from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.scene import TrafficFlow
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 MODELS = {
     "baseline": BASELINE,

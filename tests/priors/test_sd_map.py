@@ -12,7 +12,7 @@ from tflane_jax.datasets.geojson import CATEGORIES
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
 from tflane_jax.scene import SdCategory, SdMap
-from tflane_jax.world.sd_map import pack_lines
+from tflane_jax.world.roads.sd_map import pack_lines
 
 CONFIG = SdMapPriorConfig(PerceptionRange((-40.0, 40.0), (-20.0, 20.0)), categories=8)
 EVERYWHERE = PerceptionRange((-1e4, 1e4), (-1e4, 1e4))

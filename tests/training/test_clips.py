@@ -12,11 +12,11 @@ from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.evaluate import Sightings, evaluate_lanes, predictions
 from tflane_jax.scene import shapes_of, stack_examples
 from tflane_jax.summary import parameter_counts, shapes_of_params, training_program
-from tflane_jax.systems.lane_graph import clips, predict_examples
-from tflane_jax.training.evaluate import Sightings, evaluate_lanes, predictions
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph_system import clips, predict_examples
 from tflane_jax.training.schedule import OptimConfig
 
 ALONE = LaneGraphTask(replace(BASELINE, markers=CONFIG))

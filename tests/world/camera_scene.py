@@ -4,9 +4,9 @@ import numpy as np
 
 from tests.datasets.small_logs import lane_map, log, segment, tracks
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.logs import MapElement
 from tflane_jax.scene import LineType, RoadUser
-from tflane_jax.world.ring_cameras import NUSCENES_RING, CameraRigConfig
+from tflane_jax.scene.logs import MapElement
+from tflane_jax.world.cameras.ring import NUSCENES_RING, CameraRigConfig
 
 X, Y = 1000.0, -2000.0
 FRONT = CameraRigConfig(cameras=NUSCENES_RING[:1], scale=0.4, severity=0.0)

@@ -6,9 +6,9 @@ the middle. One crosswalk runs over street 3.
 
 import numpy as np
 
-from tflane_jax.logs import LaneSegment, VectorMap
 from tflane_jax.scene import LineType
-from tflane_jax.world.roads import RoadNetwork, SceneKind
+from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.world.roads.networks import RoadNetwork, SceneKind
 
 HALF_WIDTH, STOP, REACH, LIMIT = 1.75, 8.0, 150.0, 12.0
 

@@ -8,8 +8,8 @@ import pytest
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import BevGrid, PerceptionRange, yaw_pose
 from tflane_jax.scene import BevChannel, LineType
-from tflane_jax.world.bev_sensor import BevSensorConfig, hidden_cells, render_bev
-from tflane_jax.world.map_samples import sample_map
+from tflane_jax.world.bev.map_samples import sample_map
+from tflane_jax.world.bev.sensor import BevSensorConfig, hidden_cells, render_bev
 
 GRID = BevGrid()
 PERFECT = BevSensorConfig(severity=0.0)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from tests.world.camera_scene import X, Y, street
-from tflane_jax.world.camera_ground import draw_ground, sample_ground
-from tflane_jax.world.camera_paint import paint_of
-from tflane_jax.world.ground_window import Window, window_around
-from tflane_jax.world.road_area import road_rings
+from tflane_jax.world.cameras.ground import draw_ground, sample_ground
+from tflane_jax.world.cameras.ground_window import Window, window_around
+from tflane_jax.world.cameras.paint import paint_of
+from tflane_jax.world.roads.area import road_rings
 
 pytest.importorskip("cv2")
 

@@ -9,17 +9,17 @@ from tests.world import camera_scene
 from tests.world.camera_scene import scene, street
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import project
-from tflane_jax.logs import PlacedMarkers
 from tflane_jax.markers.detection import DetectorConfig, detect
-from tflane_jax.markers.patterns import MarkerFamily, board_cells, board_size, marker_cells
-from tflane_jax.world.camera_markers import marker_bodies
-from tflane_jax.world.camera_pictures import paint_picture
-from tflane_jax.world.camera_sensor import render_cameras, render_window
-from tflane_jax.world.camera_solids import draw_bodies, join, pack
-from tflane_jax.world.front_view_polygons import Solid
-from tflane_jax.world.front_view_weather import FrontWeatherConfig, draw_weather
-from tflane_jax.world.ring_cameras import CameraRigConfig, draw_rig
-from tflane_jax.world.solid_shapes import box
+from tflane_jax.scene.logs import PlacedMarkers
+from tflane_jax.scene.marker_patterns import MarkerFamily, board_cells, board_size, marker_cells
+from tflane_jax.world.cameras.markers import marker_bodies
+from tflane_jax.world.cameras.pictures import paint_picture
+from tflane_jax.world.cameras.ring import CameraRigConfig, draw_rig
+from tflane_jax.world.cameras.sensor import render_cameras, render_window
+from tflane_jax.world.cameras.solids import draw_bodies, join, pack
+from tflane_jax.world.render.polygons import Solid
+from tflane_jax.world.render.shapes import box
+from tflane_jax.world.render.weather import FrontWeatherConfig, draw_weather
 
 pytest.importorskip("cv2")
 

@@ -8,9 +8,9 @@ import pytest
 from tests.world.camera_scene import FRONT, LINES, RING, light, scene, street, to_ego
 from tflane_jax.geometry.cameras import project
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.camera_sensor import render_cameras, visible_elements
-from tflane_jax.world.front_view_weather import FrontWeatherConfig, Sky
-from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
+from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
+from tflane_jax.world.render.weather import FrontWeatherConfig, Sky
 from tflane_jax.world.simulate import WorldConfig, simulate
 
 pytest.importorskip("cv2")

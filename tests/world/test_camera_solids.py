@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from tflane_jax.geometry.cameras import project
-from tflane_jax.world.camera_solids import draw_bodies, join, pack
-from tflane_jax.world.front_view_polygons import Solid
-from tflane_jax.world.front_view_weather import FrontWeatherConfig, draw_weather
-from tflane_jax.world.ring_cameras import CameraRigConfig, draw_rig
-from tflane_jax.world.solid_shapes import box
+from tflane_jax.world.cameras.ring import CameraRigConfig, draw_rig
+from tflane_jax.world.cameras.solids import draw_bodies, join, pack
+from tflane_jax.world.render.polygons import Solid
+from tflane_jax.world.render.shapes import box
+from tflane_jax.world.render.weather import FrontWeatherConfig, draw_weather
 
 pytest.importorskip("cv2")
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.camera_solids import pack
-from tflane_jax.world.camera_vehicles import road_user
-from tflane_jax.world.vehicles import PROFILES
+from tflane_jax.world.cameras.solids import pack
+from tflane_jax.world.cameras.vehicles import road_user
+from tflane_jax.world.traffic.vehicles import PROFILES
 
 
 def drawn(category, seed=0, pace=0.0):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.world.crossroads import LIMIT, REACH, STOP, crossroads
-from tflane_jax.world.demand import _routes
-from tflane_jax.world.driving import Convoy, acceleration, crossings_busy, footing
-from tflane_jax.world.lane_table import build_lane_table
-from tflane_jax.world.pedestrians import crossing_places, draw_crossers
+from tflane_jax.world.traffic.demand import _routes
+from tflane_jax.world.traffic.driving import Convoy, acceleration, crossings_busy, footing
+from tflane_jax.world.traffic.lane_table import build_lane_table
+from tflane_jax.world.traffic.pedestrians import crossing_places, draw_crossers
 
 NOBODY = (np.zeros(0, np.intp), np.zeros(0))
 EAST, NORTH = (0, 1, 2), (3, 4, 5)

@@ -7,14 +7,14 @@ from hypothesis import strategies as st
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import ground_points, project
-from tflane_jax.world.curves import ReferenceLine
-from tflane_jax.world.front_view import FrontWorldConfig, draw_front_scene, front_view, render, scene_lines
-from tflane_jax.world.front_view_camera import FrontCamera
-from tflane_jax.world.front_view_lines import ROWS, label_lines, marked_lines
-from tflane_jax.world.front_view_road import WHITE, Stripe
-from tflane_jax.world.front_view_roadside import Roadside
-from tflane_jax.world.front_view_traffic import FrontTrafficConfig
-from tflane_jax.world.front_view_weather import Sky
+from tflane_jax.world.front_view.lines import ROWS, label_lines, marked_lines
+from tflane_jax.world.front_view.road import WHITE, Stripe
+from tflane_jax.world.front_view.roadside import Roadside
+from tflane_jax.world.front_view.traffic import FrontTrafficConfig
+from tflane_jax.world.front_view.views import FrontWorldConfig, draw_front_scene, front_view, render, scene_lines
+from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.weather import Sky
+from tflane_jax.world.roads.curves import ReferenceLine
 
 CLEAN = FrontWorldConfig(severity=0.0)
 SCENES = st.integers(0, 3 * 10**8 - 1)

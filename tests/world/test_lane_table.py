@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.world.crossroads import LIMIT, REACH, STOP, crossroads
-from tflane_jax.world.lane_table import build_lane_table
+from tflane_jax.world.traffic.lane_table import build_lane_table
 
 
 @pytest.fixture(scope="module")

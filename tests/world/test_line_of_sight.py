@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.world.line_of_sight import hidden_points
+from tflane_jax.world.bev.line_of_sight import hidden_points
 
 NO_BOXES, NO_BUILDINGS = np.zeros((0, 7)), np.zeros((0, 5))
 CAR = [10.0, 0.0, 4.0, 2.0, 0.0, 1.5, 0.0]

@@ -5,7 +5,7 @@ import pytest
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.scene import LineType
-from tflane_jax.world.map_samples import DASH, DASH_PERIOD, SPACING, sample_map
+from tflane_jax.world.bev.map_samples import DASH, DASH_PERIOD, SPACING, sample_map
 
 
 def one_line(kind, *, reverse=False, length=90.0):

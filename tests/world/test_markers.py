@@ -8,12 +8,12 @@ import pytest
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import invert_pose, transform_points
-from tflane_jax.logs import VectorMap
+from tflane_jax.scene.logs import VectorMap
 from tflane_jax.world import simulate as simulate_module
-from tflane_jax.world.markers import PlacementConfig, place_markers
-from tflane_jax.world.road_config import RoadConfig, SceneKind
+from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.roads.markers import PlacementConfig, place_markers
 from tflane_jax.world.simulate import WorldConfig, simulate
-from tflane_jax.world.traffic import TrafficConfig
+from tflane_jax.world.traffic.simulation import TrafficConfig
 
 EMPTY = TrafficConfig(
     vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0

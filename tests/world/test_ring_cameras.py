@@ -4,7 +4,7 @@ import pytest
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.cameras import inside_image, project
-from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
 
 RINGS = {"argoverse 2": ARGOVERSE2_RING, "nuscenes": NUSCENES_RING}
 

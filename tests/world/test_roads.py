@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tflane_jax.geometry.polylines import arc_length, resample
-from tflane_jax.logs import LaneSegment
 from tflane_jax.scene import LineType
-from tflane_jax.world.roads import RoadConfig, RoadNetwork, SceneKind, build_road_network
+from tflane_jax.scene.logs import LaneSegment
+from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, SceneKind, build_road_network
 
 CONFIG = RoadConfig()
 SEEDS = range(20)

@@ -14,9 +14,9 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, arc_length, yaw_pose
 from tflane_jax.scene import SdCategory, SdMap
-from tflane_jax.world.road_config import RoadConfig, SceneKind
-from tflane_jax.world.roads import build_road_network
-from tflane_jax.world.sd_map import (
+from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.roads.networks import build_road_network
+from tflane_jax.world.roads.sd_map import (
     SdMapConfig,
     gnss_error,
     make_sd_map,

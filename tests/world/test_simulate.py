@@ -8,10 +8,10 @@ import pytest
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.roads import build_road_network
+from tflane_jax.world.roads.networks import build_road_network
 from tflane_jax.world.simulate import ROOT, Stream, WorldConfig, simulate
-from tflane_jax.world.tracker import TrackerConfig
-from tflane_jax.world.traffic import TrafficConfig, simulate_traffic
+from tflane_jax.world.traffic.simulation import TrafficConfig, simulate_traffic
+from tflane_jax.world.traffic.tracker import TrackerConfig
 
 EMPTY = TrafficConfig(
     vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tflane_jax.geometry import transform_points, yaw_pose
-from tflane_jax.logs import Tracks
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.tracker import TrackerConfig, track, visible_share, wrap_angle
+from tflane_jax.scene.logs import Tracks
+from tflane_jax.world.traffic.tracker import TrackerConfig, track, visible_share, wrap_angle
 
 PERFECT = TrackerConfig.perfect()
 NO_BUILDINGS = np.zeros((0, 5))

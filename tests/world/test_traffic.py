@@ -10,11 +10,11 @@ from scipy.spatial import KDTree
 
 from tests.world.crossroads import REACH, STOP, crossroads
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.lane_table import build_lane_table
-from tflane_jax.world.pedestrians import walk_sidewalks
-from tflane_jax.world.roads import RoadConfig, build_road_network
-from tflane_jax.world.signals import Signals, draw_signals
-from tflane_jax.world.traffic import TrafficConfig, simulate_traffic
+from tflane_jax.world.roads.networks import RoadConfig, build_road_network
+from tflane_jax.world.traffic.lane_table import build_lane_table
+from tflane_jax.world.traffic.pedestrians import walk_sidewalks
+from tflane_jax.world.traffic.signals import Signals, draw_signals
+from tflane_jax.world.traffic.simulation import TrafficConfig, simulate_traffic
 
 RATE = 10.0
 EMPTY = TrafficConfig(

@@ -13,7 +13,7 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Train, evaluate and compare."""
-    from tflane_jax.compare import compare
+    from tflane_jax.ablations.compare import compare
 
     references = dict(_named(reference) for reference in options.configs)
     if len(references) < len(options.configs):

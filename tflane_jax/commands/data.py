@@ -19,11 +19,11 @@ from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.scene import stack_examples
-from tflane_jax.systems import spread, system_of
-from tflane_jax.systems.lane_curve import open_images
-from tflane_jax.systems.lane_graph import open_dataset
+from tflane_jax.tasks import spread, system_of
+from tflane_jax.tasks.lane_graph_system import open_dataset
+from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape_system import open_images
 from tflane_jax.training.batches import prepared
-from tflane_jax.training.lane_curve import LaneCurveTask
 
 _FAULTS = 50  # printed
 

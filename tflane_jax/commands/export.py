@@ -11,7 +11,7 @@ from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
 from tflane_jax.export import export_model, image_program, latencies, load_program
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.runtime import configure_jax
 
 HEIGHT, WIDTH = 360, 640

@@ -7,7 +7,7 @@ import argparse
 from tflane_jax.commands import predict_images, predict_lanes
 from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
-from tflane_jax.training.lane_curve import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.runtime import configure_jax
 
 

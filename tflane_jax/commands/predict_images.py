@@ -23,14 +23,14 @@ from tqdm import tqdm
 
 from tflane_jax.commands.sources import lane_curve_source, make_folder
 from tflane_jax.errors import UserError
-from tflane_jax.images import PhotoCamera, fit_photo, list_photos, read_image
+from tflane_jax.files.images import PhotoCamera, fit_photo, list_photos, read_image
 from tflane_jax.metrics import image_lanes
 from tflane_jax.metrics.tusimple import RowLanes
 from tflane_jax.plots.images import predicted_lines, save_photo, save_road_images
 from tflane_jax.runs import Run
 from tflane_jax.scene import LaneLines, RoadImage, stack_examples
-from tflane_jax.systems import spread
-from tflane_jax.systems.lane_curve import found_lanes, name_of, open_images, predict, truth_of
+from tflane_jax.tasks import spread
+from tflane_jax.tasks.lane_shape_system import found_lanes, name_of, open_images, predict, truth_of
 from tflane_jax.training.run_folder import write_json, write_text
 
 

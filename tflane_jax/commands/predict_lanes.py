@@ -33,8 +33,8 @@ from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.errors import UserError
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
-from tflane_jax.systems import spread
-from tflane_jax.systems.lane_graph import open_dataset, predict_examples, titles
+from tflane_jax.tasks import spread
+from tflane_jax.tasks.lane_graph_system import open_dataset, predict_examples, titles
 from tflane_jax.training.run_folder import write_json
 
 _RELATION_THRESHOLD = 0.5

@@ -17,10 +17,10 @@ from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, open_run, open_weights
-from tflane_jax.systems.lane_graph import limit_instances
-from tflane_jax.training.lane_curve import LaneCurveTask
-from tflane_jax.training.lane_graph import LaneGraphTask
-from tflane_jax.world.ring_cameras import CameraRigConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph_system import limit_instances
+from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 
 def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:

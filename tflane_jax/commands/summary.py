@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
-from tflane_jax.systems import system_of
+from tflane_jax.tasks import system_of
 from tflane_jax.training.runtime import configure_jax
 
 

@@ -12,7 +12,7 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Evaluate trained models over the values of a setting."""
-    from tflane_jax.sweep import sweep
+    from tflane_jax.ablations.sweep import sweep
 
     pairs = [reference.partition("=") for reference in options.runs]
     models = {name if path else Path(name).name: Path(path or name) for name, _, path in pairs}

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tflane_jax.convert.lstr import load_lstr
 from tflane_jax.convert.toponet import load_host
-from tflane_jax.training.lane_curve import LaneCurveTask
-from tflane_jax.training.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_shape import LaneCurveTask
 from tflane_jax.training.task import Params
 
 

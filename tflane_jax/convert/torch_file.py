@@ -19,7 +19,7 @@ import numpy as np
 
 from tflane_jax.convert.torch_pickle import KINDS, Damaged, Tensor, TorchUnpickler, Unreadable, to_array
 from tflane_jax.errors import UserError
-from tflane_jax.plain_pickle import Refused
+from tflane_jax.files.plain_pickle import Refused
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 # Where training programs keep the weights, the likeliest first.

@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.plain_pickle import PLAIN, Refused, RestrictedUnpickler, Sealed
+from tflane_jax.files.plain_pickle import PLAIN, Refused, RestrictedUnpickler, Sealed
 
 # No offset, size or stride is larger.
 _LARGEST = 2**48

@@ -20,8 +20,8 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
-from tflane_jax.logs import KeyFrame, Log, Tracks
 from tflane_jax.scene import Example, RoadUser
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks
 
 ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
 _POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")

@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.polylines import resample
-from tflane_jax.logs import LaneSegment, VectorMap
 from tflane_jax.scene import LineType
+from tflane_jax.scene.logs import LaneSegment, VectorMap
 
 MAP_PATTERN = "log_map_archive_*.json"
 # Argoverse 2's own interface makes centerlines of ten points.

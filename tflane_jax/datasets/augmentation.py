@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.images import opencv
+from tflane_jax.files.images import opencv
 from tflane_jax.scene import LaneLines, RoadImage
 
 Seed = int | Sequence[int]

@@ -10,9 +10,9 @@ import numpy as np
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
-from tflane_jax.world.bev_sensor import BevSensorConfig
-from tflane_jax.world.ring_cameras import CameraRigConfig
-from tflane_jax.world.sd_map import SdMapConfig
+from tflane_jax.world.bev.sensor import BevSensorConfig
+from tflane_jax.world.cameras.ring import CameraRigConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
 
 
 @dataclass(frozen=True)

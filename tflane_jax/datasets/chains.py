@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tflane_jax.geometry.polylines import arc_length
-from tflane_jax.logs import LaneSegment
+from tflane_jax.scene.logs import LaneSegment
 
 # Two points closer than this (metres, ground plane) are one point of a merged line.
 _SAME_POINT = 1e-6

@@ -14,11 +14,11 @@ from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
 from tflane_jax.datasets.marker_observations import marker_observations
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
-from tflane_jax.logs import Log, Tracks
 from tflane_jax.scene import Example, TrafficFlow
-from tflane_jax.world.bev_sensor import hidden_cells, render_bev
-from tflane_jax.world.camera_sensor import render_cameras, visible_elements
-from tflane_jax.world.sd_map import make_sd_map
+from tflane_jax.scene.logs import Log, Tracks
+from tflane_jax.world.bev.sensor import hidden_cells, render_bev
+from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
+from tflane_jax.world.roads.sd_map import make_sd_map
 
 
 def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tuple[TrafficFlow, int]:

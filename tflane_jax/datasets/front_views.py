@@ -17,8 +17,8 @@ from tflane_jax.datasets.leaves import image_from_leaves
 from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.world.front_view import FrontWorldConfig, front_view
-from tflane_jax.world.front_view_lines import CAPACITY, ROWS
+from tflane_jax.world.front_view.lines import CAPACITY, ROWS
+from tflane_jax.world.front_view.views import FrontWorldConfig, front_view
 
 
 @dataclass(frozen=True)

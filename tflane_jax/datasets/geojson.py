@@ -20,7 +20,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.errors import UserError
 from tflane_jax.scene import SdCategory, SdMap
-from tflane_jax.world.sd_map import SdMapConfig, pack_lines
+from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
 
 # Names of SMERF's categories (specs/modules.md section 9).
 CATEGORIES = {

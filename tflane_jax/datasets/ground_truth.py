@@ -15,10 +15,10 @@ from jaxtyping import Float, Int
 from tflane_jax.datasets.prepared_map import MapLanes, PreparedMap
 from tflane_jax.geometry import PerceptionRange, transform_points
 from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample_lines, sample_at
-from tflane_jax.logs import MapElement
 from tflane_jax.scene import LaneGraph, TrafficElements
-from tflane_jax.world.camera_sensor import ElementViews
-from tflane_jax.world.line_of_sight import hidden_points
+from tflane_jax.scene.logs import MapElement
+from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.cameras.sensor import ElementViews
 
 # A traffic element farther away than this is not part of the truth; metres.
 ELEMENT_DISTANCE = 60.0

@@ -9,12 +9,12 @@ import weakref
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import PerceptionRange, relative_pose
-from tflane_jax.logs import Log, PlacedMarkers
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.simulation import MarkerConfig, moment_before, simulate_detections
 from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.scene import MarkerObservations
-from tflane_jax.world.markers import place_markers
+from tflane_jax.scene.logs import Log, PlacedMarkers
+from tflane_jax.world.roads.markers import place_markers
 
 _REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = {}
 

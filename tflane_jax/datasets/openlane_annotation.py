@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items
-from tflane_jax.openlane_files import (
+from tflane_jax.files.fields import items
+from tflane_jax.files.openlane import (
     SEGMENT,
     FieldNames,
     read_areas,

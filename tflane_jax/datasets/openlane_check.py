@@ -28,8 +28,8 @@ from tflane_jax.datasets.openlane_frames import (
     read_frame,
 )
 from tflane_jax.errors import UserError
-from tflane_jax.fields import load_json
-from tflane_jax.openlane_files import CENTERLINE, SEGMENT, FrameKey
+from tflane_jax.files.fields import load_json
+from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 
 # A vehicle that is faster than this (metres a second) has jumped: its poses are damaged.
 _FASTEST = 70.0

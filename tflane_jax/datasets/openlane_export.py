@@ -22,10 +22,10 @@ from tflane_jax.datasets.base import Dataset, FrameInfo
 from tflane_jax.datasets.identities import Identities, line_distances
 from tflane_jax.datasets.openlane_frames import SUBSETS, Split, SubsetName, info_path
 from tflane_jax.errors import UserError
+from tflane_jax.files.images import opencv
+from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKey
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample
-from tflane_jax.images import opencv
-from tflane_jax.openlane_files import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKey
 from tflane_jax.scene import CameraViews, Example, LaneGraph, TrafficElements
 
 ImageFormat = Literal["jpg", "png"]

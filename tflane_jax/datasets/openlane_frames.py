@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_json, member, numbers
+from tflane_jax.files.fields import items, load_json, member, numbers
+from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import pose_matrix
-from tflane_jax.openlane_files import FrameKey
 
 SubsetName = Literal["A", "B"]
 Split = Literal["train", "val", "test"]

@@ -31,10 +31,10 @@ from tflane_jax.datasets.openlane_frames import (
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig, ImageFit, canvas_size, fit_image
 from tflane_jax.errors import UserError
+from tflane_jax.files.images import read_image
+from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT
 from tflane_jax.geometry import invert_pose, relative_pose
 from tflane_jax.geometry.polylines import resample_lines
-from tflane_jax.images import read_image
-from tflane_jax.openlane_files import CENTERLINE, DENSE_POINTS, SEGMENT
 from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
 
 Flavour = Literal["centerline", "lane_segment", "both"]

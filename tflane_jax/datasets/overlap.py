@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from tflane_jax.datasets.argoverse2 import find_logs, read_poses
 from tflane_jax.errors import UserError
-from tflane_jax.fields import load_json, member, numbers
+from tflane_jax.files.fields import load_json, member, numbers
 
 RADII = (5.0, 10.0, 20.0, 50.0)
 _POSE_INTERVAL = 0.1  # seconds between the poses of a log that are looked at; the files have 170 a second

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from tflane_jax.images import opencv
+from tflane_jax.files.images import opencv
 from tflane_jax.scene import CameraViews, Example
 
 # What a hidden square shows: the mean of ImageNet, which normalisation turns to zero as in the original.

@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.chains import merge_chains
 from tflane_jax.geometry import PerceptionRange, transform_points
-from tflane_jax.logs import LaneSegment, VectorMap
-from tflane_jax.world.map_samples import MapSamples, sample_map
+from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.world.bev.map_samples import MapSamples, sample_map
 
 
 @dataclass(frozen=True)

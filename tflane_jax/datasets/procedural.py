@@ -13,9 +13,9 @@ from typing import Literal
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
-from tflane_jax.images import opencv
-from tflane_jax.logs import Log
+from tflane_jax.files.images import opencv
 from tflane_jax.scene import Example
+from tflane_jax.scene.logs import Log
 from tflane_jax.world.simulate import WorldConfig, simulate
 
 # Scene ids of a split: [first, first + SCENES_PER_SPLIT).

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from tflane_jax.datasets.base import FrameInfo, TruncationWarning
 from tflane_jax.errors import UserError
-from tflane_jax.images import HEIGHT, WIDTH, read_image, resize
+from tflane_jax.files.images import HEIGHT, WIDTH, read_image, resize
 from tflane_jax.metrics.tusimple import RowLanes
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.scoring.tusimple import read_truth

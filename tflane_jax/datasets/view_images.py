@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.images import opencv
 from tflane_jax.geometry.cameras import crop_intrinsics, resize_intrinsics
-from tflane_jax.images import opencv
 
 
 @dataclass(frozen=True)

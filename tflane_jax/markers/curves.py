@@ -16,13 +16,13 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, yaw_pose
-from tflane_jax.logs import KeyFrame, LaneSegment, Log, PlacedMarkers, Tracks, VectorMap
 from tflane_jax.markers.detection import DetectorConfig, find_markers, marker_outline, solve_square
-from tflane_jax.markers.patterns import marker_count
 from tflane_jax.scene import LineType
-from tflane_jax.world.camera_sensor import render_window
-from tflane_jax.world.front_view_camera import FrontCamera
-from tflane_jax.world.ring_cameras import ARGOVERSE2_RING, CameraMount, CameraRigConfig, draw_rig
+from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, PlacedMarkers, Tracks, VectorMap
+from tflane_jax.scene.marker_patterns import marker_count
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount, CameraRigConfig, draw_rig
+from tflane_jax.world.cameras.sensor import render_window
+from tflane_jax.world.render.camera import FrontCamera
 
 # Standard deviation of the paper's forward error and of its yaw and pitch errors at 60 m, metres and degrees.
 PAPER_DISTANCE, PAPER_FORWARD, PAPER_ANGLE = 60.0, 3.0, 2.0

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.images import opencv
 from tflane_jax.geometry import invert_pose, pose_matrix, transform_points
 from tflane_jax.geometry.cameras import project
-from tflane_jax.images import opencv
-from tflane_jax.markers.patterns import MarkerFamily, cells_across, correctable_bits, dictionary_of, marker_cells
 from tflane_jax.scene import CameraViews
+from tflane_jax.scene.marker_patterns import MarkerFamily, cells_across, correctable_bits, dictionary_of, marker_cells
 
 # Corners of a marker of size 2 in its own frame, in OpenCV's order: upper left, upper right, lower right, lower left.
 _SQUARE = np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0)])

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
-from tflane_jax.logs import KeyFrame, Log, PlacedMarkers
-from tflane_jax.world.line_of_sight import hidden_points
+from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
+from tflane_jax.world.bev.line_of_sight import hidden_points
 
 ROOT = 20_251_123
 

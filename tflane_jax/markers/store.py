@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_json, member, numbers, whole_number
+from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry import invert_pose, resample_lines, transform_points
-from tflane_jax.logs import LaneSegment, PlacedMarkers
+from tflane_jax.scene.logs import LaneSegment, PlacedMarkers
 
 FORMAT, VERSION = "tflane-marker-store", 1
 # Length units that a file may be in, metres.

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.frames import (
     ElementDetections,
     ElementTruth,
@@ -22,7 +23,6 @@ from tflane_jax.metrics.frames import (
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
 from tflane_jax.metrics.topology import FILL, Version, matchings, topology_precision
-from tflane_jax.openlane_files import ATTRIBUTES
 
 LANE_THRESHOLDS = (1.0, 2.0, 3.0)  # metres, discrete Frechet
 ELEMENT_THRESHOLD = 0.75  # IoU distance

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import softmax
 
-from tflane_jax.geometry.lane_curves import curve_columns
+from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.metrics.tusimple import RowLanes
 from tflane_jax.scene import LaneCurvePrediction
 

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.topology import Version
-from tflane_jax.openlane_files import ATTRIBUTES
 
 
 class CenterlineMetrics:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_file, member, numbers, scores
+from tflane_jax.files.fields import items, load_file, member, numbers, scores
 from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
 
 

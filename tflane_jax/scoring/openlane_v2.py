@@ -17,18 +17,8 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, load_file, load_json, member, scores
-from tflane_jax.geometry.polylines import resample
-from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
-from tflane_jax.metrics.lane_segment import (
-    CROSSING,
-    AreaDetections,
-    AreaTruth,
-    Flavour,
-    SegmentDetections,
-    SegmentTruth,
-)
-from tflane_jax.openlane_files import (
+from tflane_jax.files.fields import items, load_file, load_json, member, scores
+from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
     SEGMENT,
@@ -39,6 +29,16 @@ from tflane_jax.openlane_files import (
     read_elements,
     read_lines,
     read_matrix,
+)
+from tflane_jax.geometry.polylines import resample
+from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
+from tflane_jax.metrics.lane_segment import (
+    CROSSING,
+    AreaDetections,
+    AreaTruth,
+    Flavour,
+    SegmentDetections,
+    SegmentTruth,
 )
 
 # The published numbers are measured on every 20th of a centerline's points.

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, line_points, load_json, member, numbers, scores
+from tflane_jax.files.fields import items, line_points, load_json, member, numbers, scores
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
 SUFFIXES = (".npz", ".json")

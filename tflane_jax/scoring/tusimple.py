@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
-from tflane_jax.fields import items, member, numbers
+from tflane_jax.files.fields import items, member, numbers
 from tflane_jax.metrics.tusimple import RowLanes
 
 

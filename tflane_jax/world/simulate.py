@@ -14,12 +14,12 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.logs import KeyFrame, Log, Tracks
-from tflane_jax.world.markers import PlacementConfig, place_markers
-from tflane_jax.world.roads import RoadConfig, build_road_network
-from tflane_jax.world.signals import element_states, show_signals
-from tflane_jax.world.tracker import TrackerConfig, track, wrap_angle
-from tflane_jax.world.traffic import Traffic, TrafficConfig, simulate_traffic
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks
+from tflane_jax.world.roads.markers import PlacementConfig, place_markers
+from tflane_jax.world.roads.networks import RoadConfig, build_road_network
+from tflane_jax.world.traffic.signals import element_states, show_signals
+from tflane_jax.world.traffic.simulation import Traffic, TrafficConfig, simulate_traffic
+from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
 
 ROOT = 20_250_711
 # Frames of history that every key frame has before it.

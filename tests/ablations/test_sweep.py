@@ -1,0 +1,57 @@
+"""Trained models against a setting of the test data."""
+
+import dataclasses
+import json
+
+import jax
+import pytest
+
+from tests.ablations.test_compare import CONFIG
+from tests.models.cases import BASELINE
+from tflane_jax.ablations.sweep import runs_below, sweep
+from tflane_jax.cli import main
+from tflane_jax.errors import UserError
+from tflane_jax.runs import save_weights
+from tflane_jax.tasks import system_of
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two untrained models, the first with two seeds."""
+    root = tmp_path_factory.mktemp("runs")
+    other = dataclasses.replace(BASELINE, decoder=dataclasses.replace(BASELINE.decoder, queries=5))
+    example = jax.tree.map(jax.numpy.zeros_like, system_of(CONFIG).shapes(CONFIG))
+    for path, model, seed in (("one/seed_0", BASELINE, 0), ("one/seed_1", BASELINE, 1), ("other", other, 0)):
+        config = dataclasses.replace(CONFIG, task=LaneGraphTask(model))
+        save_weights(config, config.task.init(jax.random.key(seed), example), root / path)
+    return root
+
+
+def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    command = ["sweep", f"one={folder / 'one'}", str(folder / "other"), "--setting", "data.world.severity"]
+    assert main([*command, "--values", "0", "1", "--out", str(tmp_path / "out")]) == 0
+    assert "other" in capsys.readouterr().out
+    content = json.loads((tmp_path / "out" / "sweep.json").read_text())
+    assert [(row["data.world.severity"], row["model"]) for row in content["rows"]] == [
+        ("0", "one"), ("0", "other"), ("1", "one"), ("1", "other"),
+    ]  # fmt: skip
+    assert [len(seeds) for seeds in content["meta"]["scores"]["one"]] == [2, 2]
+    assert (tmp_path / "out" / "sweep.png").stat().st_size > 5_000
+    one = {"one": folder / "one" / "seed_0"}
+    again = sweep(one, "data.world.severity", ["0"], tmp_path / "again", metrics=["all/recall"])
+    assert again.read_text().splitlines()[2].split("|")[1:-1] == [" data.world.severity ", " model ", " all/recall "]
+    with pytest.raises(UserError, match="no metric all/wit, only all/DET_l, "):
+        sweep(one, "data.world.severity", ["0"], tmp_path / "again", metrics=["all/wit"])
+    first = json.loads(again.with_suffix(".json").read_text())["meta"]["scores"]["one"][0][0]
+    assert first == content["meta"]["scores"]["one"][0][0]
+
+
+def test_what_cannot_be_swept_is_said(folder, tmp_path):
+    with pytest.raises(UserError, match="give a setting of the data"):
+        sweep({"other": folder / "other"}, "optim.lr", ["1"], tmp_path)
+    with pytest.raises(UserError, match="is no run folder, and holds none"):
+        runs_below(tmp_path)
+    with pytest.raises(UserError, match=r"unknown setting --data\.world\.severty"):
+        sweep({"other": folder / "other"}, "data.world.severty", ["1"], tmp_path)

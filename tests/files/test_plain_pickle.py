@@ -1,0 +1,92 @@
+"""Plain data comes out of a pickle as it went in; nothing else comes out, and nothing is run."""
+
+import collections
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from tflane_jax.errors import UserError
+from tflane_jax.files.plain_pickle import load_plain_pickle
+
+PLAIN = {
+    "results": {("val", "10073", "315"): [{"id": 3, "points": np.arange(6.0).reshape(2, 3), "confidence": 0.5}]},
+    "arrays": [np.zeros((0, 3), np.float32), np.array([True, False]), np.array(7), np.asfortranarray(np.eye(3)[:2])],
+    "scalars": [np.float32(0.25), np.int64(-3), np.bool_(True), 1j, None, b"raw", "text", 2**70],
+    "containers": [{1, 2}, frozenset({"a"}), (1, (2,)), collections.OrderedDict(a=1), bytearray(b"x")],
+    "text arrays": np.array(["a", "bc"]),
+    "objects": np.array([[1, 2], None], dtype=object),
+}
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_plain_data_survives(tmp_path, protocol):
+    path = tmp_path / "data.pkl"
+    path.write_bytes(pickle.dumps(PLAIN, protocol))
+    got = load_plain_pickle(path)
+    assert got.keys() == PLAIN.keys()
+    assert got["scalars"] == PLAIN["scalars"]
+    assert got["containers"] == PLAIN["containers"]
+    for a, b in zip(got["arrays"], PLAIN["arrays"], strict=True):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape)
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(got["text arrays"], PLAIN["text arrays"])
+    assert got["objects"].tolist() == [[1, 2], None]
+    (detection,) = got["results"]["val", "10073", "315"]
+    np.testing.assert_array_equal(detection["points"], [[0, 1, 2], [3, 4, 5]])
+
+
+class Evil:
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+class ArrayOfMine(np.ndarray):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("thing", "named"),
+    [
+        (Evil(os.system, "touch SHOULD_NOT_EXIST"), "system"),
+        (Evil(eval, "1 + 1"), "eval"),
+        (Evil(getattr, "x", "upper"), "getattr"),
+        (Evil(np.load, "x.npy"), "load"),
+        (ArrayOfMine((2,)), "ArrayOfMine"),
+        (UserError("an exception"), "UserError"),
+        (np.random.default_rng(0), "numpy.random"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_anything_else_is_refused_and_not_run(tmp_path, monkeypatch, thing, named, protocol):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evil.pkl").write_bytes(pickle.dumps({"results": [1, thing]}, protocol))
+    with pytest.raises(UserError, match=rf"evil\.pkl is refused.*{named}"):
+        load_plain_pickle(tmp_path / "evil.pkl")
+    assert os.listdir(tmp_path) == ["evil.pkl"]
+
+
+def test_an_array_cannot_ask_for_memory(tmp_path):
+    class Huge:
+        def __reduce__(self):
+            return np.zeros(0).__reduce__()[0], (np.ndarray, (10**15,), b"b")
+
+    (tmp_path / "huge.pkl").write_bytes(pickle.dumps(Huge()))
+    assert load_plain_pickle(tmp_path / "huge.pkl").size == 0
+
+
+@pytest.mark.parametrize("data", [b"", b"{}", b"\x80\x04", b"PK\x03\x04 not a pickle", pickle.dumps(PLAIN)[:-40]])
+def test_a_damaged_file_is_named(tmp_path, data):
+    (tmp_path / "broken.pkl").write_bytes(data)
+    with pytest.raises(UserError, match=r"broken\.pkl is no pickle file, or it is damaged"):
+        load_plain_pickle(tmp_path / "broken.pkl")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(UserError, match=r"cannot read .*nowhere\.pkl"):
+        load_plain_pickle(tmp_path / "nowhere.pkl")

@@ -1,0 +1,207 @@
+"""Networks of the LSTR family as tasks: padding, statistics, dropout, every encoder."""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
+from tests.parameters import random_params
+from tflane_jax.losses.lane_shape import LaneCurveLossConfig
+from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
+from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneCurveHeads, nearest, normalise, shrink
+from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import init_state
+from tflane_jax.training.step import make_update_step
+from tflane_jax.training.task import STATISTICS
+
+ENCODERS = {
+    "transformer": None,
+    "gtn": GtnEncoderConfig(layers=1, hidden=16),
+    "gcn": GcnEncoderConfig(layers=1, hidden=16),
+    "han": HanEncoderConfig(layers=1, hidden=16, semantic=8),
+}
+
+
+class Fitted:
+    """A task with random parameters and its compiled programs: what they start from, prediction, one update."""
+
+    def __init__(self, task):
+        optim = OptimConfig(lr=1e-2, warmup_steps=0, weight_decay=0.0)
+        self.params = random_params(task.init, road_image(0))
+        self.predict = jax.jit(task.predict)
+        self.init = jax.jit(lambda key, example: init_state(task, make_optimizer(optim, 10), key, example))
+        # The loss and its gradient take most of these tests' time: all of them read them off this one program.
+        self.update = make_update_step(task, optim, 10)
+
+    def start(self, key=0):
+        """Return a fresh state, whose buffers nobody else has: an update consumes them."""
+        return self.init(jax.random.key(key), road_image(0))
+
+    def updated(self, batch, key=0):
+        """Return the state and the metrics after one update of the random parameters."""
+        return self.update(self.start(key).replace(params=jax.tree.map(np.array, self.params)), batch)
+
+
+@cache
+def fit(name):
+    return Fitted(tiny_task(ENCODERS[name]))
+
+
+@pytest.fixture(params=ENCODERS)
+def fitted(request):
+    return fit(request.param)
+
+
+def padded(example, fill):
+    """Hide the right third of the image and fill it, and every point that is not there, with something."""
+    valid = example.image_valid.copy()
+    valid[:, WIDTH * 2 // 3 :] = False
+    there = example.lines.point_valid & example.lines.valid[:, None]
+    points = np.where(there[..., None], example.lines.points, np.nan if fill else 0.0)
+    image = np.where(valid[..., None], example.image, fill).astype(np.uint8)
+    return example.replace(image=image, image_valid=valid, lines=example.lines.replace(points=points))
+
+
+def pair(example):
+    """Return a batch that holds an example twice."""
+    return jax.tree.map(lambda leaf: np.stack([leaf, leaf]), example)
+
+
+def numbers(tree):
+    return jax.device_get(jax.tree.map(lambda leaf: jax.random.key_data(leaf) if is_key(leaf) else leaf, tree))
+
+
+def is_key(leaf):
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def test_predicts_one_class_and_one_curve_for_each_query(fitted):
+    answer = fitted.predict(fitted.params, road_image(0))
+    assert answer.logits.shape == (5, 2)
+    assert answer.curves.shape == (5, 8)
+    # k'', f'', m'' and n' belong to the image.
+    assert np.ptp(answer.curves[:, 2:6], axis=0).max() < 1e-6
+    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).logits)
+
+
+def test_what_stands_in_padding_changes_nothing(fitted):
+    clean, soiled = (padded(road_image(0), fill) for fill in (0, 200))
+    answer = fitted.predict(fitted.params, clean)
+    jax.tree.map(np.testing.assert_array_equal, answer, fitted.predict(fitted.params, soiled))
+    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(0)).logits)
+
+    # The optimiser's first moment is the gradient, scaled.
+    (state, metrics), other = (fitted.updated(pair(example)) for example in (clean, soiled))
+    assert metrics["finite"]
+    jax.tree.map(np.testing.assert_array_equal, (numbers(state), metrics), (numbers(other[0]), other[1]))
+
+
+def test_an_image_of_nothing_but_padding_stays_finite(fitted):
+    nothing = road_image(0, lines=0).replace(image_valid=np.zeros((HEIGHT, WIDTH), bool))
+    answer = fitted.predict(fitted.params, nothing)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(answer))
+    state, metrics = fitted.updated(pair(nothing))
+    assert metrics["finite"]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((numbers(state), metrics)))
+
+
+def test_training_moves_everything_that_learns_and_the_statistics(fitted):
+    batch = jax.device_put(road_images(2))
+    state, losses = fitted.start(), []
+    before = jax.tree.map(np.asarray, state.params)
+    for _ in range(8):
+        state, metrics = fitted.update(state, batch)
+        losses.append(float(metrics["loss"]))
+        assert STATISTICS not in "".join(metrics)
+    assert losses[-1] < losses[0]
+    still = [
+        jax.tree_util.keystr(place, simple=True, separator="/")
+        for (place, old), new in zip(jax.tree.leaves_with_path(before), jax.tree.leaves(state.params), strict=True)
+        if np.array_equal(old, new)
+    ]
+    # The first decoder layer's queries are zeros, which have no values to attend to; so it is in LSTR.
+    assert still == ["decoder_0/self_attention/value/kernel"]
+
+
+def test_dropout_follows_its_key():
+    batch = road_images(2)
+    first, again, other = (float(fit("transformer").updated(batch, seed)[1]["loss"]) for seed in (0, 0, 1))
+    assert first == again
+    assert first != other
+
+
+def test_normalisation_reads_blue_first():
+    image = np.zeros((1, 1, 3), np.uint8)
+    image[..., 2] = 255
+    out = np.asarray(normalise(image, np.ones((1, 1), bool)))[0, 0]
+    expected = (np.array([1.0, 0.0, 0.0]) - MEAN_BGR) / STD_BGR
+    np.testing.assert_allclose(out, expected, rtol=1e-6)
+
+
+def test_padding_is_sampled_at_the_first_pixel_of_a_cell():
+    mask = jnp.asarray(np.random.default_rng(0).random((360, 640)) < 0.5)
+    np.testing.assert_array_equal(nearest(mask, 12, 20), mask[::30, ::32])
+    assert nearest(mask[:1, :1], 1, 1).shape == (1, 1)
+
+
+def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
+    anchors, rng = (0.4, 0.9), np.random.default_rng(0)
+    queries = jnp.asarray(rng.normal(size=(2, 3, 8)).astype(np.float32))
+    heads = LaneCurveHeads(8, anchors)
+    variables = heads.init(jax.random.key(0), queries)
+    plain = LaneCurveHeads(8).apply(variables, queries)
+    anchored = heads.apply(variables, queries)
+    np.testing.assert_array_equal(anchored.logits, plain.logits)
+    # alpha of a typical road is 0.38, give or take 0.05.
+    np.testing.assert_allclose(anchored.curves[..., 0], 0.38 + 0.05 * plain.curves[..., 0], rtol=1e-5)
+    b, offset = anchored.curves[..., 6], anchored.curves[..., 7]
+    for i, (row, spread) in enumerate(zip(anchors, (0.1, 1.0), strict=True)):
+        np.testing.assert_allclose(b * row - offset, spread * plain.curves[..., 6 + i], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("encoder", [None, GtnEncoderConfig(layers=1, hidden=16)])
+def test_cells_are_learned_beside_the_curves(encoder):
+    task = LaneCurveTask(tiny_model(encoder, cells=True))
+    silent = dataclasses.replace(task, losses=LaneCurveLossConfig(cell_weight=0.0))
+    without = LaneCurveTask(tiny_model(encoder))
+    params = random_params(task.init, road_image(0))
+
+    @jax.jit
+    def run(params, example, batch, key):
+        rest = {name: value for name, value in params.items() if name != "cell_head"}
+        answers = task.predict(params, example), without.predict(rest, example)
+        return jax.value_and_grad(task.loss, has_aux=True)(params, batch, key), silent.loss(params, batch, key), answers
+
+    ((loss, terms), gradient), (rest, _), answers = run(params, road_image(0), road_images(2), jax.random.key(0))
+    assert terms["cells"] > 0
+    assert np.abs(gradient["cell_head"]["kernel"]).max() > 0
+    np.testing.assert_allclose(loss - terms["cells"], rest, rtol=1e-5)
+    jax.tree.map(np.testing.assert_array_equal, *answers)
+
+
+def test_shrunk_images_are_means_of_blocks_and_valid_where_all_of_a_block_is():
+    image = np.random.default_rng(0).normal(size=(4, 6, 3)).astype(np.float32)
+    valid = np.ones((4, 6), bool)
+    valid[1, 2] = False
+    small, small_valid = shrink(jnp.asarray(image), jnp.asarray(valid), 2)
+    np.testing.assert_allclose(small[1, 2], image[2:4, 4:6].mean((0, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(small_valid, [[True, False, True], [True, True, True]])
+    with pytest.raises(ValueError, match="4 x 6 does not shrink by blocks of 5 x 5"):
+        shrink(jnp.asarray(image), jnp.asarray(valid), 5)
+
+
+@cache
+def curves_of(**options):
+    """Return the curves that a network with some options predicts; parameters of one name have the same values."""
+    task = LaneCurveTask(tiny_model(**options))
+    return jax.jit(task.predict)(random_params(task.init, road_image(0)), road_image(0)).curves
+
+
+@pytest.mark.parametrize("changes", [{"shrink": 2}, {"located": True}, {"anchors": (0.4, 1.0)}])
+def test_options_predict_something_else(changes):
+    assert not np.array_equal(curves_of(), curves_of(**changes))

@@ -1,0 +1,1 @@
+"""Predictions and examples to every protocol."""

@@ -1,0 +1,183 @@
+"""Hungarian fitting loss of lane curves: GTN paper Eq. (3), (4), weighed as in LSTR (specs/modules.md section 2.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.matching import Assignment, match
+from tflane_jax.scene import LaneCurvePrediction, LaneLines
+
+
+@dataclass(frozen=True)
+class LaneCurveLossConfig:
+    """Weights of matching costs and loss terms alike; the defaults are LSTR's.
+
+    Attributes:
+        class_weight: omega_1.
+        curve_weight: omega_2; columns are shares of the image, summed over the points of a lane.
+        extent_weight: omega_3, of the rows where a lane begins and ends.
+        cell_weight: of the auxiliary loss on cells, for networks that have it; LSTR does not.
+        shared_horizon: every lane of an image is to begin at the highest row of any of them, as in LSTR's training.
+        least_depth: rows nearer to a predicted horizon than this share of the image count as this far below it. The
+            curve has a pole there, and LSTR, which goes without (1e-6), can leave it only by luck.
+        matcher: backend of `matching.match`.
+    """
+
+    class_weight: float = 3.0
+    curve_weight: float = 5.0
+    extent_weight: float = 2.0
+    cell_weight: float = 10.0
+    shared_horizon: bool = True
+    least_depth: float = 1e-6
+    matcher: Literal["scipy", "jax"] = "scipy"
+
+
+@struct.dataclass
+class LaneCurveTargets:
+    """Lane lines as the loss wants them; leading axes as the lines have them.
+
+    Attributes:
+        columns, rows: (L, P) u and v, shares of the image; 0 where there is no point.
+        point_valid: (L, P).
+        extent: (L, 2) first and last row, alpha and beta of Eq. (8); 0 where there is no lane.
+        valid: (L,) lanes with at least one point.
+    """
+
+    columns: Float[Array, "*b l p"]
+    rows: Float[Array, "*b l p"]
+    point_valid: Bool[Array, "*b l p"]
+    extent: Float[Array, "*b l 2"]
+    valid: Bool[Array, "*b l"]
+
+
+def lane_curve_targets(lines: LaneLines, *, shared_horizon: bool = True) -> LaneCurveTargets:
+    """Return the targets of lane lines (any leading axes); what stands in padding does not matter."""
+    point_valid = lines.point_valid & lines.valid[..., None]
+    valid = point_valid.any(-1)
+    columns, rows = (jnp.where(point_valid, lines.points[..., i], 0.0) for i in range(2))
+    first = jnp.where(point_valid, rows, jnp.inf).min(-1)
+    last = jnp.where(point_valid, rows, -jnp.inf).max(-1)
+    if shared_horizon:
+        first = jnp.broadcast_to(first.min(-1, keepdims=True), first.shape)
+    extent = jnp.where(valid[..., None], jnp.stack([first, last], -1), 0.0)
+    return LaneCurveTargets(columns, rows, point_valid, extent, valid)
+
+
+def lane_weights(targets: LaneCurveTargets, counted: Bool[Array, "*b l"]) -> Float[Array, "*b l"]:
+    """Return the weight of each lane of a batch: short lanes weigh more.
+
+    w_l = sqrt(N / N_l) / max_i sqrt(N / N_i) = sqrt(min_i N_i / N_l), over the counted lanes of the whole batch.
+    """
+    points = targets.point_valid.sum(-1).astype(jnp.float32)
+    least = jnp.where(counted, points, jnp.inf).min()
+    return jnp.sqrt(jnp.where(counted, least / jnp.maximum(points, 1.0), 0.0))
+
+
+def curve_errors(
+    curves: Float[Array, "*layers q 8"], targets: LaneCurveTargets, least_depth: float
+) -> Float[Array, "*layers q l"]:
+    """Return the sum over points of |u(v) - column| of every curve to every lane of one example."""
+    # Rows without a point stand at 1, far from any horizon.
+    rows = jnp.where(targets.point_valid, targets.rows, 1.0)
+    lead = curves.shape[:-1]
+    columns = curve_columns(_shape(curves), rows.reshape(*(1,) * len(lead), -1), least_depth)
+    errors = jnp.abs(columns.reshape(*lead, *rows.shape) - _lead(targets.columns, len(lead)))
+    return jnp.where(_lead(targets.point_valid, len(lead)), errors, 0.0).sum(-1)
+
+
+def cell_loss(logits: Float[Array, "h w"], targets: LaneCurveTargets) -> Float[Array, ""]:
+    """Return the mean cross-entropy of one example's cells: does a point of a lane line lie in each?"""
+    height, width = logits.shape
+    inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1) & (targets.rows < 1)
+    # Index `height` lies outside, so other points write nowhere.
+    row = jnp.where(inside, (targets.rows * height).astype(jnp.int32), height)
+    column = jnp.where(inside, (targets.columns * width).astype(jnp.int32), 0)
+    taken = jnp.zeros((height, width)).at[row, column].set(1.0, mode="drop")
+    return optax.sigmoid_binary_cross_entropy(logits, taken).mean()
+
+
+def matching_cost(
+    prediction: LaneCurvePrediction,
+    targets: LaneCurveTargets,
+    weights: Float[Array, " l"],
+    config: LaneCurveLossConfig,
+) -> Float[Array, "layers q l"]:
+    """Return d(l, h) of Eq. (3) for one example: the cost of giving each lane to each query."""
+    is_lane = jax.nn.softmax(prediction.logits)[..., 1:]
+    fit = _lead(weights, 2) * curve_errors(prediction.curves, targets, config.least_depth)
+    extent = jnp.abs(prediction.curves[..., None, :2] - _lead(targets.extent, 2)).sum(-1)
+    return -config.class_weight * is_lane + config.curve_weight * fit + config.extent_weight * extent
+
+
+def lane_curve_loss(
+    prediction: LaneCurvePrediction, targets: LaneCurveTargets, config: LaneCurveLossConfig
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Return the loss of a batch, Eq. (4) summed over decoder layers, and its terms.
+
+    Args:
+        prediction: outputs of every decoder layer, leading axes (batch, layer).
+        targets: leading axis batch.
+        config: weights.
+
+    Returns:
+        The total, and the weighted terms of the last layer: `class`, `curve`, `extent`, beside `matching/lanes`, the
+        mean number of matched lanes.
+    """
+    every = lane_weights(targets, targets.valid)
+    cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, every)
+    assignment = match(cost, targets.valid[:, None], config.matcher)  # z of Eq. (3), (B, D, L): one host call
+    # Weights of a layer count the lanes that it matched.
+    weights = jax.vmap(lambda matched: lane_weights(targets, matched), in_axes=1, out_axes=1)(assignment.matched)
+    per_layer = jax.vmap(jax.vmap(lambda p, a, w, t: _terms(p, a, w, t, config), in_axes=(0, 0, 0, None)))
+    classes, curves, extents = per_layer(prediction, assignment, weights, targets)  # each (B, D)
+
+    lanes = jnp.maximum(targets.valid.sum().astype(jnp.float32), 1.0)
+    terms = {
+        "class": config.class_weight * classes.mean(0),
+        "curve": config.curve_weight * curves.sum(0) / lanes,
+        "extent": config.extent_weight * extents.sum(0) / lanes,
+    }
+    total = jnp.stack(list(terms.values())).sum()
+    report = {name: value[-1] for name, value in terms.items()}
+    report["matching/lanes"] = assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()
+    return total, report
+
+
+def _terms(
+    prediction: LaneCurvePrediction,
+    assignment: Assignment,
+    weights: Float[Array, " l"],
+    targets: LaneCurveTargets,
+    config: LaneCurveLossConfig,
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Return mean class loss, sum of curve errors and sum of extent errors of one layer of one example."""
+    queries = prediction.logits.shape[0]
+    # Index `queries` lies outside, so unmatched targets write nowhere.
+    query = jnp.where(assignment.matched, assignment.query, queries)
+    label = jnp.zeros(queries, jnp.int32).at[query].set(1, mode="drop")
+    classes = optax.softmax_cross_entropy_with_integer_labels(prediction.logits, label).mean()
+
+    chosen = prediction.curves[assignment.query]  # (L, 8)
+    rows = jnp.where(targets.point_valid, targets.rows, 1.0)
+    errors = jnp.abs(curve_columns(_shape(chosen), rows, config.least_depth) - targets.columns)
+    curve = jnp.where(targets.point_valid & assignment.matched[:, None], errors, 0.0).sum(-1)
+    extent = jnp.abs(chosen[:, :2] - targets.extent).sum(-1)
+    return classes, (weights * curve).sum(), jnp.where(assignment.matched, extent, 0.0).sum()
+
+
+def _shape(curves: Float[Array, "*b 8"]) -> Float[Array, "*b 6"]:
+    """Return k'', f'', m'', n', b'', b''' of g_t, Eq. (8); its first two are alpha and beta."""
+    return curves[..., 2:]
+
+
+def _lead(x, axes):
+    """Return x with `axes` new leading axes."""
+    return x.reshape((1,) * axes + x.shape)

@@ -1,0 +1,39 @@
+"""The vocabulary that every package shares: what is around the vehicle at one moment, as fixed-size arrays.
+
+One `Example` holds one frame of one scene in the **ego frame** (x forward, y left, z up; metres, radians).
+Containers are pytrees without a batch axis; callers `vmap`. Every padded array has a bool `valid` beside it, and
+`valid` is the only truth: padding content is arbitrary (NaN included) and must never reach an output.
+Arrays are numpy on the host and jax on the device; dtype float32, bool and int32 unless a docstring says otherwise.
+
+Host-side recordings in global coordinates (maps, poses, tracks) are in `tflane_jax.scene.logs`.
+"""
+
+from tflane_jax.scene.example import Example, RoadImage, shapes_of, stack_examples
+from tflane_jax.scene.prediction import ElementPrediction, LaneCurvePrediction, LanePrediction, Prediction
+from tflane_jax.scene.priors import MarkerObservations, RoadUser, SdCategory, SdMap, TrafficFlow
+from tflane_jax.scene.truth import Areas, AreaType, LaneGraph, LaneLines, LineType, TrafficElements
+from tflane_jax.scene.views import BevChannel, CameraViews
+
+__all__ = [
+    "AreaType",
+    "Areas",
+    "BevChannel",
+    "CameraViews",
+    "ElementPrediction",
+    "Example",
+    "LaneCurvePrediction",
+    "LaneGraph",
+    "LaneLines",
+    "LanePrediction",
+    "LineType",
+    "MarkerObservations",
+    "Prediction",
+    "RoadImage",
+    "RoadUser",
+    "SdCategory",
+    "SdMap",
+    "TrafficElements",
+    "TrafficFlow",
+    "shapes_of",
+    "stack_examples",
+]

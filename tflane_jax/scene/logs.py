@@ -1,0 +1,177 @@
+"""What a drive recorded: a vector map, ego poses and tracks, on the host, in numpy.
+
+A `Log` is what the built-in world simulates and what the Argoverse 2 reader reads; `tflane_jax.datasets.examples` turns
+one moment of it into an `Example`. Global coordinates (city frame) stay float64 here; nothing on this floor is padded
+except tracks, which carry `valid`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tflane_jax.scene.marker_patterns import MarkerFamily
+
+
+@dataclass(frozen=True)
+class LaneSegment:
+    """One stretch of lane with constant markings and neighbours (an Argoverse 2 lane segment).
+
+    Attributes:
+        id: unique in its map.
+        centerline, left, right: (n, 3) float64 global metres, in driving direction; n may differ among the three.
+        left_type, right_type: `scene.LineType`.
+        is_intersection: inside an intersection.
+        successors: ids of the segments that continue this one.
+        vehicle: open to motor vehicles (False for bike lanes).
+    """
+
+    id: int
+    centerline: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    left_type: int
+    right_type: int
+    is_intersection: bool
+    successors: tuple[int, ...]
+    vehicle: bool = True
+
+
+@dataclass(frozen=True)
+class MapElement:
+    """A traffic light or sign.
+
+    Attributes:
+        position: (3,) centre, global metres.
+        yaw: direction that it faces, global radians.
+        category: 1 traffic light, 2 road sign.
+        attribute: OpenLane-V2 attribute; for a light this is the state at the start.
+        lanes: ids of the lane segments that it governs.
+    """
+
+    position: np.ndarray
+    yaw: float
+    category: int
+    attribute: int
+    lanes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class VectorMap:
+    """Static map in global metres, float64.
+
+    Attributes:
+        segments: lane segments by id.
+        crossings: closed rings (n, 3), first point repeated at the end.
+        road_boundaries: polylines (n, 3); a closed ring repeats its first point.
+        elements: traffic lights and signs.
+        buildings: (B, 5) x, y, length, width, yaw of opaque blocks beside the road, unlimited in height.
+        roads: one line (n, 3) in the middle of each road, of sources that know roads; a closed one repeats its first
+            point.
+    """
+
+    segments: dict[int, LaneSegment]
+    crossings: tuple[np.ndarray, ...] = ()
+    road_boundaries: tuple[np.ndarray, ...] = ()
+    elements: tuple[MapElement, ...] = ()
+    buildings: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
+    roads: tuple[np.ndarray, ...] = ()
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Boxes of K road users over F frames; **each frame's boxes in the ego frame of that frame**.
+
+    Attributes:
+        position: (F, K, 3) box centres, metres.
+        yaw: (F, K) radians.
+        size: (K, 3) length, width, height, metres.
+        category: (K,) `scene.RoadUser`.
+        occluded: (F, K) reported without being seen.
+        valid: (F, K).
+        uuid: (K,) str, the source's name of the track.
+    """
+
+    position: np.ndarray
+    yaw: np.ndarray
+    size: np.ndarray
+    category: np.ndarray
+    occluded: np.ndarray
+    valid: np.ndarray
+    uuid: np.ndarray
+
+    @property
+    def frames(self) -> int:
+        """Number of frames F."""
+        return self.valid.shape[0]
+
+
+@dataclass(frozen=True)
+class KeyFrame:
+    """A moment at which an example is made.
+
+    Attributes:
+        timestamp_ns: the moment.
+        global_from_ego: (4, 4) float64 pose at that moment.
+        track_frame: index into the log's track frames of the frame that belongs to this moment; the history is what
+            lies strictly before it.
+    """
+
+    timestamp_ns: int
+    global_from_ego: np.ndarray
+    track_frame: int
+
+
+@dataclass(frozen=True)
+class PlacedMarkers:
+    """Fiducial markers that stand beside the road; `tflane_jax.markers` says what the frame of a marker is.
+
+    Attributes:
+        marker_id: (M,) int32, unique within a log.
+        pose: (M, 4, 4) float64 global_from_marker, metres.
+        size: side of the black square, metres.
+        family: dictionary of the printed patterns.
+    """
+
+    marker_id: np.ndarray
+    pose: np.ndarray
+    size: float = 1.0
+    family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
+
+
+@dataclass(frozen=True)
+class Log:
+    """One drive.
+
+    Attributes:
+        name: unique name (log id, or the world's scene number).
+        source: dataset name.
+        map: static map.
+        timestamps_ns: (F,) int64, one for each track frame.
+        global_from_ego: (F, 4, 4) float64, the ego pose of each track frame.
+        tracks: what the tracker reported: the only traffic a prior may see.
+        actors: every box that was really there, for line of sight and the obstacle channel (the same object as `tracks`
+            where a source has no tracker in between).
+        keyframes: moments at which examples are made, in time order.
+        element_attribute: (F, E) attribute of each of the map's elements at each track frame (the state of a light);
+            None where every element keeps its own.
+        weather: 0 (clear) to 1 (worst), dims the evidence.
+        paint_wear: 0 (fresh) to 1 (gone), dims lane paint.
+        seed: root of everything random that is drawn when this log is rendered.
+        markers: fiducial markers beside the road; None where nobody has put any up.
+    """
+
+    name: str
+    source: str
+    map: VectorMap
+    timestamps_ns: np.ndarray
+    global_from_ego: np.ndarray
+    tracks: Tracks
+    actors: Tracks
+    keyframes: tuple[KeyFrame, ...]
+    element_attribute: np.ndarray | None = None
+    weather: float = 0.0
+    paint_wear: float = 0.0
+    seed: int = 0
+    markers: PlacedMarkers | None = None

@@ -1,0 +1,92 @@
+"""Black and white cells of ArUco and AprilTag markers, from OpenCV's dictionaries (extra `images`)."""
+
+from __future__ import annotations
+
+import enum
+import functools
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from tflane_jax.errors import UserError
+from tflane_jax.files.images import opencv
+
+
+class MarkerFamily(enum.Enum):
+    """A dictionary of markers, by OpenCV's name (ArUco: Garrido-Jurado et al. 2014; AprilTag: Olson 2011)."""
+
+    ARUCO_4X4_50 = "DICT_4X4_50"
+    ARUCO_4X4_100 = "DICT_4X4_100"
+    ARUCO_4X4_1000 = "DICT_4X4_1000"
+    ARUCO_5X5_100 = "DICT_5X5_100"
+    ARUCO_5X5_1000 = "DICT_5X5_1000"
+    ARUCO_6X6_250 = "DICT_6X6_250"
+    ARUCO_6X6_1000 = "DICT_6X6_1000"
+    ARUCO_7X7_1000 = "DICT_7X7_1000"
+    ARUCO_ORIGINAL = "DICT_ARUCO_ORIGINAL"
+    ARUCO_MIP_36H12 = "DICT_ARUCO_MIP_36h12"
+    APRILTAG_16H5 = "DICT_APRILTAG_16h5"
+    APRILTAG_25H9 = "DICT_APRILTAG_25h9"
+    APRILTAG_36H10 = "DICT_APRILTAG_36h10"
+    APRILTAG_36H11 = "DICT_APRILTAG_36h11"
+
+
+# Cells of white around the black square of a printed marker: detectors need one.
+MARGIN = 1
+
+
+@functools.cache
+def dictionary_of(family: MarkerFamily) -> Any:
+    """Return OpenCV's dictionary; raises UserError where OpenCV is missing or built without its aruco module."""
+    cv2 = opencv()
+    if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
+        raise UserError("this OpenCV has no aruco.ArucoDetector: pip install 'opencv-python-headless>=4.10'")
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family.value))
+
+
+def marker_count(family: MarkerFamily) -> int:
+    """Return how many ids a family has; they count from 0."""
+    return len(dictionary_of(family).bytesList)
+
+
+def correctable_bits(family: MarkerFamily) -> int:
+    """Return how many wrong bits of a marker of this family can be put right without doubt about its id."""
+    return int(dictionary_of(family).maxCorrectionBits)
+
+
+def cells_across(family: MarkerFamily) -> int:
+    """Return how many cells the black square has along a side, its border included."""
+    return int(dictionary_of(family).markerSize) + 2
+
+
+def marker_cells(family: MarkerFamily, marker_id: int) -> Bool[np.ndarray, "n n"]:
+    """Return which cells of a marker are white, top row first, with its black border and without a margin.
+
+    The array is remembered: do not write into it. Raises UserError for an id that the family does not have.
+    """
+    return _cells(family, int(marker_id))
+
+
+@functools.lru_cache(maxsize=1024)
+def _cells(family: MarkerFamily, marker_id: int) -> Bool[np.ndarray, "n n"]:
+    count = marker_count(family)
+    if not 0 <= marker_id < count:
+        raise UserError(
+            f"marker family {family.name} has the ids 0 to {count - 1}, not {marker_id}: choose one of these, or a "
+            "larger family"
+        )
+    cells = opencv().aruco.generateImageMarker(dictionary_of(family), marker_id, cells_across(family)) > 127
+    cells.flags.writeable = False
+    return cells
+
+
+def board_cells(family: MarkerFamily, marker_id: int) -> Bool[np.ndarray, "m m"]:
+    """Return the cells of a printed marker: those of `marker_cells` in a white margin of `MARGIN` cells."""
+    return np.pad(marker_cells(family, marker_id), MARGIN, constant_values=True)
+
+
+def board_size(family: MarkerFamily, size: float) -> float:
+    """Return the side of a printed marker with its margin, metres, where its black square has the side `size`."""
+    across = cells_across(family)
+    return size * (across + 2 * MARGIN) / across

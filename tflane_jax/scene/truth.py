@@ -1,0 +1,169 @@
+"""What is true around the vehicle, or in one image: lanes, areas, traffic elements, lane lines."""
+
+from __future__ import annotations
+
+import enum
+
+import chex
+import numpy as np
+from flax import struct
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.scene.arrays import Array
+
+
+class LineType(enum.IntEnum):
+    """Marking of a lane boundary, as OpenLane-V2 numbers it."""
+
+    NONE = 0
+    SOLID = 1
+    DASHED = 2
+
+
+class AreaType(enum.IntEnum):
+    """Category of an area, as OpenLane-V2 numbers it."""
+
+    PEDESTRIAN_CROSSING = 1
+    ROAD_BOUNDARY = 2
+
+
+@struct.dataclass
+class LaneGraph:
+    """Directed lane graph: N lanes of P points.
+
+    The same container serves both OpenLane-V2 flavours: merged centerlines and lane segments.
+
+    Attributes:
+        points: (N, P, 3) centerline in driving direction, metres.
+        left, right: (N, P, 3) boundaries in driving direction, metres.
+        left_type, right_type: (N,) `LineType`.
+        is_connector: (N,) lane inside an intersection.
+        visibility: (N,) share of the centerline in direct line of sight, 0 to 1.
+        successor: (N, N) [i, j] true where the end of lane i is the start of lane j.
+        valid: (N,).
+    """
+
+    points: Float[Array, "n p 3"]
+    left: Float[Array, "n p 3"]
+    right: Float[Array, "n p 3"]
+    left_type: Int[Array, " n"]
+    right_type: Int[Array, " n"]
+    is_connector: Bool[Array, " n"]
+    visibility: Float[Array, " n"]
+    successor: Bool[Array, "n n"]
+    valid: Bool[Array, " n"]
+
+    @classmethod
+    def empty(cls, capacity: int, points: int) -> LaneGraph:
+        """Return a graph with room for `capacity` lanes of `points` points and none valid."""
+        line = np.zeros((capacity, points, 3), np.float32)
+        label = np.zeros(capacity, np.int32)
+        flag = np.zeros(capacity, bool)
+        return cls(
+            points=line, left=line.copy(), right=line.copy(),
+            left_type=label, right_type=label.copy(),
+            is_connector=flag, visibility=np.zeros(capacity, np.float32),
+            successor=np.zeros((capacity, capacity), bool), valid=flag.copy(),
+        )  # fmt: skip
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        n, p = self.points.shape[:2]
+        chex.assert_shape([self.points, self.left, self.right], (n, p, 3))
+        chex.assert_shape([self.left_type, self.right_type, self.is_connector, self.visibility], (n,))
+        chex.assert_shape(self.successor, (n, n))
+        chex.assert_shape(self.valid, (n,))
+
+
+@struct.dataclass
+class Areas:
+    """Pedestrian crossings (closed rings) and road boundaries.
+
+    Attributes:
+        points: (A, P, 3) metres; a closed ring repeats its first point at the end.
+        category: (A,) `AreaType`.
+        valid: (A,).
+    """
+
+    points: Float[Array, "a p 3"]
+    category: Int[Array, " a"]
+    valid: Bool[Array, " a"]
+
+    @classmethod
+    def empty(cls, capacity: int, points: int) -> Areas:
+        """Return a set with room for `capacity` areas and none valid."""
+        return cls(np.zeros((capacity, points, 3), np.float32), np.zeros(capacity, np.int32), np.zeros(capacity, bool))
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        a, p = self.points.shape[:2]
+        chex.assert_shape(self.points, (a, p, 3))
+        chex.assert_shape([self.category, self.valid], (a,))
+
+
+@struct.dataclass
+class TrafficElements:
+    """Traffic lights and signs.
+
+    Attributes:
+        position: (E, 3) centre in the ego frame, metres.
+        box: (E, 2, 2) top-left and bottom-right pixel corners in the front image; zeros where there is no image.
+        category: (E,) 1 traffic light, 2 road sign.
+        attribute: (E,) OpenLane-V2 attribute 0 to 12.
+        lane: (N, E) element e governs lane n of the merged centerlines.
+        valid: (E,).
+    """
+
+    position: Float[Array, "e 3"]
+    box: Float[Array, "e 2 2"]
+    category: Int[Array, " e"]
+    attribute: Int[Array, " e"]
+    lane: Bool[Array, "n e"]
+    valid: Bool[Array, " e"]
+
+    @classmethod
+    def empty(cls, capacity: int, lanes: int) -> TrafficElements:
+        """Return a set with room for `capacity` elements and none valid."""
+        label = np.zeros(capacity, np.int32)
+        return cls(
+            position=np.zeros((capacity, 3), np.float32), box=np.zeros((capacity, 2, 2), np.float32),
+            category=label, attribute=label.copy(), lane=np.zeros((lanes, capacity), bool),
+            valid=np.zeros(capacity, bool),
+        )  # fmt: skip
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        e = self.valid.shape[0]
+        chex.assert_shape(self.position, (e, 3))
+        chex.assert_shape(self.box, (e, 2, 2))
+        chex.assert_shape([self.category, self.attribute, self.valid], (e,))
+        chex.assert_shape(self.lane, (None, e))
+
+
+@struct.dataclass
+class LaneLines:
+    """Lane lines in one front-view image: L lines of up to P points, from the horizon down.
+
+    Attributes:
+        points: (L, P, 2) column u and row v as shares of the image's width and height, v ascending.
+        point_valid: (L, P) the line has this point; what stands at the others is arbitrary.
+        valid: (L,).
+    """
+
+    points: Float[Array, "l p 2"]
+    point_valid: Bool[Array, "l p"]
+    valid: Bool[Array, " l"]
+
+    @classmethod
+    def empty(cls, capacity: int, points: int) -> LaneLines:
+        """Return a set with room for `capacity` lines of `points` points and none valid."""
+        return cls(
+            np.zeros((capacity, points, 2), np.float32), np.zeros((capacity, points), bool), np.zeros(capacity, bool)
+        )
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        l, p = self.points.shape[:2]
+        chex.assert_shape(self.points, (l, p, 2))
+        chex.assert_shape(self.point_valid, (l, p))
+        chex.assert_shape(self.valid, (l,))

@@ -1,0 +1,51 @@
+"""What the sensors deliver in one frame: the bird's-eye-view raster and calibrated camera images."""
+
+from __future__ import annotations
+
+import enum
+
+import chex
+from flax import struct
+from jaxtyping import Bool, Float, Int, UInt8
+
+from tflane_jax.scene.arrays import Array
+
+
+class BevChannel(enum.IntEnum):
+    """Channels of the bird's-eye-view evidence raster (`Example.bev`)."""
+
+    LANE_PAINT = 0
+    ROAD_EDGE = 1
+    CROSSING = 2
+    OBSTACLE = 3
+
+
+@struct.dataclass
+class CameraViews:
+    """What V calibrated pinhole cameras see in one frame.
+
+    Camera 0 looks ahead, and traffic elements are labelled in its image.
+    All images have one size; a smaller one lies in the top-left corner of its array and the rest is padding.
+
+    Attributes:
+        image: (V, H, W, 3) uint8, RGB, without lens distortion.
+        size: (V, 2) width and height of each image, pixels.
+        intrinsics: (V, 3, 3), pixels from the top-left corner of the image (see `geometry.cameras`).
+        camera_from_ego: (V, 4, 4).
+        valid: (V,) the camera delivered an image.
+    """
+
+    image: UInt8[Array, "v h w 3"]
+    size: Int[Array, "v 2"]
+    intrinsics: Float[Array, "v 3 3"]
+    camera_from_ego: Float[Array, "v 4 4"]
+    valid: Bool[Array, " v"]
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        v, h, w = self.image.shape[:3]
+        chex.assert_shape(self.image, (v, h, w, 3))
+        chex.assert_shape(self.size, (v, 2))
+        chex.assert_shape(self.intrinsics, (v, 3, 3))
+        chex.assert_shape(self.camera_from_ego, (v, 4, 4))
+        chex.assert_shape(self.valid, (v,))

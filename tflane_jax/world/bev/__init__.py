@@ -1,0 +1,1 @@
+"""The bird's-eye-view evidence sensor and its line of sight."""

@@ -1,0 +1,153 @@
+"""Rings of calibrated cameras on the vehicle, as Argoverse 2 and nuScenes carry them.
+
+The mounts state rounded, typical measures of the two vehicles; every scene has a vehicle of its own, whose calibration
+differs from them a little.
+"""
+
+from __future__ import annotations
+
+import functools
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.errors import UserError
+from tflane_jax.world.render.camera import FrontCamera, camera_pose
+from tflane_jax.world.render.weather import FrontWeatherConfig
+
+ROOT = 20_251_121
+# Standard deviations at `jitter` 1: focal length and principal point (shares of the focal length), place (metres),
+# angles (degrees).
+_FOCAL, _CENTRE, _PLACE, _ANGLE = 0.003, 0.004, 0.01, 0.35
+# Images smaller than this share of the native ones are drawn twice as large and averaged.
+_SMALL = 0.35
+
+
+@dataclass(frozen=True)
+class CameraMount:
+    """One camera of a ring.
+
+    Attributes:
+        name: as the dataset calls it.
+        x, y, z: place in the ego frame, metres.
+        yaw: of the optical axis, to the left of ahead, degrees.
+        pitch: of the optical axis, downwards, degrees.
+        focal: pixels of the native image.
+        width, height: of the native image, pixels.
+    """
+
+    name: str
+    x: float
+    y: float
+    z: float
+    yaw: float
+    pitch: float
+    focal: float
+    width: int
+    height: int
+
+
+ARGOVERSE2_RING = (
+    CameraMount("ring_front_center", 1.64, 0.0, 1.40, 0.0, 0.0, 1776.0, 1550, 2048),
+    CameraMount("ring_front_left", 1.55, 0.20, 1.40, 45.0, 2.8, 1688.0, 2048, 1550),
+    CameraMount("ring_front_right", 1.55, -0.20, 1.40, -45.0, 2.8, 1688.0, 2048, 1550),
+    CameraMount("ring_rear_left", 1.10, 0.13, 1.42, 153.0, 0.0, 1686.0, 2048, 1550),
+    CameraMount("ring_rear_right", 1.10, -0.13, 1.42, -153.0, 0.0, 1686.0, 2048, 1550),
+    CameraMount("ring_side_left", 1.31, 0.28, 1.40, 99.0, 2.8, 1687.0, 2048, 1550),
+    CameraMount("ring_side_right", 1.31, -0.28, 1.40, -99.0, 2.8, 1687.0, 2048, 1550),
+)
+NUSCENES_RING = (
+    CameraMount("CAM_FRONT", 1.70, 0.0, 1.51, 0.0, 0.3, 1266.0, 1600, 900),
+    CameraMount("CAM_FRONT_RIGHT", 1.55, -0.49, 1.50, -56.0, 0.5, 1261.0, 1600, 900),
+    CameraMount("CAM_FRONT_LEFT", 1.52, 0.49, 1.51, 55.5, 0.2, 1267.0, 1600, 900),
+    CameraMount("CAM_BACK", 0.03, 0.0, 1.58, 180.0, -0.5, 809.0, 1600, 900),
+    CameraMount("CAM_BACK_LEFT", 1.04, 0.48, 1.58, 109.0, 0.9, 1257.0, 1600, 900),
+    CameraMount("CAM_BACK_RIGHT", 1.02, -0.48, 1.56, -110.5, 0.9, 1260.0, 1600, 900),
+)
+
+
+@dataclass(frozen=True)
+class CameraRigConfig:
+    """A ring of cameras and how its images are drawn.
+
+    Attributes:
+        cameras: the first looks ahead, and traffic elements are labelled in its image.
+        scale: of the images, 1 is native.
+        multiple: widths and heights are rounded up to multiples of this; what is added shows more to the right and
+            further down.
+        jitter: scales how far a scene's calibration lies from the mounts (1: a third of a degree, a centimetre).
+        severity: scales the log's own weather and paint wear; 0 gives a clear day, fresh paint and a perfect camera.
+        weather: kinds of weather, and what the camera does to its picture.
+        element_pixels: a light or sign lower than this in the native image is not part of the truth.
+        markers: draw the scene's fiducial markers, which may hide what stands behind their boards.
+    """
+
+    cameras: tuple[CameraMount, ...] = NUSCENES_RING
+    scale: float = 0.1
+    multiple: int = 1
+    jitter: float = 1.0
+    severity: float = 1.0
+    weather: FrontWeatherConfig = FrontWeatherConfig()
+    element_pixels: float = 8.0
+    markers: bool = False
+
+    @property
+    def supersample(self) -> int:
+        """How many times larger than the image it is drawn, before areas are averaged."""
+        return 2 if self.scale < _SMALL else 1
+
+    def size(self, mount: CameraMount) -> tuple[int, int]:
+        """Return width and height of a camera's image, pixels."""
+        width, height = (
+            -(-round(side * self.scale) // self.multiple) * self.multiple for side in (mount.width, mount.height)
+        )
+        return width, height
+
+    def validate(self) -> None:
+        """Raise UserError where no images can be made of it."""
+        if not self.cameras:
+            raise UserError("a camera rig needs at least one camera: give CameraRigConfig.cameras")
+        if not 0.0 <= self.severity <= 1.0:
+            raise UserError(f"CameraRigConfig.severity must be between 0 and 1, not {self.severity}")
+        if self.multiple < 1 or min(min(self.size(mount)) for mount in self.cameras) < 8:
+            raise UserError(
+                f"CameraRigConfig.scale = {self.scale} with multiple = {self.multiple} leaves less than 8 pixels of an "
+                "image: raise scale, and multiple to at least 1"
+            )
+
+
+@functools.lru_cache(maxsize=16)
+def draw_rig(seed: int, config: CameraRigConfig) -> tuple[FrontCamera, ...]:
+    """Return the calibrated cameras of a scene, one for each mount.
+
+    A camera depends on the seed, its own mount and the image size alone, whatever other cameras there are.
+    """
+    config.validate()
+    return tuple(_draw_camera(seed, mount, config) for mount in config.cameras)
+
+
+def camera_stream(seed: int, mount: CameraMount, *more: int) -> np.random.Generator:
+    """Return the stream of what is drawn for one camera of a scene."""
+    return np.random.default_rng([ROOT, seed, zlib.crc32(mount.name.encode()), *more])
+
+
+def _draw_camera(seed: int, mount: CameraMount, config: CameraRigConfig) -> FrontCamera:
+    focal, u, v, dx, dy, dz, yaw, pitch, roll = config.jitter * camera_stream(seed, mount).standard_normal(9)
+    angles = np.deg2rad([mount.yaw + _ANGLE * yaw, mount.pitch + _ANGLE * pitch, _ANGLE * roll])
+    pose = camera_pose(0.0, angles[1], angles[0], angles[2])
+    pose[:3, 3] = -pose[:3, :3] @ (np.array([mount.x, mount.y, mount.z]) + _PLACE * np.array([dx, dy, dz]))
+    scale = [round(mount.width * config.scale) / mount.width, round(mount.height * config.scale) / mount.height]
+    centre = 0.5 * np.array([mount.width, mount.height]) + _CENTRE * mount.focal * np.array([u, v])
+    length = mount.focal * (1.0 + _FOCAL * focal)
+    native = np.array([[length, 0.0, centre[0]], [0.0, length, centre[1]], [0.0, 0.0, 1.0]])
+    return FrontCamera(*config.size(mount), np.diag([*scale, 1.0]) @ native, pose)
+
+
+def enlarged(camera: FrontCamera, factor: int) -> FrontCamera:
+    """Return the camera with `factor` times as many pixels along both sides."""
+    if factor == 1:
+        return camera
+    scale: Float[np.ndarray, "3 3"] = np.diag([float(factor), float(factor), 1.0])
+    return FrontCamera(factor * camera.width, factor * camera.height, scale @ camera.intrinsics, camera.camera_from_ego)

@@ -1,0 +1,149 @@
+"""What does not move in a log, drawn once for all its key frames: weather, paint, ground, scenery, sky, shadows."""
+
+from __future__ import annotations
+
+import enum
+import weakref
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tflane_jax.scene.logs import Log
+from tflane_jax.world.cameras.elements import mast_bodies
+from tflane_jax.world.cameras.ground import Ground, draw_ground
+from tflane_jax.world.cameras.ground_window import window_around
+from tflane_jax.world.cameras.light import cast, draw_panorama, log_weather
+from tflane_jax.world.cameras.markers import marker_bodies
+from tflane_jax.world.cameras.paint import Paint, paint_of
+from tflane_jax.world.cameras.ring import ROOT, CameraRigConfig
+from tflane_jax.world.cameras.scenery import Scenery, draw_scenery
+from tflane_jax.world.cameras.solids import Bodies, footprints, join
+from tflane_jax.world.render.polygons import SHIFT
+from tflane_jax.world.render.weather import Weather
+
+# The ground is drawn to this distance from the key frames, with texels of this size; light on it with coarser ones;
+# metres.
+_REACH, _TEXEL = 90.0, 0.08
+SHADE_TEXEL = 0.25
+# Above this scale images show more of the sky than small ones do, and of the ground near the vehicle.
+LARGE = 0.25
+_MOST_WORN = 0.88
+
+
+class Stream(enum.IntEnum):
+    """What is drawn from which stream of a log."""
+
+    WEATHER = 0
+    PAINT = 1
+    GROUND = 2
+    SCENERY = 3
+    SKY = 4
+    LOOKS = 5
+    PICTURE = 6
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What does not move in a log.
+
+    Attributes:
+        weather: with its sun in the global frame.
+        paint, scenery: of the map.
+        static: scenery, masts and fiducial markers, global frame.
+        panorama: of the sky.
+        shade: (h, w) uint8 share of sunlight that buildings and trees let pass, and `lamps` the light of street lamps;
+            both with texels of `SHADE_TEXEL` from `low`.
+        looks: (K, 8) what tells road users apart.
+        ground: of the surroundings of all key frames.
+        users: bodies of road users that were needed so far.
+    """
+
+    weather: Weather
+    paint: Paint
+    scenery: Scenery
+    static: Bodies
+    panorama: UInt8[np.ndarray, "p q 3"]
+    low: Float[np.ndarray, "2"]
+    shade: UInt8[np.ndarray, "h w"]
+    lamps: UInt8[np.ndarray, "h w"] | None
+    looks: Float[np.ndarray, "k 8"]
+    ground: Ground
+    users: dict[tuple[int, int], Bodies] = field(default_factory=dict)
+
+
+_STAGES: dict[tuple[int, CameraRigConfig], Stage] = {}
+
+
+def stage_of(log: Log, config: CameraRigConfig) -> Stage:
+    """Return what does not move in a log, remembered for as long as the log lives."""
+    # Cameras and their calibration do not change the world.
+    key = id(log), replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0)
+    if key not in _STAGES:
+        _STAGES[key] = _set_stage(log, config)
+        weakref.finalize(log, _STAGES.pop, key)
+    return _STAGES[key]
+
+
+def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
+    weather = log_weather(
+        log_stream(log, Stream.WEATHER), config.weather, weather=log.weather, severity=config.severity
+    )
+    # However worn, some paint is left in the pores of the asphalt.
+    wear = min(log.paint_wear * config.severity, 1.0) * _MOST_WORN
+    paint = paint_of(log_stream(log, Stream.PAINT), log.map, paint_wear=wear, log_seed=log.seed)
+    scenery = draw_scenery(log_stream(log, Stream.SCENERY), log.map, weather.night)
+    places = np.stack([keyframe.global_from_ego[:2, 3] for keyframe in log.keyframes])
+    ground = draw_ground(
+        log_stream(log, Stream.GROUND), log.map, paint, window_around(places, _REACH, _TEXEL),
+        dirt=weather.dirt, wet=weather.rain, urban=scenery.urban,
+    )  # fmt: skip
+    low, shade, lamps = _static_light(places, scenery, weather)
+    masts = mast_bodies(log.map.elements, log.map.road_boundaries)
+    return Stage(
+        weather=weather,
+        paint=paint,
+        scenery=scenery,
+        static=join([scenery.bodies, masts, marker_bodies(log.markers if config.markers else None)]),
+        panorama=draw_panorama(log_stream(log, Stream.SKY), weather, 3072 if config.scale > LARGE else 1024),
+        low=low,
+        shade=shade,
+        lamps=lamps,
+        looks=log_stream(log, Stream.LOOKS).random((len(log.actors.size), 8)),
+        ground=ground,
+    )
+
+
+def log_stream(log: Log, stream: Stream) -> np.random.Generator:
+    return np.random.default_rng([ROOT, log.seed, stream])
+
+
+def _static_light(
+    places: Float[np.ndarray, "n 2"], scenery: Scenery, weather: Weather
+) -> tuple[Float[np.ndarray, "2"], UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None]:
+    """Return the shadows of buildings and trees and the light of street lamps on the ground, as `Stage` keeps them."""
+    import cv2
+
+    window = window_around(places, _REACH, SHADE_TEXEL)
+    shade = np.full((window.rows, window.columns), 255, np.uint8)
+    if weather.direct > 0.1:
+        boxes = np.pad(scenery.towers[:, :5], ((0, 0), (0, 2)))
+        for ring in cast(footprints(boxes), scenery.towers[:, 5], weather.sun):
+            cv2.fillPoly(shade, [window.fixed(ring)], 20, cv2.LINE_8, SHIFT)
+        toward = weather.sun[:2] / max(float(weather.sun[2]), 0.35)
+        angle = np.linspace(0.0, 2.0 * np.pi, 15)[:-1]
+        circle = np.stack([np.cos(angle), np.sin(angle)], -1)
+        for x, y, height, radius in scenery.crowns:
+            ragged = 1.0 + 0.18 * np.sin(5.0 * angle + x)[:, None]
+            stretched = circle + 0.5 * (circle @ toward)[:, None] * toward
+            ring = np.array([x, y]) - toward * height + 0.85 * radius * ragged * stretched
+            cv2.fillPoly(shade, [window.fixed(ring)], 60, cv2.LINE_8, SHIFT)
+        shade = cv2.GaussianBlur(shade, (3, 3), 0)
+    lamps = None
+    if weather.night:
+        lamps = np.zeros_like(shade)
+        for centre in window.fixed(scenery.lamps).tolist():
+            cv2.circle(lamps, centre, round(9.0 / SHADE_TEXEL * (1 << SHIFT)), 130, -1, cv2.LINE_8, SHIFT)
+            cv2.circle(lamps, centre, round(4.5 / SHADE_TEXEL * (1 << SHIFT)), 230, -1, cv2.LINE_8, SHIFT)
+        lamps = cv2.GaussianBlur(lamps, (0, 0), 2.5 / SHADE_TEXEL)
+    return np.array(window.low), shade, lamps

@@ -1,0 +1,1 @@
+"""Front views of a road, for monocular lane shapes."""

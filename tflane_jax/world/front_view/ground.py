@@ -1,0 +1,128 @@
+"""The ground below every pixel: which station and offset of the road it shows, and how large it is there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tflane_jax.world.front_view.road import Highway
+from tflane_jax.world.render.camera import FrontCamera, lift
+from tflane_jax.world.roads.curves import ReferenceLine
+
+# Columns between those in which the road is looked up; offsets are all but linear there.
+_COLUMNS = 16
+# Beyond this distance the ground is not looked up any more, metres.
+FAR = 400.0
+_NEWTON_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The rows of an image below its horizon. Arrays are float32.
+
+    Attributes:
+        first_row: of the image that row 0 of the arrays is.
+        s, offset: (h, w) station and offset of the road at each pixel's centre, metres.
+        depth: (h, w) along the optical axis, metres; `_BEYOND` where a pixel shows no ground.
+        length: (h,) metres of road that a row covers.
+    """
+
+    first_row: int
+    s: Float[np.ndarray, "h w"]
+    offset: Float[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    length: Float[np.ndarray, " h"]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "h w"]:
+        """Where a pixel shows ground."""
+        return self.depth < _BEYOND
+
+
+_BEYOND = 20_000.0
+
+
+def look_at_ground(camera: FrontCamera, axis: ReferenceLine) -> Ground:
+    """Return what ground each pixel shows."""
+    knots = np.arange(0, camera.width + _COLUMNS, _COLUMNS) + 0.5
+    horizon = camera.horizon_rows(np.array([0.0, camera.width])).min()
+    first = int(np.clip(np.floor(horizon), 0, camera.height - 1))
+    rows = np.arange(first, camera.height) + 0.5
+    pixels = np.stack(np.meshgrid(knots, rows), -1)
+    xy, seen = camera.ground_at(pixels.reshape(-1, 2))
+    distance = np.where(seen, np.hypot(xy[:, 0], xy[:, 1]), FAR)
+    # Beyond, the ground keeps its direction and comes nearer, so that all stations are on the axis.
+    s, offset = road_coordinates(axis, xy * np.minimum(1.0, FAR / np.maximum(distance, 1e-9))[:, None])
+    coarse = np.stack([s, offset]).reshape(2, *pixels.shape[:2]).astype(np.float32)
+    length = np.abs(np.gradient(coarse[0, :, len(knots) // 2]))
+    fine = _between_columns(coarse)[..., : camera.width]
+    depth = camera.ground_depth(np.arange(camera.width) + 0.5, rows, _BEYOND)
+    return Ground(first, fine[0], fine[1], depth, np.maximum(length, 1e-3))
+
+
+def _between_columns(coarse: Float[np.ndarray, "c h k"]) -> Float[np.ndarray, "c h w"]:
+    share = (np.arange(_COLUMNS) / _COLUMNS).astype(np.float32)
+    fine = np.diff(coarse, axis=-1)[..., None] * share
+    fine += coarse[..., :-1, None]
+    return fine.reshape(*coarse.shape[:-1], -1)
+
+
+def road_coordinates(
+    axis: ReferenceLine, xy: Float[np.ndarray, "k 2"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Return station and offset (to the right) of ground points, by Newton's method from s = x.
+
+    The axis must be sampled evenly and not turn back on itself.
+    """
+    start, spacing, last = axis.s[0], axis.s[1] - axis.s[0], len(axis.s) - 2
+    table = np.concatenate([axis.xy, axis.heading[:, None]], 1)
+
+    def from_axis(s):
+        """Return how far ahead of station s, and to its right, the points lie."""
+        place = (s - start) / spacing
+        index = np.clip(place.astype(int), 0, last)
+        base = table[index]
+        here = base + (place - index)[:, None] * (table[index + 1] - base)
+        cos, sin = np.cos(here[:, 2]), np.sin(here[:, 2])
+        dx, dy = xy[:, 0] - here[:, 0], xy[:, 1] - here[:, 1]
+        return cos * dx + sin * dy, sin * dx - cos * dy
+
+    s = np.clip(xy[:, 0], axis.s[0], axis.s[-1])
+    for _ in range(_NEWTON_STEPS):
+        s = np.clip(s + from_axis(s)[0], axis.s[0], axis.s[-1])
+    return s, from_axis(s)[1]
+
+
+def image_columns(
+    camera: FrontCamera, road: Highway, offset: Float[np.ndarray, " n"], rows: Float[np.ndarray, " r"], reach: float
+) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
+    """Return where a line along the road crosses image rows: columns, and stations there.
+
+    Args:
+        camera: that looks.
+        road: whose axis the line follows.
+        offset: of the line at the axis' vertices.
+        rows: v, pixels, ascending.
+        reach: the line ends at this station.
+
+    Both are NaN in rows that the line does not reach.
+    """
+    axis = road.axis
+    keep = axis.s <= reach
+    ground = axis.offset(offset)[keep]
+    s = axis.s[keep]
+    if reach < axis.s[-1]:
+        end = road.at(np.array([reach]), np.interp([reach], axis.s, offset))
+        ground, s = np.concatenate([ground, end]), np.append(s, reach)
+    pixels, depth = camera.image_of(lift(ground))
+    seen = depth > 1.0
+    # Farther is higher in the image.
+    u, v, s = pixels[seen, 0][::-1], pixels[seen, 1][::-1], s[seen][::-1]
+    if len(v) < 2:
+        return np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    # Along the road, rows are proportional to inverse distances, so interpolate stations there.
+    inside = (rows >= v[0]) & (rows <= v[-1])
+    columns, stations = np.interp(rows, v, u), np.interp(rows, v, s)
+    return np.where(inside, columns, np.nan), np.where(inside, stations, np.nan)

@@ -1,0 +1,1 @@
+"""The renderer that front views and ring cameras share: camera, polygons, weather."""

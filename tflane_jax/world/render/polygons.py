@@ -1,0 +1,111 @@
+"""Flat-coloured polygons in space, shaded by the weather and drawn into an image from far to near."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.weather import Weather
+
+# cv2 takes corners as multiples of 1/16 pixel.
+SHIFT = 4
+_LIMIT = 8000.0
+# How far the ego's headlights reach, metres.
+HEADLIGHTS = 38.0
+
+
+@dataclass
+class Solid:
+    """Polygons that are drawn together, in the order in which they were added.
+
+    Attributes:
+        distance: from the camera, metres; farther solids are drawn first.
+        corners: (m, 3) each, ego frame, metres; seen from the side on which they run counter-clockwise.
+        colours: display values 0 to 1, one for each.
+        light: 0 lit by the sun, 1 shines by itself, one for each.
+    """
+
+    distance: float = 0.0
+    corners: list[np.ndarray] = field(default_factory=list)
+    colours: list[tuple[float, float, float]] = field(default_factory=list)
+    light: list[float] = field(default_factory=list)
+
+    def add(self, corners: np.ndarray, colour: tuple[float, float, float], light: float = 0.0) -> None:
+        """Add one polygon."""
+        self.corners.append(np.asarray(corners, np.float64))
+        self.colours.append(colour)
+        self.light.append(light)
+
+
+def draw_solids(
+    image: UInt8[np.ndarray, "h w 3"], solids: Sequence[Solid], camera: FrontCamera, weather: Weather
+) -> None:
+    """Draw solids into the image, the farthest first; polygons seen from behind are left out."""
+    import cv2
+
+    ordered = sorted((solid for solid in solids if solid.corners), key=lambda solid: -solid.distance)
+    if not ordered:
+        return
+    corners = [ring for solid in ordered for ring in solid.corners]
+    points = np.concatenate(corners)
+    stops = np.cumsum([len(ring) for ring in corners])
+    starts = np.concatenate([[0], stops[:-1]])
+    # Outward normals from the first three corners.
+    a = points[starts]
+    normal = np.cross(points[starts + 1] - a, points[starts + 2] - a)
+    facing = (([0.0, 0.0, camera.above_ground] - a) * normal).sum(-1) > 0.0
+    pixels, depth = camera.image_of(points)
+    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
+    nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
+    size = [camera.width, camera.height]
+    visible = facing & (((high > 0.0) & (low < size)).all(-1) | (nearest <= NEAR)) & (farthest > NEAR)
+    colours = shade(
+        np.concatenate([solid.colours for solid in ordered]), normal,
+        np.concatenate([solid.light for solid in ordered]), a, weather,
+    ).tolist()  # fmt: skip
+    fixed = fixed_point(pixels)
+    for number in np.flatnonzero(visible):
+        part = slice(starts[number], stops[number])
+        ring = fixed[part]
+        if nearest[number] <= NEAR:
+            ring = fixed_point(camera.image_of(clipped(points[part], depth[part]))[0])
+        cv2.fillPoly(image, [ring], colours[number], cv2.LINE_AA, SHIFT)
+
+
+def fixed_point(pixels: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m 2"]:
+    """Return pixels, counted from the image's corner, as cv2 takes them: from the first pixel's centre, in 1/16."""
+    return np.round((np.clip(pixels, -_LIMIT, _LIMIT) - 0.5) * (1 << SHIFT)).astype(np.int32)
+
+
+def clipped(points: Float[np.ndarray, "m 3"], depth: Float[np.ndarray, " m"]) -> Float[np.ndarray, "k 3"]:
+    """Return the part of a polygon in front of the camera (Sutherland and Hodgman 1974)."""
+    after, depth_after = np.roll(points, -1, 0), np.roll(depth, -1)
+    inside = depth > NEAR
+    crosses = inside != (depth_after > NEAR)
+    share = np.where(crosses, (NEAR - depth) / np.where(crosses, depth_after - depth, 1.0), 0.0)
+    cut = points + share[:, None] * (after - points)
+    both = np.stack([points, cut], 1).reshape(-1, 3)
+    return both[np.stack([inside, crosses], 1).ravel()]
+
+
+def shade(
+    colours: Float[np.ndarray, "k 3"],
+    normal: Float[np.ndarray, "k 3"],
+    light: Float[np.ndarray, " k"],
+    place: Float[np.ndarray, "k 3"],
+    weather: Weather,
+) -> Float[np.ndarray, "k 3"]:
+    """Return display colours 0 to 255 of surfaces in the light and haze of the weather."""
+    unit = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    distance = np.linalg.norm(place[:, :2], axis=-1)
+    sky = 0.8 + 0.2 * unit[:, 2]
+    lit = weather.ambient * sky + 1.1 * weather.direct * np.maximum(unit @ weather.sun, 0.0)
+    lit += weather.night * 0.5 * np.exp(-((distance / HEADLIGHTS) ** 2)) * np.maximum(-unit[:, 0], 0.0)
+    factor = np.where(light > 0.0, np.maximum(light, lit), lit)
+    clear = np.exp(-distance / weather.visibility)[:, None]
+    hazy = colours * factor[:, None] * clear + weather.horizon * (1.0 - clear)
+    return np.round(255.0 * np.clip(hazy, 0.0, 1.0))

@@ -1,0 +1,1 @@
+"""Road networks: layouts, lanes, junctions, signs, and the maps derived from them."""

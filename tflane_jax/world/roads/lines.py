@@ -1,0 +1,49 @@
+"""Roads as single lines, as a road map without lanes has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.world.roads.layout_junctions import JunctionsPlan
+from tflane_jax.world.roads.streets import Street
+
+
+def road_lines(
+    streets: Sequence[Street], plan: JunctionsPlan | None = None
+) -> tuple[Float[np.ndarray, "n 2"], ...]:
+    """Return one line for each street, midway between its kerbs (in the median where it has one), metres.
+
+    Lines of streets that meet at an intersection all end in its middle, and at a roundabout on its lane, which is a
+    closed line of its own behind the others.
+
+    Args:
+        streets: laid out.
+        plan: of the intersections between them, None without any.
+    """
+    lines = []
+    for street in streets:
+        line = 0.5 * (street.forward.kerb_line + street.backward.kerb_line[::-1])
+        if plan is not None:
+            start = [_node(line[0], plan)] if street.plan.stops_at_start else []
+            stop = [_node(line[-1], plan)] if street.plan.stops_at_end else []
+            line = np.stack([*start, *line, *stop])
+        lines.append(line)
+    if plan is not None and plan.ring is not None:
+        angle = np.linspace(0.0, 2 * np.pi, 49)
+        circle = plan.ring[0] * np.stack([np.cos(angle), np.sin(angle)], -1)
+        circle[-1] = circle[0]
+        lines.append(plan.junctions[0].center + circle)
+    return tuple(lines)
+
+
+def _node(end: Float[np.ndarray, "2"], plan: JunctionsPlan) -> Float[np.ndarray, "2"]:
+    """Return the point at which a road that ends here joins the others."""
+    centers = np.stack([junction.center for junction in plan.junctions])
+    center = centers[np.argmin(np.linalg.norm(centers - end, axis=-1))]
+    if plan.ring is None:
+        return center
+    spoke = end - center
+    return center + plan.ring[0] * spoke / np.linalg.norm(spoke)

@@ -1,0 +1,92 @@
+"""Procedural road networks: the static half of the built-in world.
+
+`build_road_network` draws a scene kind, plans its streets (`layout_roads`, `layout_junctions`), lays them out as lane
+segments (`through_roads`, `junction_networks`) and furnishes the roadside. All of it is metres in one global frame
+around the central feature, right-hand traffic, z = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.scene.logs import VectorMap
+from tflane_jax.world.roads import roadside
+from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.roads.intersections import crossing_walk
+from tflane_jax.world.roads.junction_networks import lay_out_junctions
+from tflane_jax.world.roads.lane_network import LaneNetwork
+from tflane_jax.world.roads.layout_junctions import plan_junctions
+from tflane_jax.world.roads.layout_roads import plan_road
+from tflane_jax.world.roads.lines import road_lines
+from tflane_jax.world.roads.through_roads import lay_out_road
+
+__all__ = ["RoadConfig", "RoadNetwork", "SceneKind", "build_road_network"]
+
+_SHORTEST_ROUTE = 120.0
+_JUNCTIONS = (SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS, SceneKind.ROUNDABOUT)
+
+
+@dataclass(frozen=True)
+class RoadNetwork:
+    """A map and the rules of driving and walking on it.
+
+    Attributes:
+        map: lane segments, crossings, road boundaries, traffic elements, buildings.
+        speed_limit: m/s for each segment id.
+        yield_to: segment -> segments whose traffic it must let pass before its own may enter it.
+        signal_phase: connector -> (intersection index, phase index); absent where there are no signals.
+        sidewalks: (n, 2) lines on which pedestrians walk, metres.
+        walk_across: (2, 2) start and end of the walk over each pedestrian crossing, behind the kerbs.
+        parking: (P, 3) x, y, yaw of kerb-side slots for parked vehicles.
+        ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; all that it
+            perceives on the way (+-51.2 m x +-25.6 m) lies inside the map.
+        kind: the central feature.
+    """
+
+    map: VectorMap
+    speed_limit: dict[int, float]
+    yield_to: dict[int, tuple[int, ...]]
+    signal_phase: dict[int, tuple[int, int]]
+    sidewalks: tuple[np.ndarray, ...]
+    walk_across: tuple[np.ndarray, ...]
+    parking: np.ndarray
+    ego_routes: tuple[tuple[int, ...], ...]
+    kind: SceneKind
+
+
+def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetwork:
+    """Draw a road network; the same stream and config give the same bits."""
+    kinds, weights = zip(*config.kinds, strict=True)
+    kind = kinds[rng.choice(len(kinds), p=np.array(weights) / np.sum(weights))]
+    network = LaneNetwork()
+    if kind in _JUNCTIONS:
+        plan = plan_junctions(rng, kind, config)
+        site = lay_out_junctions(rng, plan, network, config)
+    else:
+        plan = None
+        site = lay_out_road(plan_road(rng, kind, config), network, config)
+    density = rng.uniform(0.55, 0.95) if site.urban else rng.uniform(0.0, 0.3)
+    boxes = roadside.buildings(rng, site, config.building_setback, density)
+    return RoadNetwork(
+        map=VectorMap(
+            segments=network.segments(), crossings=_on_plane(site.crossings),
+            road_boundaries=_on_plane([*site.kerbs, *site.islands]), elements=tuple(site.elements),
+            buildings=boxes, roads=_on_plane(road_lines(site.streets, plan)),
+        ),
+        speed_limit={i: d.speed for i, d in network.drafts.items()},
+        yield_to={i: tuple(sorted(others)) for i, others in network.yield_to.items()},
+        signal_phase=dict(network.signal_phase),
+        sidewalks=tuple(roadside.sidewalks(site.kerbs, config.sidewalk)) if site.urban else (),
+        walk_across=tuple(crossing_walk(ring, config.sidewalk) for ring in site.crossings),
+        parking=roadside.parking_slots(site),
+        ego_routes=network.routes(_SHORTEST_ROUTE),
+        kind=kind,
+    )  # fmt: skip
+
+
+def _on_plane(lines: Sequence[Float[np.ndarray, "n 2"]]) -> tuple[np.ndarray, ...]:
+    return tuple(np.pad(line, ((0, 0), (0, 1))) for line in lines)

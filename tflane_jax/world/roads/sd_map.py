@@ -1,0 +1,175 @@
+"""What a navigation map says of the roads around the vehicle: coarse lines, put where the vehicle believes it is.
+
+Three things part an SD map from the truth, each with its own knob: it was drawn with few points (`tolerance`), its
+points were surveyed inexactly (`survey`), and the vehicle reads it at the pose that its GNSS receiver reports
+(`translation`, `yaw_deg`). Lines are cut at the range that the vehicle believes to be around it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import BevGrid, PerceptionRange, clip_to_range, invert_pose, resample_lines, transform_points
+from tflane_jax.geometry.poses import yaw_pose
+from tflane_jax.scene import SdCategory, SdMap
+from tflane_jax.scene.logs import Log
+
+# Streams of a log's seed; `world.bev.sensor` has 1 and 2.
+_SURVEY_STREAM, _GNSS_STREAM = 31, 32
+# Waves of the survey's error, and their typical length, metres: neighbouring roads are off together.
+_WAVES, _WAVE_LENGTH = 16, 120.0
+
+
+@dataclass(frozen=True)
+class SdMapConfig:
+    """Size and faults of an SD map; all faults 0 puts its lines in the middle of the roads.
+
+    Attributes:
+        lines: most lines R; the nearest stay.
+        points: on each line, P, equally spaced (SMERF: 11).
+        range: where lines are cut, ego frame.
+        tolerance: by how much a line with fewer points may miss the road's own, metres.
+        survey: standard deviation of the error of the map's points along each axis, metres. It changes slowly from
+            place to place, so roads that meet still meet.
+        translation: standard deviation of the GNSS receiver's error along each axis, metres.
+        yaw_deg: standard deviation of the error of its heading, degrees.
+        drift_s: time after which error of position and heading are others altogether, seconds: the error is
+            sigma (a cos wt + b sin wt), w = pi / (2 drift_s), with a and b drawn once for each scene.
+        crossings: whether pedestrian crossings are lines of the map.
+    """
+
+    lines: int = 24
+    points: int = 11
+    range: PerceptionRange = BevGrid().range
+    tolerance: float = 1.0
+    survey: float = 1.5
+    translation: float = 0.0
+    yaw_deg: float = 0.0
+    drift_s: float = 30.0
+    crossings: Literal["include", "exclude"] = "include"
+
+
+def make_sd_map(log: Log, keyframe: int, config: SdMapConfig) -> tuple[SdMap, int]:
+    """Return the SD map of a key frame, and how many of its lines found no room (the farthest).
+
+    Seeded by the log: the map is the same in all its frames, only the vehicle's place on it drifts.
+
+    Raises:
+        UserError: the log's map has no roads.
+    """
+    if not log.map.roads:
+        raise UserError(
+            f"{log.source} {log.name} knows lanes but no roads, of which an SD map could be made: leave sd_map of "
+            "ExampleConfig None, or read an SD map with tflane_jax.datasets.geojson"
+        )
+    moment = log.keyframes[keyframe]
+    seconds = (moment.timestamp_ns - int(log.timestamps_ns[0])) * 1e-9
+    rings = log.map.crossings if config.crossings == "include" else ()
+    lines = [simplify(road[:, :2], config.tolerance) for road in log.map.roads]
+    lines += [crossing_line(ring[:, :2]) for ring in rings]
+    sizes = np.cumsum([len(line) for line in lines])[:-1]
+    points = np.concatenate(lines)
+    points = points + config.survey * survey_error(points, log.seed)
+    category = [SdCategory.ROAD] * len(log.map.roads) + [SdCategory.CROSSWALK] * len(rings)
+    error = gnss_error(log.seed, seconds, config)
+    zero = np.zeros(())
+    believed = moment.global_from_ego @ yaw_pose(zero, zero, error[2])
+    believed[:2, 3] += error[:2]
+    points = transform_points(invert_pose(believed), np.pad(points, ((0, 0), (0, 1))))[:, :2]
+    return pack_lines(
+        np.split(points, sizes), category, capacity=config.lines, points=config.points, range_=config.range
+    )
+
+
+def pack_lines(
+    lines: Sequence[Float[np.ndarray, "_ 2"]],
+    category: Sequence[int],
+    *,
+    capacity: int,
+    points: int,
+    range_: PerceptionRange,
+) -> tuple[SdMap, int]:
+    """Return lines cut at a range and resampled as an SD map, and how many pieces found no room (the farthest).
+
+    Args:
+        lines: ego frame, metres, none empty.
+        category: of each, `SdCategory`.
+        capacity: lines R of the map; pieces keep their order.
+        points: P on each, equally spaced.
+        range_: where lines are cut; a line that leaves it and comes back is several pieces.
+    """
+    pieces = [
+        (piece, label)
+        for line, label in zip(lines, category, strict=True)
+        for piece in clip_to_range(line, range_)
+    ]
+    sd_map = SdMap.empty(capacity, points)
+    if not pieces:
+        return sd_map, 0
+    found = resample_lines([piece for piece, _ in pieces], points)
+    distance = np.linalg.norm(found, axis=-1).min(-1)
+    kept = np.sort(np.argsort(distance, kind="stable")[:capacity])
+    n = len(kept)
+    sd_map.points[:n] = found[kept]
+    sd_map.category[:n] = np.array([label for _, label in pieces])[kept]
+    sd_map.valid[:n] = True
+    return sd_map, len(pieces) - n
+
+
+def simplify(points: Float[np.ndarray, "n 2"], tolerance: float) -> Float[np.ndarray, "k 2"]:
+    """Return the vertices of a line that keep all others within `tolerance` metres (Douglas and Peucker 1973).
+
+    Both ends stay; 0 keeps every vertex. A closed line is cut at the vertex farthest from its seam.
+    """
+    if tolerance <= 0.0 or len(points) < 3:
+        return points
+    keep = np.zeros(len(points), bool)
+    keep[[0, -1]] = True
+    spans = [(0, len(points) - 1)]
+    while spans:
+        first, last = spans.pop()
+        if last - first < 2:
+            continue
+        distance = _distance(points[first + 1 : last], points[first], points[last])
+        farthest = first + 1 + int(np.argmax(distance))
+        if distance[farthest - first - 1] > tolerance:
+            keep[farthest] = True
+            spans += [(first, farthest), (farthest, last)]
+    return points[keep]
+
+
+def _distance(
+    points: Float[np.ndarray, "n 2"], start: Float[np.ndarray, "2"], stop: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, " n"]:
+    """Return the distances of points from the segment between two others."""
+    along = stop - start
+    share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+    return np.linalg.norm(points - start - share[:, None] * along, axis=-1)
+
+
+def crossing_line(ring: Float[np.ndarray, "5 2"]) -> Float[np.ndarray, "2 2"]:
+    """Return the way over a pedestrian crossing of the built-in world, from kerb to kerb."""
+    return np.stack([0.5 * (ring[0] + ring[3]), 0.5 * (ring[1] + ring[2])])
+
+
+def survey_error(points: Float[np.ndarray, "n 2"], seed: int) -> Float[np.ndarray, "n 2"]:
+    """Return the error of a map at some places (global, metres): a smooth random field of standard deviation 1."""
+    rng = np.random.default_rng([seed, _SURVEY_STREAM])
+    wave = rng.normal(0.0, 2 * math.pi / _WAVE_LENGTH, (_WAVES, 2))
+    phase, amplitude = rng.uniform(0.0, 2 * math.pi, _WAVES), rng.normal(size=(_WAVES, 2))
+    return math.sqrt(2 / _WAVES) * np.cos(points @ wave.T + phase) @ amplitude
+
+
+def gnss_error(seed: int, seconds: float, config: SdMapConfig) -> Float[np.ndarray, "3"]:
+    """Return what the receiver adds to x and y (global, metres) and heading (radians) at a time of a scene."""
+    first, second = np.random.default_rng([seed, _GNSS_STREAM]).normal(size=(2, 3))
+    turn = 0.5 * math.pi * seconds / config.drift_s
+    sigma = np.array([config.translation, config.translation, math.radians(config.yaw_deg)])
+    return sigma * (first * math.cos(turn) + second * math.sin(turn))

@@ -1,0 +1,1 @@
+"""Road users: demand, driving, signals, and the tracker that observes them."""

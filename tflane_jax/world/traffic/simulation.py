@@ -1,0 +1,195 @@
+"""Simulated traffic: every road user of a scene over time, the ego vehicle among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.scene import RoadUser
+from tflane_jax.world.roads.networks import RoadNetwork
+from tflane_jax.world.traffic.demand import draw_trips
+from tflane_jax.world.traffic.lane_table import LaneTable, build_lane_table
+from tflane_jax.world.traffic.pedestrians import Walkers, crossing_places, draw_crossers, walk_sidewalks
+from tflane_jax.world.traffic.rollout import Rollout
+from tflane_jax.world.traffic.signals import Signals, draw_signals, turn_green
+from tflane_jax.world.traffic.vehicles import draw_drivers
+
+# Traffic settles for so long before the log begins, in steps of so long; the ego vehicle joins near the end, seconds.
+_WARM_UP, _WARM_UP_STEP, _EGO_JOINS = 20.0, 0.4, 3.2
+# Steps while logging are at most this long, seconds; frames in between follow the constant acceleration of the step.
+_LONGEST_STEP = 0.2
+# Places tried for the ego vehicle.
+_EGO_CHOICES = 6
+
+
+@dataclass(frozen=True)
+class TrafficConfig:
+    """How much traffic, and of what kind.
+
+    Attributes:
+        vehicles_per_metre: mean density on a lane in free flow; 0 leaves the ego vehicle alone.
+        category_share: moving motor vehicles by category.
+        bicycles_per_metre: on bike lanes; at the edge of outer lanes half of their share of the traffic.
+        parked_share: of the kerb-side slots.
+        pedestrians_per_metre: on sidewalks.
+        crossers_per_minute: people who cross, for each crossing.
+        ego_top_speed: m/s.
+        green_wave: probability that the first light on the ego vehicle's way turns green about when the log begins.
+        range: distance from the ego vehicle up to which road users are told, metres.
+    """
+
+    vehicles_per_metre: float = 0.032
+    category_share: tuple[tuple[RoadUser, float], ...] = (
+        (RoadUser.CAR, 0.79), (RoadUser.TRUCK, 0.1), (RoadUser.BUS, 0.05), (RoadUser.MOTORCYCLE, 0.06)
+    )  # fmt: skip
+    bicycles_per_metre: float = 0.012
+    parked_share: float = 0.55
+    pedestrians_per_metre: float = 0.015
+    crossers_per_minute: float = 3.0
+    ego_top_speed: float = 14.0
+    green_wave: float = 0.6
+    range: float = 90.0
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """N road users over F frames, global metres and radians.
+
+    Attributes:
+        xy: (F, N, 2) box centres.
+        yaw: (F, N).
+        present: (F, N).
+        size: (N, 3) length, width, height.
+        category: (N,) `RoadUser`.
+        ego: (F, 3) x, y, yaw of the ego vehicle, which is not among the N.
+        signals: traffic lights; t = 0 is the first frame.
+    """
+
+    xy: Float[np.ndarray, "f n 2"]
+    yaw: Float[np.ndarray, "f n"]
+    present: Bool[np.ndarray, "f n"]
+    size: Float[np.ndarray, "n 3"]
+    category: Int[np.ndarray, " n"]
+    ego: Float[np.ndarray, "f 3"]
+    signals: Signals
+
+
+def simulate_traffic(
+    rng: np.random.Generator, network: RoadNetwork, config: TrafficConfig, *, frames: int, rate_hz: float
+) -> Traffic:
+    """Let traffic settle, then record `frames` frames."""
+    table = build_lane_table(network)
+    times = np.arange(frames) / rate_hz
+    stop = times[-1] if frames else 0.0
+    start = -_WARM_UP
+
+    index = {int(segment): i for i, segment in enumerate(table.ids)}
+    way = tuple(index[i] for i in network.ego_routes[rng.integers(len(network.ego_routes))])
+    signals = _signals_for_ego(rng, table, way, config.green_wave)
+    # The oldest trips still on the road when the simulation starts entered as long ago as a slow drive takes.
+    trips = draw_trips(
+        rng, table, way, start=start - 40.0, stop=stop + 5.0,
+        vehicles_per_metre=config.vehicles_per_metre, bicycles_per_metre=config.bicycles_per_metre,
+        category_share=config.category_share,
+    )  # fmt: skip
+    trips.drivers.top_speed[0] = config.ego_top_speed
+    crossers = draw_crossers(
+        rng, network.walk_across, start=start, stop=stop, per_minute=config.crossers_per_minute
+    )
+    places = crossing_places(network.walk_across, table)
+    road = Rollout(table, signals, trips, crossers, places, len(network.walk_across))
+    road.place_early_trips(start)
+    ego_starts = _ego_starts(rng, road, stop + _EGO_JOINS)
+    joins = round((_WARM_UP - _EGO_JOINS) / _WARM_UP_STEP)
+    road.drive(start, _WARM_UP_STEP, joins, 1)
+    road.put_ego(ego_starts)
+    road.drive(-_EGO_JOINS, _WARM_UP_STEP, round(_EGO_JOINS / _WARM_UP_STEP), 1)
+
+    substeps = max(1, int(_LONGEST_STEP * rate_hz + 1e-9))
+    position, progress = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
+    driven = _driven(road, position[:frames])
+    walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]
+    walking.append(crossers.paths(progress[:frames]))
+    return _assemble(rng, network, config, road, driven, walking)
+
+
+def _signals_for_ego(rng: np.random.Generator, table: LaneTable, way: tuple[int, ...], green_wave: float) -> Signals:
+    """Draw signals of which, with probability `green_wave`, the first on the ego vehicle's way lets it drive on."""
+    signals = draw_signals(rng, table)
+    favoured, when = rng.random() < green_wave, rng.uniform(-5.0, 1.0)
+    governed = [i for i in way if table.intersection[i] >= 0]
+    if favoured and governed:
+        return turn_green(signals, int(table.intersection[governed[0]]), int(table.phase[governed[0]]), when)
+    return signals
+
+
+def _ego_starts(rng: np.random.Generator, road: Rollout, duration: float) -> Float[np.ndarray, " c"]:
+    """Draw where on its way the ego vehicle may join: early enough to stay on it, and not inside a junction."""
+    routes, table = road.trips.routes, road.table
+    way = routes.segment[0, np.isfinite(routes.start[0])]
+    speed = min(float(np.median(table.speed_at_start[way])), road.trips.drivers.top_speed[0])
+    # What continues the way to the border of the map is not to be driven: 50 m is more than half of it.
+    starts = rng.uniform(5.0, max(routes.length[0] - 50.0 - speed * duration, 10.0), _EGO_CHOICES)
+    for i, at in enumerate(starts):
+        leg = int((routes.start[0] <= at).sum()) - 1
+        while leg > 0 and table.is_gate[routes.segment[0, leg]]:
+            starts[i] = routes.start[0, leg] - 4.0
+            leg -= 1
+    return np.maximum(starts, 3.0)
+
+
+def _driven(
+    road: Rollout, position: Float[np.ndarray, "f n"]
+) -> tuple[Float[np.ndarray, "f n 2"], Float[np.ndarray, "f n"], Bool[np.ndarray, "f n"]]:
+    """Return box centres, headings and presence of all trips: front and rear wheels stay on the lane."""
+    routes, drivers, table = road.trips.routes, road.trips.drivers, road.table
+    present = (position >= 0.0) & (position <= routes.length)
+    at = np.where(present, position, 0.0)
+    wheelbase = 0.6 * drivers.size[:, 0]
+    axles = at[..., None] + wheelbase[:, None] * np.array([-0.5, 0.5])
+    segment, station = routes.place(axles.transpose(1, 0, 2))
+    xy, heading = table.locate(segment, station)
+    # A slow sway about a habitual offset, by distance, so that who stands does not slide.
+    sway = drivers.offset[:, None, None] + drivers.wander[:, None, None] * np.sin(
+        axles.transpose(1, 0, 2) / 11.0 + drivers.phase[:, None, None]
+    )
+    xy = xy + sway[..., None] * np.stack([-np.sin(heading), np.cos(heading)], -1)
+    middle, axis = xy.mean(2), xy[:, :, 1] - xy[:, :, 0]
+    return middle.transpose(1, 0, 2), np.arctan2(axis[..., 1], axis[..., 0]).T, present
+
+
+def _assemble(
+    rng: np.random.Generator,
+    network: RoadNetwork,
+    config: TrafficConfig,
+    road: Rollout,
+    driven: tuple[np.ndarray, np.ndarray, np.ndarray],
+    walking: list[Walkers],
+) -> Traffic:
+    """Join vehicles, parked vehicles and pedestrians, and leave out whoever never comes near the ego vehicle."""
+    xy, yaw, present = driven
+    frames = len(xy)
+    slots = network.parking[rng.random(len(network.parking)) < config.parked_share]
+    lorry = rng.random(len(slots)) < 0.06
+    parked = draw_drivers(rng, np.where(lorry, RoadUser.TRUCK, RoadUser.CAR))
+    # Slots are 6.5 m long: of trucks only vans and light ones park there.
+    parked.size[:, 0] = np.minimum(parked.size[:, 0], 6.0)
+    slots = slots + np.stack([0.3 * parked.offset, parked.wander * 0.3, 0.05 * parked.wander], -1)
+    people = draw_drivers(rng, np.full(sum(w.xy.shape[1] for w in walking), int(RoadUser.PEDESTRIAN)))
+
+    def still(values: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(values, (frames, *values.shape))
+
+    drivers = road.trips.drivers
+    xy = np.concatenate([xy, still(slots[:, :2]), *(w.xy for w in walking)], 1)
+    yaw = np.concatenate([yaw, still(slots[:, 2]), *(w.yaw for w in walking)], 1)
+    present = np.concatenate([present, still(np.ones(len(slots), bool)), *(w.present for w in walking)], 1)
+    size = np.concatenate([drivers.size, parked.size, people.size])
+    category = np.concatenate([drivers.category, parked.category, people.category])
+    ego = np.concatenate([xy[:, 0], yaw[:, :1]], -1)
+    present = present & (np.hypot(*(xy - ego[:, None, :2]).transpose(2, 0, 1)) < config.range)
+    present[:, 0] = False
+    seen = present.any(0)
+    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, road.signals)

@@ -153,9 +153,11 @@ def spatial_masks(inputs: Inputs) -> SpatialMask:
 def quadrants_of(mask: SpatialMask) -> dict[str, Array | None]:
     """Return the quadrants by fusion module."""
     return {
-        "T->T": mask.traffic_traffic, "T->L": mask.traffic_lane,
-        "L->T": mask.lane_traffic, "L->L": mask.lane_lane,
-    }  # fmt: skip
+        "T->T": mask.traffic_traffic,
+        "T->L": mask.traffic_lane,
+        "L->T": mask.lane_traffic,
+        "L->L": mask.lane_lane,
+    }
 
 
 def variants(result: Result, lanes: int) -> dict[str, Callable[[Inputs], Tokens]]:
@@ -173,19 +175,26 @@ def variants(result: Result, lanes: int) -> dict[str, Callable[[Inputs], Tokens]
     if result == "joint":
         return {
             OURS: lambda x: lanes_jointly(x.lanes, x.traffic, jax.vmap(SpatialMask.dense)(spatial_masks(x))),
-            "ours, all rows": joint(ours), "jax.nn": joint(jax_nn), "flax.linen": joint(flax_linen),
-            "dense additive": joint(additive), "dense where": joint(where),
-        }  # fmt: skip
+            "ours, all rows": joint(ours),
+            "jax.nn": joint(jax_nn),
+            "flax.linen": joint(flax_linen),
+            "dense additive": joint(additive),
+            "dense where": joint(where),
+        }
     narrow = {
-        OURS: quadrant(ours), "jax.nn, quadrants": quadrant(jax_nn), "flax.linen, quadrants": quadrant(flax_linen),
+        OURS: quadrant(ours),
+        "jax.nn, quadrants": quadrant(jax_nn),
+        "flax.linen, quadrants": quadrant(flax_linen),
         "where, quadrants": quadrant(where),
-    }  # fmt: skip
+    }
     if lanes > LARGEST_DENSE:
         return narrow
     return narrow | {
-        "dense ours": matrix(ours), "dense additive": matrix(additive), "dense where": matrix(where),
+        "dense ours": matrix(ours),
+        "dense additive": matrix(additive),
+        "dense where": matrix(where),
         "dense jax.nn": matrix(jax_nn),
-    }  # fmt: skip
+    }
 
 
 def with_gradient(function: Callable[[Inputs], Tokens]) -> Callable[[Inputs], tuple]:
@@ -205,9 +214,7 @@ def torch_programs(result: Result, inputs: Inputs) -> dict[str, Compiled]:
     except ImportError:
         return {}
     torch.set_num_threads(os.cpu_count())
-    lanes, traffic, gradient = (
-        torch.tensor(np.asarray(x)) for x in (inputs.lanes, inputs.traffic, inputs.gradient)
-    )
+    lanes, traffic, gradient = (torch.tensor(np.asarray(x)) for x in (inputs.lanes, inputs.traffic, inputs.gradient))
     mask = spatial_masks(inputs)
     quadrants = {k: None if m is None else torch.tensor(np.asarray(m)) for k, m in quadrants_of(mask).items()}
     whole = torch.tensor(np.asarray(jax.vmap(SpatialMask.dense)(mask))) if result == "joint" else None

@@ -61,13 +61,15 @@ def run(out: Path, first: int = 0) -> dict[str, Any]:
             opening = [_seconds(log, 0, rig.config) for log in logs[1:]]
             frames = [_seconds(log, k, rig.config) for log in logs[1:] for k in range(1, len(log.keyframes))]
             frame, scene = float(np.median(frames)), float(np.median(opening) - np.median(frames))
-            results.append({
-                "rig": rig.name,
-                "ms_frame": 1e3 * frame,
-                "ms_image": 1e3 * frame / len(rig.config.cameras),
-                "ms_scene": 1e3 * scene,
-                "ms_frame_of_dataset": 1e3 * (frame + scene / world.keyframes),
-            })  # fmt: skip
+            results.append(
+                {
+                    "rig": rig.name,
+                    "ms_frame": 1e3 * frame,
+                    "ms_image": 1e3 * frame / len(rig.config.cameras),
+                    "ms_scene": 1e3 * scene,
+                    "ms_frame_of_dataset": 1e3 * (frame + scene / world.keyframes),
+                }
+            )
     finally:
         cv2.setNumThreads(threads)
     table = markdown_table(

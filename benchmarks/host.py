@@ -115,9 +115,12 @@ def first_step() -> dict[str, Any]:
     """Time a fresh process until it has imported, made an example, initialised, compiled and made one step."""
     start = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.host", "--first-step"], check=True, capture_output=True, text=True,
+        [sys.executable, "-m", "benchmarks.host", "--first-step"],
+        check=True,
+        capture_output=True,
+        text=True,
         cwd=CONFIGS.parent.parent,
-    )  # fmt: skip
+    )
     marks = dict(line.split("=") for line in done.stdout.split())
     return {name: float(value) for name, value in marks.items()} | {"process": time.perf_counter() - start}
 

@@ -135,10 +135,17 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     """Return one row for each program; the ratio is to the first of its case."""
     header = ("case", "program", "median ms", "least ms", "times the first", "compile s")
     rows = [
-        (case, name, f"{row['median_ms']:.1f}", f"{row['least_ms']:.1f}", f"{row['ratio']:.2f}",
-         f"{row['compile_s']:.1f}")
-        for case, programs in results.items() for name, row in programs.items()
-    ]  # fmt: skip
+        (
+            case,
+            name,
+            f"{row['median_ms']:.1f}",
+            f"{row['least_ms']:.1f}",
+            f"{row['ratio']:.2f}",
+            f"{row['compile_s']:.1f}",
+        )
+        for case, programs in results.items()
+        for name, row in programs.items()
+    ]
     return markdown_table(header, rows)
 
 

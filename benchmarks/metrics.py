@@ -155,10 +155,11 @@ def lane_segments(rng: np.random.Generator, detections: int) -> tuple[SegmentDet
     found_areas, scores = detected(rng, areas, curves(rng, AREAS // 2, 20))
     categories = np.arange(AREAS + AREAS // 2) % 2 + 1
     return (
-        SegmentDetections(found, found.points + aside, found.points - aside,
-                          AreaDetections(found_areas, categories, scores)),
+        SegmentDetections(
+            found, found.points + aside, found.points - aside, AreaDetections(found_areas, categories, scores)
+        ),
         SegmentTruth(true, true.points + aside, true.points - aside, AreaTruth(areas, categories[:AREAS])),
-    )  # fmt: skip
+    )
 
 
 def vector_map(rng: np.random.Generator, detections: int) -> tuple[MapDetections, MapTruth]:
@@ -202,24 +203,33 @@ def run(out: Path, frames: int = 100, rounds: int = 5) -> dict[str, Any]:
     for comparison in comparisons():
         times = milliseconds(comparison, frames, rounds)
         ms = float(np.median(times))
-        results.append({
-            "protocol": comparison.name,
-            "detections": comparison.detections,
-            "ms": ms,
-            "least_ms": min(times),
-            "frames_per_second": 1e3 / ms,
-            "official_ms": comparison.official_ms,
-            "ratio": comparison.official_ms / ms,
-            "goal": comparison.goal,
-        })  # fmt: skip
+        results.append(
+            {
+                "protocol": comparison.name,
+                "detections": comparison.detections,
+                "ms": ms,
+                "least_ms": min(times),
+                "frames_per_second": 1e3 / ms,
+                "official_ms": comparison.official_ms,
+                "ratio": comparison.official_ms / ms,
+                "goal": comparison.goal,
+            }
+        )
     table = markdown_table(
         ["protocol", "detections", "ms a frame", "frames/s", "official ms", "times as fast", "goal"],
         [
-            [r["protocol"], str(r["detections"]), f"{r['ms']:.2f}", f"{r['frames_per_second']:.0f}",
-             f"{r['official_ms']:g}", f"{r['ratio']:.0f}", f"{r['goal']:g}"]
+            [
+                r["protocol"],
+                str(r["detections"]),
+                f"{r['ms']:.2f}",
+                f"{r['frames_per_second']:.0f}",
+                f"{r['official_ms']:g}",
+                f"{r['ratio']:.0f}",
+                f"{r['goal']:g}",
+            ]
             for r in results
         ],
-    )  # fmt: skip
+    )
     table += "\n\nCPU time, one process. The official times are quoted, from a comparable machine of two cores."
     print(table)
     record = {"machine": machine(), "frames": frames, "rounds": rounds, "results": results}

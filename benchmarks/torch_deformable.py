@@ -30,9 +30,9 @@ def attend(value: Any, shapes: Sequence[tuple[int, int]], locations: Any, weight
     for level, ((h, w), part) in enumerate(zip(shapes, parts, strict=True)):
         image = part.permute(0, 2, 3, 1).reshape(views * heads, -1, h, w)
         grid = (2.0 * locations[:, :, :, level] - 1.0).transpose(1, 2).reshape(views * heads, queries, points, 2)
-        sampled.append(torch.nn.functional.grid_sample(
-            image, grid, mode="bilinear", padding_mode="zeros", align_corners=False
-        ))  # fmt: skip
+        sampled.append(
+            torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        )
     share = weights.transpose(1, 2).reshape(views * heads, 1, queries, -1)
     total = (torch.cat(sampled, -1) * share).sum(-1)
     return total.reshape(views, -1, queries).transpose(1, 2).contiguous()

@@ -49,10 +49,18 @@ def fake_example(seed: int = 0, *, padding: float = 0.0) -> Example:
     hidden = np.zeros((10, 20), bool)
     hidden[3:6, 4:9] = True
     return Example(
-        bev=rng.integers(0, 256, (10, 20, 4), dtype=np.uint8), hidden=hidden, traffic_flow=flow, markers=None,
-        sd_map=None, lanes=lanes, segments=LaneGraph.empty(3, POINTS), areas=areas, traffic_elements=elements,
-        previous_from_ego=np.eye(4, dtype=np.float32), has_previous=np.asarray(seed % 2 == 1),
-    )  # fmt: skip
+        bev=rng.integers(0, 256, (10, 20, 4), dtype=np.uint8),
+        hidden=hidden,
+        traffic_flow=flow,
+        markers=None,
+        sd_map=None,
+        lanes=lanes,
+        segments=LaneGraph.empty(3, POINTS),
+        areas=areas,
+        traffic_elements=elements,
+        previous_from_ego=np.eye(4, dtype=np.float32),
+        has_previous=np.asarray(seed % 2 == 1),
+    )
 
 
 def fake_views(seed: int = 0, *, cameras: int = 6, width: int = 48, height: int = 32) -> CameraViews:
@@ -84,9 +92,10 @@ def empty_example() -> Example:
     example = fake_example()
     parts = {name: getattr(example, name) for name in ("lanes", "areas", "traffic_flow", "traffic_elements")}
     return example.replace(
-        bev=np.zeros_like(example.bev), hidden=np.zeros_like(example.hidden),
+        bev=np.zeros_like(example.bev),
+        hidden=np.zeros_like(example.hidden),
         **{name: part.replace(valid=np.zeros_like(part.valid)) for name, part in parts.items()},
-    )  # fmt: skip
+    )
 
 
 def fake_prediction(seed: int = 0, *, queries: int = 6) -> LanePrediction:

@@ -99,8 +99,17 @@ def test_help_is_instant_and_imports_nothing_slow():
 
 def test_a_run_folder_holds_everything(trained):
     names = {path.name for path in trained.iterdir()}
-    assert names == {"config.json", "config.txt", "provenance.json", "metrics.jsonl", "tensorboard", "checkpoints",
-                     "curves.png", "pictures", "run.lock"}  # fmt: skip
+    assert names == {
+        "config.json",
+        "config.txt",
+        "provenance.json",
+        "metrics.jsonl",
+        "tensorboard",
+        "checkpoints",
+        "curves.png",
+        "pictures",
+        "run.lock",
+    }
     assert sorted(p.name for p in (trained / "pictures").iterdir()) == ["step_00000002.png", "step_00000004.png"]
     assert "training.seeds = [3]\n" in (trained / "config.txt").read_text()
     validation = [r for r in read_records(trained / "metrics.jsonl") if r["split"] == "val"]

@@ -14,7 +14,7 @@ from tflane_jax.scoring.tusimple import read_predictions, read_truth
 
 pytest.importorskip("cv2")
 
-CONFIG = '''
+CONFIG = """
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.lstr import LstrConfig
@@ -32,7 +32,7 @@ def get_config():
         training=TrainingConfig(steps=4, batch_size=2, log_every=1, eval_every=2, best_metric="all/Accuracy"),
         evaluation=EvaluationConfig(batch_size=2, pictures=1),
     )
-'''
+"""
 
 
 @pytest.fixture(scope="module")

@@ -48,10 +48,16 @@ def test_a_size_scales_the_distance(photos, tmp_path):
     assert marker["position"][0] == pytest.approx(4.5, abs=0.02)
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    (["--family", "QR"], "ARUCO_5X5_100"), (["--size", "0"], "size"), (["--distortion", "0.1"], "--distortion"),
-    (["--intrinsics", "0", "900", "1", "1"], "--intrinsics"), (["--enlarge", "0"], "enlarge"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (["--family", "QR"], "ARUCO_5X5_100"),
+        (["--size", "0"], "size"),
+        (["--distortion", "0.1"], "--distortion"),
+        (["--intrinsics", "0", "900", "1", "1"], "--intrinsics"),
+        (["--enlarge", "0"], "enlarge"),
+    ],
+)
 def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):
     assert main(["markers", "detect", str(photos), *INTRINSICS, *change, "--out", str(tmp_path / "out")]) == 2
     assert words in capsys.readouterr().err

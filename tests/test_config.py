@@ -55,11 +55,13 @@ def test_every_golden_text_has_its_configuration():
 @pytest.mark.parametrize(
     "config",
     [
-        RunConfig(), FLOW, RunConfig(data=LogData(Path("a"), Path("b/c"), Path("d"), openlane=Path("e"))),
+        RunConfig(),
+        FLOW,
+        RunConfig(data=LogData(Path("a"), Path("b/c"), Path("d"), openlane=Path("e"))),
         RunConfig(data=OpenLaneV2Data(Path("a"), subset="B")),
         RunConfig(data=OpenLaneV2Data(Path("a"), augmentation=None)),
     ],
-)  # fmt: skip
+)
 def test_json_round_trip(config):
     assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config
     assert hash(config) == hash(from_json(RunConfig, to_json(config)))
@@ -142,10 +144,16 @@ def test_overrides_change_what_they_name(arguments, changed):
 
 def test_parts_are_switched_on_and_off():
     arguments = [
-        "--data.example.markers.simulation.jump", "0.2", "--data.example.markers", "default",
-        "--task.model.markers.memory", "None", "--task.model.traffic-flow=None",
-        "--task.model.markers", "MarkerFusionConfig",
-    ]  # fmt: skip
+        "--data.example.markers.simulation.jump",
+        "0.2",
+        "--data.example.markers",
+        "default",
+        "--task.model.markers.memory",
+        "None",
+        "--task.model.traffic-flow=None",
+        "--task.model.markers",
+        "MarkerFusionConfig",
+    ]
     config = apply_overrides(FLOW, arguments)
     model = FLOW.task.model
     assert config.data.example == replace(

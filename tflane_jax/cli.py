@@ -83,24 +83,35 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _command(commands, name: str, text: str, *, function: str, module: str, epilog: str = "", **more):
     parser = commands.add_parser(
-        name, help=text, description=text[0].upper() + text[1:] + ".", epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter, **more,
-    )  # fmt: skip
+        name,
+        help=text,
+        description=text[0].upper() + text[1:] + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        **more,
+    )
     parser.set_defaults(module=module, function=function, takes_overrides=False)
     return parser
 
 
 def _train(commands) -> None:
     # Its help is printed by the command itself, because with a config it lists that config's settings.
-    parser = _command(commands, "train", "train a model", module="train", function="run", epilog=_OVERRIDES,
-                      add_help=False)  # fmt: skip
+    parser = _command(
+        commands, "train", "train a model", module="train", function="run", epilog=_OVERRIDES, add_help=False
+    )
     parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (.py), or one of its ablations")
     parser.add_argument("--out", metavar="RUN", type=Path, help="run folder (default runs/<name of the config file>)")
     start = parser.add_mutually_exclusive_group()
-    start.add_argument("--resume", action="store_const", const="resume", dest="start",
-                       help="go on with the run in --out (its own configuration, --config not needed)")  # fmt: skip
-    start.add_argument("--overwrite", action="store_const", const="overwrite", dest="start",
-                       help="delete the run in --out first")  # fmt: skip
+    start.add_argument(
+        "--resume",
+        action="store_const",
+        const="resume",
+        dest="start",
+        help="go on with the run in --out (its own configuration, --config not needed)",
+    )
+    start.add_argument(
+        "--overwrite", action="store_const", const="overwrite", dest="start", help="delete the run in --out first"
+    )
     parser.add_argument("-h", "--help", action="store_true", dest="wants_help", help="show this and exit")
     parser.set_defaults(start="new", takes_overrides=True, usage=parser.format_help())
 
@@ -115,10 +126,15 @@ def _checkpoint(text: str) -> int | str:
 
 def _model_arguments(parser: argparse.ArgumentParser, inputs: str = "run folder") -> None:
     parser.add_argument("inputs", metavar="RUN", nargs="*", type=Path, help=inputs)
-    parser.add_argument("--config", metavar="FILE[:NAME]",
-                        help="instead of a run: a config file that names published weights")  # fmt: skip
-    parser.add_argument("--checkpoint", metavar="best|last|STEP", type=_checkpoint,
-                        help="default best, or last where nothing was evaluated")  # fmt: skip
+    parser.add_argument(
+        "--config", metavar="FILE[:NAME]", help="instead of a run: a config file that names published weights"
+    )
+    parser.add_argument(
+        "--checkpoint",
+        metavar="best|last|STEP",
+        type=_checkpoint,
+        help="default best, or last where nothing was evaluated",
+    )
 
 
 def _example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
@@ -132,11 +148,14 @@ def _split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
 
 
 def _source_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", choices=("procedural", "world-cameras", "argoverse2", "openlane-v2", "front-views",
-                                           "tusimple"),
-                        help="take other data than the configuration's")  # fmt: skip
-    parser.add_argument("--root", metavar="PATH",
-                        help="folder of --data argoverse2 (a log, or logs), openlane-v2 or tusimple")  # fmt: skip
+    parser.add_argument(
+        "--data",
+        choices=("procedural", "world-cameras", "argoverse2", "openlane-v2", "front-views", "tusimple"),
+        help="take other data than the configuration's",
+    )
+    parser.add_argument(
+        "--root", metavar="PATH", help="folder of --data argoverse2 (a log, or logs), openlane-v2 or tusimple"
+    )
     parser.add_argument("--openlane", metavar="PATH", help="folder of the OpenLane-V2 split files, if there is one")
 
 
@@ -144,38 +163,53 @@ def _evaluate(commands) -> None:
     parser = _command(commands, "eval", "evaluate a trained run", module="evaluate", function="run")
     _model_arguments(parser)
     _example_arguments(parser, "test")
-    parser.add_argument("--out", metavar="STEM", type=Path,
-                        help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)")  # fmt: skip
+    parser.add_argument(
+        "--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
+    )
 
 
 def _predict(commands) -> None:
-    parser = _command(commands, "predict", "write predictions and pictures", module="predict", function="run",
-                      epilog=_PREDICT)  # fmt: skip
+    parser = _command(
+        commands, "predict", "write predictions and pictures", module="predict", function="run", epilog=_PREDICT
+    )
     _model_arguments(parser, "run folder; then photos or folders of photos, for models of lane lines in one image")
     _example_arguments(parser, "val")
     parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
-    parser.add_argument("--threshold", type=float, default=0.3,
-                        help="least score of a lane in JSON and pictures (default 0.3)")  # fmt: skip
+    parser.add_argument(
+        "--threshold", type=float, default=0.3, help="least score of a lane in JSON and pictures (default 0.3)"
+    )
     parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
     parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/predict"),
-                        help="where to write (default runs/predict)")  # fmt: skip
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("runs/predict"), help="where to write (default runs/predict)"
+    )
 
 
 def _export(commands) -> None:
-    parser = _command(commands, "export", "write a model of lane lines in one image as a StableHLO program",
-                      module="export", function="run")  # fmt: skip
+    parser = _command(
+        commands,
+        "export",
+        "write a model of lane lines in one image as a StableHLO program",
+        module="export",
+        function="run",
+    )
     _model_arguments(parser)
-    parser.add_argument("--out", metavar="FILE", type=Path, default=Path("model.stablehlo"),
-                        help="default model.stablehlo")  # fmt: skip
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, default=Path("model.stablehlo"), help="default model.stablehlo"
+    )
 
 
 def _convert(commands) -> None:
-    parser = _command(commands, "convert", "turn published PyTorch weights into a run folder", module="convert",
-                      function="run")  # fmt: skip
+    parser = _command(
+        commands, "convert", "turn published PyTorch weights into a run folder", module="convert", function="run"
+    )
     parser.add_argument("--config", metavar="FILE[:NAME]", required=True, help="config file of the same model")
-    parser.add_argument("--weights", metavar="FILE", type=Path,
-                        help="checkpoint, .pth, .pkl or .npz (default: the one that the config names)")  # fmt: skip
+    parser.add_argument(
+        "--weights",
+        metavar="FILE",
+        type=Path,
+        help="checkpoint, .pth, .pkl or .npz (default: the one that the config names)",
+    )
     parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="run folder to write")
 
 
@@ -186,37 +220,63 @@ def _data(commands) -> None:
     show.add_argument("--config", metavar="FILE", help="config file whose data to show (default: the built-in world)")
     _split_arguments(show, "train")
     show.add_argument("--count", type=int, default=8, help="examples (default 8)")
-    show.add_argument("--out", metavar="FILE", type=Path, default=Path("samples.png"),
-                      help="picture (default samples.png)")  # fmt: skip
+    show.add_argument(
+        "--out", metavar="FILE", type=Path, default=Path("samples.png"), help="picture (default samples.png)"
+    )
     check = _command(inner, "check", "say what a dataset's folder lacks", module="data", function="check")
     check.add_argument("root", metavar="PATH", help="a log, a folder of logs, or OpenLane-V2's folder")
-    check.add_argument("--format", choices=("argoverse2", "openlane-v2"), default="argoverse2",
-                       help="of the dataset (default argoverse2)")  # fmt: skip
-    export = _command(inner, "export", "write a dataset with cameras in another format", module="data_export",
-                      function="run", epilog=_OVERRIDES)  # fmt: skip
+    check.add_argument(
+        "--format",
+        choices=("argoverse2", "openlane-v2"),
+        default="argoverse2",
+        help="of the dataset (default argoverse2)",
+    )
+    export = _command(
+        inner,
+        "export",
+        "write a dataset with cameras in another format",
+        module="data_export",
+        function="run",
+        epilog=_OVERRIDES,
+    )
     export.add_argument("--format", choices=("openlane-v2",), default="openlane-v2", help="default openlane-v2")
     export.add_argument("--config", metavar="FILE[:NAME]", help="config file whose data to write", required=True)
     _source_arguments(export)
-    export.add_argument("--splits", choices=("train", "val", "test"), nargs="+", default=["train", "val"],
-                        help="default train val")  # fmt: skip
+    export.add_argument(
+        "--splits", choices=("train", "val", "test"), nargs="+", default=["train", "val"], help="default train val"
+    )
     export.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg as official, png without loss")
     export.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
     export.set_defaults(takes_overrides=True)
-    overlap = _command(inner, "overlap", "say whether two splits show the same places", module="data",
-                       function="overlap_of_splits")  # fmt: skip
-    overlap.add_argument("train", metavar="TRAIN", type=Path,
-                         help="folder of Argoverse 2 logs, or of OpenLane-V2 segments")  # fmt: skip
+    overlap = _command(
+        inner, "overlap", "say whether two splits show the same places", module="data", function="overlap_of_splits"
+    )
+    overlap.add_argument(
+        "train", metavar="TRAIN", type=Path, help="folder of Argoverse 2 logs, or of OpenLane-V2 segments"
+    )
     overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same of the other split")
     overlap.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
-    build = _command(inner, "build", "make the built-in world's examples ahead of training", module="data",
-                     function="build", epilog=_OVERRIDES)  # fmt: skip
+    build = _command(
+        inner,
+        "build",
+        "make the built-in world's examples ahead of training",
+        module="data",
+        function="build",
+        epilog=_OVERRIDES,
+    )
     build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
     build.set_defaults(takes_overrides=True)
 
 
 def _summary(commands) -> None:
-    parser = _command(commands, "summary", "count a model's parameters, operations and memory",
-                      module="summary", function="run", epilog=_OVERRIDES)  # fmt: skip
+    parser = _command(
+        commands,
+        "summary",
+        "count a model's parameters, operations and memory",
+        module="summary",
+        function="run",
+        epilog=_OVERRIDES,
+    )
     parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the default configuration)")
     parser.add_argument("--depth", type=int, default=1, help="levels of parameter names (default 1)")
     parser.add_argument("--no-compile", action="store_true", help="count operations only, which takes seconds")
@@ -226,10 +286,20 @@ def _summary(commands) -> None:
 
 
 def _compare(commands) -> None:
-    parser = _command(commands, "compare", "train configurations with several seeds and test their differences",
-                      module="compare", function="run", epilog=_OVERRIDES)  # fmt: skip
-    parser.add_argument("configs", metavar="[NAME=]FILE[:ABLATION]", nargs="+",
-                        help="config files; the first one is what the others are compared with")  # fmt: skip
+    parser = _command(
+        commands,
+        "compare",
+        "train configurations with several seeds and test their differences",
+        module="compare",
+        function="run",
+        epilog=_OVERRIDES,
+    )
+    parser.add_argument(
+        "configs",
+        metavar="[NAME=]FILE[:ABLATION]",
+        nargs="+",
+        help="config files; the first one is what the others are compared with",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, sharing the cores (default 1)")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/compare"), help="default runs/compare")
@@ -237,10 +307,20 @@ def _compare(commands) -> None:
 
 
 def _sweep(commands) -> None:
-    parser = _command(commands, "sweep", "evaluate trained models while a setting of their test data changes",
-                      module="sweep", function="run", epilog=_OVERRIDES)  # fmt: skip
-    parser.add_argument("runs", metavar="[NAME=]FOLDER", nargs="+",
-                        help="run folders, or folders with one for each seed as compare leaves them")  # fmt: skip
+    parser = _command(
+        commands,
+        "sweep",
+        "evaluate trained models while a setting of their test data changes",
+        module="sweep",
+        function="run",
+        epilog=_OVERRIDES,
+    )
+    parser.add_argument(
+        "runs",
+        metavar="[NAME=]FOLDER",
+        nargs="+",
+        help="run folders, or folders with one for each seed as compare leaves them",
+    )
     parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
     parser.add_argument("--values", nargs="+", required=True, help="of the setting")
     parser.add_argument("--metrics", nargs="+", help="to show, say all/DET_l gap/recall (default: as compare does)")
@@ -249,74 +329,129 @@ def _sweep(commands) -> None:
 
 
 def _score(commands) -> None:
-    parser = _command(commands, "score", "score a file of predictions, of any framework, by an official protocol",
-                      module="score", function="run", epilog=_FILES)  # fmt: skip
+    parser = _command(
+        commands,
+        "score",
+        "score a file of predictions, of any framework, by an official protocol",
+        module="score",
+        function="run",
+        epilog=_FILES,
+    )
     parser.add_argument("protocol", metavar="PROTOCOL", help="see below")
     parser.add_argument("predictions", metavar="PREDICTIONS", type=Path, help="file of predictions")
     parser.add_argument("truth", metavar="GROUND_TRUTH", type=Path, help="file or folder of annotations")
-    parser.add_argument("--by", choices=("scene", "distance", "occlusion"),
-                        help="report parts as well; distance and occlusion: of centerlines")  # fmt: skip
-    parser.add_argument("--bootstrap", type=int, metavar="N", default=0,
-                        help="95 percent intervals from N draws of whole scenes (some 200 are enough)")  # fmt: skip
-    parser.add_argument("--out", metavar="STEM", type=Path, default=Path("score"),
-                        help="write STEM.md and STEM.json (default score)")  # fmt: skip
+    parser.add_argument(
+        "--by",
+        choices=("scene", "distance", "occlusion"),
+        help="report parts as well; distance and occlusion: of centerlines",
+    )
+    parser.add_argument(
+        "--bootstrap",
+        type=int,
+        metavar="N",
+        default=0,
+        help="95 percent intervals from N draws of whole scenes (some 200 are enough)",
+    )
+    parser.add_argument(
+        "--out", metavar="STEM", type=Path, default=Path("score"), help="write STEM.md and STEM.json (default score)"
+    )
 
 
 def _markers(commands) -> None:
-    parser = commands.add_parser("markers", help="find fiducial markers, and store the lanes that they name",
-                                 description="Fiducial markers.")  # fmt: skip
+    parser = commands.add_parser(
+        "markers", help="find fiducial markers, and store the lanes that they name", description="Fiducial markers."
+    )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
     _marker_store(inner)
-    detect = _command(inner, "detect", "find markers in photos of a calibrated camera", module="markers",
-                      function="find")  # fmt: skip
+    detect = _command(
+        inner, "detect", "find markers in photos of a calibrated camera", module="markers", function="find"
+    )
     detect.add_argument("images", metavar="IMAGES", nargs="+", type=Path, help="photos, or folders of photos")
-    detect.add_argument("--intrinsics", metavar=("FX", "FY", "CX", "CY"), nargs=4, type=float, required=True,
-                        help="focal lengths and principal point, pixels from the image's corner")  # fmt: skip
-    detect.add_argument("--distortion", metavar="K", nargs="+", type=float,
-                        help="of the lens: OpenCV's K1 K2 P1 P2 [K3 [K4 K5 K6]]; default none")  # fmt: skip
+    detect.add_argument(
+        "--intrinsics",
+        metavar=("FX", "FY", "CX", "CY"),
+        nargs=4,
+        type=float,
+        required=True,
+        help="focal lengths and principal point, pixels from the image's corner",
+    )
+    detect.add_argument(
+        "--distortion",
+        metavar="K",
+        nargs="+",
+        type=float,
+        help="of the lens: OpenCV's K1 K2 P1 P2 [K3 [K4 K5 K6]]; default none",
+    )
     detect.add_argument("--size", type=float, default=1.0, help="side of the black square, metres (default 1)")
     detect.add_argument("--height", type=float, default=1.5, help="of the camera above ground, metres (default 1.5)")
     detect.add_argument("--pitch", type=float, default=0.0, help="of the camera, downwards, degrees (default 0)")
     detect.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/markers"), help="default runs/markers")
-    curves = _command(inner, "curves", "measure how detection and pose get worse with distance, in the built-in world",
-                      module="markers", function="curves")  # fmt: skip
-    curves.add_argument("--distances", type=float, nargs="+", default=[5.0 * n for n in range(1, 13)],
-                        help="metres (default 5 to 60)")  # fmt: skip
-    curves.add_argument("--scales", type=float, nargs="+", default=[1.0, 0.5],
-                        help="sizes of the images, 1 is native (default 1 0.5)")  # fmt: skip
+    curves = _command(
+        inner,
+        "curves",
+        "measure how detection and pose get worse with distance, in the built-in world",
+        module="markers",
+        function="curves",
+    )
+    curves.add_argument(
+        "--distances", type=float, nargs="+", default=[5.0 * n for n in range(1, 13)], help="metres (default 5 to 60)"
+    )
+    curves.add_argument(
+        "--scales", type=float, nargs="+", default=[1.0, 0.5], help="sizes of the images, 1 is native (default 1 0.5)"
+    )
     curves.add_argument("--seeds", type=int, default=8, help="scenes, with three boards each (default 8)")
     curves.add_argument("--severity", type=float, default=0.5, help="of weather and camera, 0 to 1 (default 0.5)")
-    curves.add_argument("--sigma-d", type=float, default=40.0,
-                        help="of the paper's detection curve in the picture, metres (default 40)")  # fmt: skip
+    curves.add_argument(
+        "--sigma-d", type=float, default=40.0, help="of the paper's detection curve in the picture, metres (default 40)"
+    )
     curves.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
     for command, many in ((detect, False), (curves, True)):
         command.add_argument("--family", default="ARUCO_5X5_100", help="of the markers (default ARUCO_5X5_100)")
         command.add_argument("--enlarge", type=int, default=1, help="search images so many times larger (default 1)")
         ways = ("pattern", "subpixel", "none")
         if many:
-            command.add_argument("--corners", choices=ways, nargs="+", default=["pattern", "subpixel"],
-                                 help="how corners are found (default pattern subpixel)")  # fmt: skip
+            command.add_argument(
+                "--corners",
+                choices=ways,
+                nargs="+",
+                default=["pattern", "subpixel"],
+                help="how corners are found (default pattern subpixel)",
+            )
         else:
             command.add_argument("--corners", choices=ways, default="pattern", help="how corners are found")
 
 
 def _marker_store(inner) -> None:
-    store = _command(inner, "store", "write which lanes the markers of a log name", module="marker_store",
-                     function="run")  # fmt: skip
-    store.add_argument("--log", metavar="SCENE|FOLDER", required=True,
-                       help="number of a world scene, or an Argoverse 2 log, which gets virtual markers")  # fmt: skip
+    store = _command(
+        inner, "store", "write which lanes the markers of a log name", module="marker_store", function="run"
+    )
+    store.add_argument(
+        "--log",
+        metavar="SCENE|FOLDER",
+        required=True,
+        help="number of a world scene, or an Argoverse 2 log, which gets virtual markers",
+    )
     store.add_argument("--out", metavar="FILE", type=Path, default=Path("store.json"), help="default store.json")
     store.add_argument("--radius", type=float, default=50.0, help="lanes so near to a marker, metres (default 50)")
-    store.add_argument("--frame", choices=("marker", "survey"), default="marker",
-                       help="of the lanes in the file: the marker's, or the map's (default marker)")  # fmt: skip
+    store.add_argument(
+        "--frame",
+        choices=("marker", "survey"),
+        default="marker",
+        help="of the lanes in the file: the marker's, or the map's (default marker)",
+    )
     store.add_argument("--bike-lanes", choices=("include", "exclude"), default="include", help="default include")
     store.add_argument("--surveyed", metavar="YYYY-MM-DD", help="day of the survey")
     store.add_argument("--expires", metavar="YYYY-MM-DD", help="first day on which the entries count no longer")
 
 
 def _demo(commands) -> None:
-    parser = _command(commands, "demo", "train with and without traffic flow, evaluate both, in under ten minutes",
-                      module="demo", function="run")  # fmt: skip
+    parser = _command(
+        commands,
+        "demo",
+        "train with and without traffic flow, evaluate both, in under ten minutes",
+        module="demo",
+        function="run",
+    )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default runs/demo")
 
 

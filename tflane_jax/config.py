@@ -114,9 +114,15 @@ class OpenLaneV2Data:
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""
         return OpenLaneV2Config(
-            self.root, getattr(self, split), self.subset, self.flavour, self.data_dict, self.image, self.example,
+            self.root,
+            getattr(self, split),
+            self.subset,
+            self.flavour,
+            self.data_dict,
+            self.image,
+            self.example,
             self.loading,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A trained monocular model as one StableHLO file: any batch size, weights inside, runs without this package.
 
-    from jax import export
-    program = export.deserialize(open("lstr.stablehlo", "rb").read())
-    answer = program.call(images)    # (b, 360, 640, 3) uint8 RGB -> {"logits": (b, q, 2), "curves": (b, q, 8)}
+from jax import export
+program = export.deserialize(open("lstr.stablehlo", "rb").read())
+answer = program.call(images)    # (b, 360, 640, 3) uint8 RGB -> {"logits": (b, q, 2), "curves": (b, q, 8)}
 """
 
 from __future__ import annotations

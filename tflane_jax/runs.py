@@ -62,10 +62,19 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         return system.evaluate(config.task, params, validation, config.evaluation.batch_size).scores()
 
     return train(
-        config.task, arrays, folder, config=config.training, optim=config.optim,
-        resolved=to_json(config), resolved_text=to_text(config), start=start,
-        prepare=system.prepare(config), evaluate=evaluate, draw=_drawing(config), progress=progress,
-    )  # fmt: skip
+        config.task,
+        arrays,
+        folder,
+        config=config.training,
+        optim=config.optim,
+        resolved=to_json(config),
+        resolved_text=to_text(config),
+        start=start,
+        prepare=system.prepare(config),
+        evaluate=evaluate,
+        draw=_drawing(config),
+        progress=progress,
+    )
 
 
 def resumable_config(folder: Path) -> RunConfig:
@@ -115,9 +124,12 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
     optimizer = make_optimizer(config.optim, config.training.steps)
     params = jax.tree.map(jnp.asarray, params)
     state = TrainState(
-        step=jnp.zeros((), jnp.int32), params=params, ema_params=params,
-        opt_state=optimizer.init(split_statistics(params)[0]), key=jax.random.key(0),
-    )  # fmt: skip
+        step=jnp.zeros((), jnp.int32),
+        params=params,
+        ema_params=params,
+        opt_state=optimizer.init(split_statistics(params)[0]),
+        key=jax.random.key(0),
+    )
     with claimed(folder, "new"):
         add_provenance(folder)
         write_text(folder / "config.txt", to_text(config))

@@ -1,7 +1,7 @@
 """OpenLane-V2's large baseline at its full size, on subset A: as `toponet_r50.py`, 100 queries, lanes as Bezier curves.
 
-    tflane summary --config configs/camera/bevformer_detr_r50.py --no-compile   # needs no data
-    tflane train --config configs/camera/bevformer_detr_r50.py --data.root PATH
+tflane summary --config configs/camera/bevformer_detr_r50.py --no-compile   # needs no data
+tflane train --config configs/camera/bevformer_detr_r50.py --data.root PATH
 """
 
 from dataclasses import replace

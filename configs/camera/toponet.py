@@ -34,8 +34,9 @@ ENCODER = CameraEncoderConfig(
     # Three levels from 1/8 on.
     ImageEncoderConfig(stages=(1, 2, 3), pyramid=FeaturePyramidConfig(64, 3)),
     # A camera sees at most 469 of the 1,250 cells.
-    replace(SMALL_BEVFORMER, grid=GRID, levels=3, cameras=6, capacity=480), cells=True,
-)  # fmt: skip
+    replace(SMALL_BEVFORMER, grid=GRID, levels=3, cameras=6, capacity=480),
+    cells=True,
+)
 DECODER = LaneDecoderConfig(queries=32, range=GRID.range)
 ELEMENTS = ElementDecoderConfig(levels=3)
 

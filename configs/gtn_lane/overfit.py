@@ -19,9 +19,7 @@ def get_config() -> RunConfig:
     shared = Path(os.environ.get("TFLANE_SHARED", "../shared")) / "data"
     return dataclasses.replace(
         load_config(str(Path(__file__).with_name("gtn.py"))),
-        data=TuSimpleData(
-            shared / "tusimple" / "LaneDetection", train="all", val="all", test="all", augmentation=None
-        ),
+        data=TuSimpleData(shared / "tusimple" / "LaneDetection", train="all", val="all", test="all", augmentation=None),
         training=TrainingConfig(steps=2000, batch_size=10, eval_every=500, best_metric="all/Accuracy"),
         evaluation=EvaluationConfig(batch_size=10),
     )

@@ -24,9 +24,14 @@ def get_config() -> RunConfig:
     """Return the baseline."""
     # Half the resolution and as many cells as at the full one: four times as many steps in the same time.
     model = LstrConfig(
-        ResNetConfig(strides=(1, 2, 2, 1)), encoder=TransformerEncoderConfig(layer=LAYER), decoder=LAYER,
-        shrink=2, located=True, cells=True, anchors=(0.35, 1.0),
-    )  # fmt: skip
+        ResNetConfig(strides=(1, 2, 2, 1)),
+        encoder=TransformerEncoderConfig(layer=LAYER),
+        decoder=LAYER,
+        shrink=2,
+        located=True,
+        cells=True,
+        anchors=(0.35, 1.0),
+    )
     augmentation = AugmentationConfig(geometry=0.8, rotation=0.03, crop=0.95)
     return RunConfig(
         task=LaneCurveTask(model, LaneCurveLossConfig(least_depth=0.02)),

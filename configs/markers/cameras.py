@@ -41,10 +41,8 @@ def get_config() -> RunConfig:
         task=replace(host.task, model=model, clip=4),
         data=replace(host.data, world=world, example=example),
         optim=replace(host.optim, ema_decay=0.99),
-        training=replace(
-            host.training, steps=300, batch_size=2, eval_every=300, init_from=HOST, init_partly=True
-        ),
-    )  # fmt: skip
+        training=replace(host.training, steps=300, batch_size=2, eval_every=300, init_from=HOST, init_partly=True),
+    )
 
 
 def ablations() -> dict[str, RunConfig]:

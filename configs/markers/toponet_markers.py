@@ -63,7 +63,11 @@ def _tuned(host: str = "host", **priors: object) -> RunConfig:
         # Averaged over the last hundred updates or so: over a thousand, most of the average would be the host.
         optim=replace(config.optim, ema_decay=0.99),
         training=replace(
-            config.training, steps=400, batch_size=2, eval_every=400,
-            init_from=f"{HOSTS}/{host}/seed_{{seed}}", init_partly=True,
+            config.training,
+            steps=400,
+            batch_size=2,
+            eval_every=400,
+            init_from=f"{HOSTS}/{host}/seed_{{seed}}",
+            init_partly=True,
         ),
-    )  # fmt: skip
+    )

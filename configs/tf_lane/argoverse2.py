@@ -23,9 +23,7 @@ def get_config() -> RunConfig:
     """Return 100 steps from a trained model on one log, at a tenth of the world's learning rate."""
     shared = Path(os.environ.get("TFLANE_SHARED", "../shared")) / "data"
     logs = shared / "argoverse2" / "sensor" / "val"
-    data = LogData(
-        train=logs / TRAIN, val=logs / TEST, test=logs / TEST, openlane=shared / "openlanev2"
-    )
+    data = LogData(train=logs / TRAIN, val=logs / TEST, test=logs / TEST, openlane=shared / "openlanev2")
     return dataclasses.replace(
         load_config(str(Path(__file__).with_name("toponet_tfm.py"))),
         data=data,

@@ -36,9 +36,7 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _architecture(fusions: tuple, depth: int, normalised: bool) -> RunConfig:
-    module = TrafficFlowModuleConfig(
-        fusions=fusions, depth=depth, position_encoding="sine" if normalised else "linear"
-    )
+    module = TrafficFlowModuleConfig(fusions=fusions, depth=depth, position_encoding="sine" if normalised else "linear")
     prior = TrafficFlowPriorConfig(coordinates="normalised" if normalised else "metres")
     return _with_traffic_flow(TrafficFlowConfig(prior=prior, module=module))
 

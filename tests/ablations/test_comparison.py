@@ -22,7 +22,12 @@ def test_rows():
 
 
 def test_compact_is_in_percent():
-    rows = compact([variant("base", 0.1, 0.2), ], ["all/DET_l", "occluded/DET_l"])
+    rows = compact(
+        [
+            variant("base", 0.1, 0.2),
+        ],
+        ["all/DET_l", "occluded/DET_l"],
+    )
     assert rows == [{"model": "base", "all/DET_l": "15.0 ± 7.1", "occluded/DET_l": "7.5 ± 3.5"}]
     assert compact([variant("base", 0.1)], ["all/DET_l"]) == [{"model": "base", "all/DET_l": "10.0"}]
 

@@ -35,8 +35,11 @@ def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
     assert "other" in capsys.readouterr().out
     content = json.loads((tmp_path / "out" / "sweep.json").read_text())
     assert [(row["data.world.severity"], row["model"]) for row in content["rows"]] == [
-        ("0", "one"), ("0", "other"), ("1", "one"), ("1", "other"),
-    ]  # fmt: skip
+        ("0", "one"),
+        ("0", "other"),
+        ("1", "one"),
+        ("1", "other"),
+    ]
     assert [len(seeds) for seeds in content["meta"]["scores"]["one"]] == [2, 2]
     assert (tmp_path / "out" / "sweep.png").stat().st_size > 5_000
     one = {"one": folder / "one" / "seed_0"}

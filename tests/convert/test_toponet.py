@@ -28,9 +28,11 @@ ELEMENTS = ElementDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24)
 DECODER = LaneDecoderConfig(dim=16, heads=4, layers=2, queries=8, hidden=24, relation=128, refine="fixed")
 TOPONET = TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS)
 BASELINE = BevFormerDetrConfig(
-    ENCODER, LaneDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24, relation=128, refine="fixed"),
-    ELEMENTS, control_points=5,
-)  # fmt: skip
+    ENCODER,
+    LaneDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24, relation=128, refine="fixed"),
+    ELEMENTS,
+    control_points=5,
+)
 
 
 def fixture(name, prefix):

@@ -39,14 +39,21 @@ def assert_state(got, expected):
 @pytest.mark.parametrize(
     ("kind", "dtype", "returned"),
     [
-        ("FloatStorage", np.float32, np.float32), ("DoubleStorage", np.float64, np.float64),
-        ("HalfStorage", np.float16, np.float32), ("BFloat16Storage", ml_dtypes.bfloat16, np.float32),
-        ("CharStorage", np.int8, np.int8), ("ByteStorage", np.uint8, np.uint8), ("ShortStorage", np.int16, np.int16),
-        ("IntStorage", np.int32, np.int32), ("LongStorage", np.int64, np.int64), ("BoolStorage", np.bool_, np.bool_),
-        ("ComplexFloatStorage", np.complex64, np.complex64), ("ComplexDoubleStorage", np.complex128, np.complex128),
+        ("FloatStorage", np.float32, np.float32),
+        ("DoubleStorage", np.float64, np.float64),
+        ("HalfStorage", np.float16, np.float32),
+        ("BFloat16Storage", ml_dtypes.bfloat16, np.float32),
+        ("CharStorage", np.int8, np.int8),
+        ("ByteStorage", np.uint8, np.uint8),
+        ("ShortStorage", np.int16, np.int16),
+        ("IntStorage", np.int32, np.int32),
+        ("LongStorage", np.int64, np.int64),
+        ("BoolStorage", np.bool_, np.bool_),
+        ("ComplexFloatStorage", np.complex64, np.complex64),
+        ("ComplexDoubleStorage", np.complex128, np.complex128),
     ],
     ids=str,
-)  # fmt: skip
+)
 @pytest.mark.parametrize("write", [write_zip, write_legacy, "big"])
 def test_every_element_type(tmp_path, kind, dtype, returned, write):
     values = (RNG.standard_normal((3, 5)) * 9).astype(dtype)
@@ -91,9 +98,14 @@ def test_views_of_a_shared_storage(tmp_path, write):
         nothing=of(np.zeros((2, 0))),
     )
     expected = {
-        "whole": GRID, "transposed": GRID.T, "window": GRID[1:3, ::2][:, :3], "scalar": GRID[3, 5],
-        "repeated": np.broadcast_to(GRID[:, 1], (3, 4)), "empty": GRID[:0], "nothing": np.zeros((2, 0), np.float32),
-    }  # fmt: skip
+        "whole": GRID,
+        "transposed": GRID.T,
+        "window": GRID[1:3, ::2][:, :3],
+        "scalar": GRID[3, 5],
+        "repeated": np.broadcast_to(GRID[:, 1], (3, 4)),
+        "empty": GRID[:0],
+        "nothing": np.zeros((2, 0), np.float32),
+    }
     expected = {name: np.asarray(value) for name, value in expected.items()}
     assert_state(read_state_dict(write(tmp_path / "w.pth", state)), expected)
 
@@ -134,8 +146,13 @@ def test_what_wraps_a_tensor(tmp_path, write):
     wrapped = Call(named(utils, "_rebuild_parameter"), one, True, collections.OrderedDict())
     with_state = Call(named(utils, "_rebuild_parameter_with_state"), one, True, {}, tag)
     arguments = (storage(GRID), 0, (4, 6), (6, 1), False, {})
-    with_type = Call(named("torch._tensor", "_rebuild_from_type_v2"), named(utils, "_rebuild_tensor_v2"),
-                     named("torch", "Tensor"), arguments, tag)  # fmt: skip
+    with_type = Call(
+        named("torch._tensor", "_rebuild_from_type_v2"),
+        named(utils, "_rebuild_tensor_v2"),
+        named("torch", "Tensor"),
+        arguments,
+        tag,
+    )
     signs = tensor(storage(GRID), (4, 6), rest=(False, {}, {"neg": True}))
     old = tensor(storage(GRID), (4, 6), rebuild="_rebuild_tensor", rest=())
     state = collections.OrderedDict(a=wrapped, b=with_state, c=with_type, d=signs, e=old)
@@ -261,8 +278,12 @@ def test_sorts_of_tensors_that_are_not_read(tmp_path):
     quantised = Call(
         named(utils, "_rebuild_qtensor"), Storage(b"1234", "QInt8Storage"), 0, (4,), (1,), scheme, False, {}
     )
-    half = tensor(Storage(b"12345678", "UntypedStorage", module="torch.storage"), (2,), rebuild="_rebuild_tensor_v3",
-                  rest=(False, {}, named("torch", "complex32")))  # fmt: skip
+    half = tensor(
+        Storage(b"12345678", "UntypedStorage", module="torch.storage"),
+        (2,),
+        rebuild="_rebuild_tensor_v3",
+        rest=(False, {}, named("torch", "complex32")),
+    )
     for odd, message in [
         (sparse, "a sparse"),
         (quantised, "a quantised"),
@@ -474,10 +495,16 @@ def test_files_of_pytorch_itself(tmp_path):
     net = torch.nn.Sequential(torch.nn.Conv2d(2, 3, 1), torch.nn.BatchNorm2d(3))
     base = torch.arange(24.0).reshape(4, 6)
     state = net.state_dict() | {
-        "transposed": base.T, "row": base[2], "strided": base[1:3, ::2], "expanded": base[:1].expand(3, 6),
-        "parameter": torch.nn.Parameter(base), "scalar": torch.tensor(3), "empty": base[4:],
-        "conjugate": torch.tensor([1 + 2j]).conj(), "negative": torch.tensor([1 + 2j]).conj().imag,
-    }  # fmt: skip
+        "transposed": base.T,
+        "row": base[2],
+        "strided": base[1:3, ::2],
+        "expanded": base[:1].expand(3, 6),
+        "parameter": torch.nn.Parameter(base),
+        "scalar": torch.tensor(3),
+        "empty": base[4:],
+        "conjugate": torch.tensor([1 + 2j]).conj(),
+        "negative": torch.tensor([1 + 2j]).conj().imag,
+    }
     state |= {
         name: base.to(getattr(torch, name)) for name in ("float16", "bfloat16", "int16", "bool", "float64", "uint8")
     }

@@ -12,22 +12,46 @@ import numpy as np
 
 _FUNCTIONS = {
     "torch._utils": (
-        "_rebuild_tensor", "_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter",
-        "_rebuild_parameter_with_state", "_rebuild_sparse_tensor", "_rebuild_qtensor",
+        "_rebuild_tensor",
+        "_rebuild_tensor_v2",
+        "_rebuild_tensor_v3",
+        "_rebuild_parameter",
+        "_rebuild_parameter_with_state",
+        "_rebuild_sparse_tensor",
+        "_rebuild_qtensor",
     ),
     "torch._tensor": ("_rebuild_from_type_v2",),
     "torch.serialization": ("_get_layout",),
-}  # fmt: skip
+}
 _CLASSES = {
     "torch": (
-        "FloatStorage", "DoubleStorage", "HalfStorage", "BFloat16Storage", "CharStorage", "ByteStorage", "ShortStorage",
-        "IntStorage", "LongStorage", "BoolStorage", "ComplexFloatStorage", "ComplexDoubleStorage", "QInt8Storage",
-        "Tensor", "Size", "device", "float32", "uint16", "uint32", "float8_e4m3fn", "complex32", "per_tensor_affine",
+        "FloatStorage",
+        "DoubleStorage",
+        "HalfStorage",
+        "BFloat16Storage",
+        "CharStorage",
+        "ByteStorage",
+        "ShortStorage",
+        "IntStorage",
+        "LongStorage",
+        "BoolStorage",
+        "ComplexFloatStorage",
+        "ComplexDoubleStorage",
+        "QInt8Storage",
+        "Tensor",
+        "Size",
+        "device",
+        "float32",
+        "uint16",
+        "uint32",
+        "float8_e4m3fn",
+        "complex32",
+        "per_tensor_affine",
     ),
     "torch.storage": ("UntypedStorage",),
     "torch.nn.parameter": ("Parameter",),
     "torch.nn.modules.linear": ("Linear",),
-}  # fmt: skip
+}
 
 
 def _stand_ins():
@@ -73,8 +97,17 @@ class Storage:
     item: int = field(default=0)
 
     def __post_init__(self):
-        sizes = {"Float": 4, "Double": 8, "Half": 2, "BFloat16": 2, "Short": 2, "Int": 4, "Long": 8, "ComplexFloat": 8,
-                 "ComplexDouble": 16}  # fmt: skip
+        sizes = {
+            "Float": 4,
+            "Double": 8,
+            "Half": 2,
+            "BFloat16": 2,
+            "Short": 2,
+            "Int": 4,
+            "Long": 8,
+            "ComplexFloat": 8,
+            "ComplexDouble": 16,
+        }
         self.item = sizes.get(self.kind.removesuffix("Storage"), 1)
         self.size = len(self.data) // self.item if self.size is None else self.size
 

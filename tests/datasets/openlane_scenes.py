@@ -66,8 +66,16 @@ class DriveDataset:
         elements.lane[:3, 1:] = np.stack([order == 0, order == 2], -1)
         elements.valid[1:] = True
         return Example(
-            bev=None, hidden=None, traffic_flow=None, markers=None, sd_map=None, lanes=lanes, segments=segments,
-            areas=areas, traffic_elements=elements,
-            previous_from_ego=relative_pose(before, pose).astype(np.float32), has_previous=np.asarray(frame > 0),
+            bev=None,
+            hidden=None,
+            traffic_flow=None,
+            markers=None,
+            sd_map=None,
+            lanes=lanes,
+            segments=segments,
+            areas=areas,
+            traffic_elements=elements,
+            previous_from_ego=relative_pose(before, pose).astype(np.float32),
+            has_previous=np.asarray(frame > 0),
             cameras=fake_views(index, cameras=self.config.cameras),
-        )  # fmt: skip
+        )

@@ -14,9 +14,16 @@ def segment(number, centerline, successors=(), *, width=3.5, left=LineType.DASHE
     heading /= np.linalg.norm(heading, axis=-1, keepdims=True)
     side = np.column_stack([-heading[:, 1], heading[:, 0], np.zeros(len(line))]) * width / 2
     return LaneSegment(
-        number, line, line + side, line - side, left, right, other.pop("is_intersection", False), tuple(successors),
+        number,
+        line,
+        line + side,
+        line - side,
+        left,
+        right,
+        other.pop("is_intersection", False),
+        tuple(successors),
         **other,
-    )  # fmt: skip
+    )
 
 
 def lane_map(*segments, **other):
@@ -42,11 +49,16 @@ def log(vector_map, recorded, poses, keyframes, **other):
     """Return a log whose key frames are (track frame, pose)."""
     frames = len(poses)
     return Log(
-        name="small", source="test", map=vector_map, timestamps_ns=np.arange(frames) * 100_000_000,
-        global_from_ego=np.asarray(poses, float).reshape(frames, 4, 4), tracks=recorded, actors=recorded,
+        name="small",
+        source="test",
+        map=vector_map,
+        timestamps_ns=np.arange(frames) * 100_000_000,
+        global_from_ego=np.asarray(poses, float).reshape(frames, 4, 4),
+        tracks=recorded,
+        actors=recorded,
         keyframes=tuple(KeyFrame(frame * 100_000_000, np.asarray(pose), frame) for frame, pose in keyframes),
         **other,
-    )  # fmt: skip
+    )
 
 
 def drive(frames, *, start=(1000.0, -2000.0), step=0.7, turn=0.03):

@@ -40,9 +40,18 @@ def write(path, rows, columns=None):
 
 def box(frame, uuid, category, x, *, points=9):
     return {
-        "timestamp_ns": 1000 + 100 * frame, "track_uuid": uuid, "category": category, "length_m": 4.0, "width_m": 2.0,
-        "height_m": 1.5, **POSE, "tx_m": x, "qw": 0.0, "qz": 1.0, "num_interior_pts": points,
-    }  # fmt: skip
+        "timestamp_ns": 1000 + 100 * frame,
+        "track_uuid": uuid,
+        "category": category,
+        "length_m": 4.0,
+        "width_m": 2.0,
+        "height_m": 1.5,
+        **POSE,
+        "tx_m": x,
+        "qw": 0.0,
+        "qz": 1.0,
+        "num_interior_pts": points,
+    }
 
 
 def points(*xy):
@@ -50,11 +59,18 @@ def points(*xy):
 
 
 LANE = {
-    "id": 5, "is_intersection": False, "lane_type": "BIKE", "left_lane_boundary": points((0, 2), (40, 2)),
-    "left_lane_mark_type": "DASHED_WHITE", "right_lane_boundary": points((0, -2), (20, -2), (40, -2)),
-    "right_lane_mark_type": "NONE", "successors": [6], "predecessors": [], "left_neighbor_id": None,
+    "id": 5,
+    "is_intersection": False,
+    "lane_type": "BIKE",
+    "left_lane_boundary": points((0, 2), (40, 2)),
+    "left_lane_mark_type": "DASHED_WHITE",
+    "right_lane_boundary": points((0, -2), (20, -2), (40, -2)),
+    "right_lane_mark_type": "NONE",
+    "successors": [6],
+    "predecessors": [],
+    "left_neighbor_id": None,
     "right_neighbor_id": None,
-}  # fmt: skip
+}
 MAP = {
     "lane_segments": {"5": LANE},
     "pedestrian_crossings": {"1": {"id": 1, "edge1": points((0, 0), (0, 5)), "edge2": points((3, 0), (3, 5))}},
@@ -213,9 +229,17 @@ def test_check_names_everything_that_is_missing(tmp_path):
 
 @pytest.mark.parametrize(
     ("mark", "expected"),
-    [("NONE", 0), ("UNKNOWN", 0), ("SOLID_BLUE", 1), ("DOUBLE_SOLID_YELLOW", 1), ("DASHED_WHITE", 2),
-     ("DOUBLE_DASH_WHITE", 2), ("SOLID_DASH_YELLOW", 1), ("DASH_SOLID_WHITE", 2)],
-)  # fmt: skip
+    [
+        ("NONE", 0),
+        ("UNKNOWN", 0),
+        ("SOLID_BLUE", 1),
+        ("DOUBLE_SOLID_YELLOW", 1),
+        ("DASHED_WHITE", 2),
+        ("DOUBLE_DASH_WHITE", 2),
+        ("SOLID_DASH_YELLOW", 1),
+        ("DASH_SOLID_WHITE", 2),
+    ],
+)
 def test_line_types(mark, expected):
     assert line_type(mark) == expected
 
@@ -285,19 +309,30 @@ def test_real_histories(name, means, largest, crowded):
 @pytest.mark.parametrize(
     ("name", "counts", "means"),
     [
-        (FLAT, [[38, 21, 27], [40, 21, 27], [19, 12, 20], [21, 12, 20], [4, 4, 4], [4, 4, 7]],
-         (25.2, 25.2, 14.4, 14.4)),
-        (FORKED, [[52, 52, 55], [53, 53, 56], [26, 26, 28], [27, 27, 29], [4, 4, 4], [4, 4, 4]],
-         (53.7, 54.6, 26.9, 27.8)),
+        (
+            FLAT,
+            [[38, 21, 27], [40, 21, 27], [19, 12, 20], [21, 12, 20], [4, 4, 4], [4, 4, 7]],
+            (25.2, 25.2, 14.4, 14.4),
+        ),
+        (
+            FORKED,
+            [[52, 52, 55], [53, 53, 56], [26, 26, 28], [27, 27, 29], [4, 4, 4], [4, 4, 4]],
+            (53.7, 54.6, 26.9, 27.8),
+        ),
     ],
-)  # fmt: skip
+)
 def test_real_ground_truth(name, counts, means):
     found = [
-        [e.segments.valid.sum(), e.segments.successor.sum(), e.lanes.valid.sum(), e.lanes.successor.sum(),
-         (e.areas.category[e.areas.valid] == AreaType.PEDESTRIAN_CROSSING).sum(),
-         (e.areas.category[e.areas.valid] == AreaType.ROAD_BOUNDARY).sum()]
+        [
+            e.segments.valid.sum(),
+            e.segments.successor.sum(),
+            e.lanes.valid.sum(),
+            e.lanes.successor.sum(),
+            (e.areas.category[e.areas.valid] == AreaType.PEDESTRIAN_CROSSING).sum(),
+            (e.areas.category[e.areas.valid] == AreaType.ROAD_BOUNDARY).sum(),
+        ]
         for e in real_examples(name)
-    ]  # fmt: skip
+    ]
     assert np.array(found)[[0, 15, 31]].T.tolist() == counts
     assert np.mean(found, 0)[:4].round(1).tolist() == list(means)
 

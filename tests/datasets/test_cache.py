@@ -45,8 +45,10 @@ def test_examples_and_infos_come_back_bit_for_bit(tmp_path):
         read.example(index).validate()
         got, expected = read.info(index), dataset.info(index)
         assert (got.source, got.scene, got.timestamp_ns) == (
-            expected.source, expected.scene, expected.timestamp_ns,
-        )  # fmt: skip
+            expected.source,
+            expected.scene,
+            expected.timestamp_ns,
+        )
         assert got.global_from_ego.dtype == np.float64
         np.testing.assert_array_equal(got.global_from_ego, expected.global_from_ego)
 

@@ -62,8 +62,11 @@ def test_no_segments():
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
-@given(st.integers(1, 8).flatmap(lambda n: st.lists(st.lists(st.integers(0, n - 1), max_size=2, unique=True),
-                                                    min_size=n, max_size=n)))  # fmt: skip
+@given(
+    st.integers(1, 8).flatmap(
+        lambda n: st.lists(st.lists(st.integers(0, n - 1), max_size=2, unique=True), min_size=n, max_size=n)
+    )
+)
 def test_every_segment_is_in_one_chain_and_every_edge_is_kept_or_merged(successors):
     result = merged(*(straight(i, s) for i, s in enumerate(successors)))
     incoming = [sum(j in s for s in successors) for j in range(len(successors))]

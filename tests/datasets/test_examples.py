@@ -139,8 +139,7 @@ def test_a_building_hides_ground_and_lanes():
     pose = yaw_pose(1000.0, -2000.0, 0.0)
     road = dataclasses.replace(ROAD, buildings=building)
     open_, walled = (
-        make_example(log(m, tracks(np.zeros((1, 0, 3))), [pose], [(0, pose)]), 0, ExampleConfig())
-        for m in (ROAD, road)
+        make_example(log(m, tracks(np.zeros((1, 0, 3))), [pose], [(0, pose)]), 0, ExampleConfig()) for m in (ROAD, road)
     )
     assert open_.lanes.visibility[0] == 1.0
     # Seen from -50 m to the face at 18 m.

@@ -33,8 +33,11 @@ def east_north(latitude, longitude, origin):
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
-    st.floats(-60, 60), st.floats(-180, 180), st.floats(0, 2 * np.pi), st.sampled_from([(100.0, 3e-3), (1000.0, 0.3)]),
-)  # fmt: skip
+    st.floats(-60, 60),
+    st.floats(-180, 180),
+    st.floats(0, 2 * np.pi),
+    st.sampled_from([(100.0, 3e-3), (1000.0, 0.3)]),
+)
 def test_places_are_as_exact_as_promised(latitude, longitude, bearing, reach):
     distance, tolerance = reach
     origin = Origin(latitude, longitude)

@@ -22,9 +22,14 @@ NO_BOXES, NO_BUILDINGS = np.zeros((0, 7)), np.zeros((0, 5))
 def crop(vector_map, *, flavour="centerlines", pose=None, capacity=8, points=11, buildings=NO_BUILDINGS):
     prepared = prepare_map(vector_map, bike_lanes=True)
     return lane_graph(
-        getattr(prepared, flavour), np.eye(4) if pose is None else pose, RANGE, capacity=capacity, points=points,
-        boxes=NO_BOXES, buildings=buildings,
-    )  # fmt: skip
+        getattr(prepared, flavour),
+        np.eye(4) if pose is None else pose,
+        RANGE,
+        capacity=capacity,
+        points=points,
+        boxes=NO_BOXES,
+        buildings=buildings,
+    )
 
 
 def test_a_lane_is_cut_at_the_border_and_keeps_its_labels():
@@ -168,6 +173,7 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
         segment(11, [(10.0, 0.0), (20.0, 0.0)]),
         segment(12, [(0.0, 9.0), (10.0, 9.0)]),
     )
+
     def element(x, *governed):
         return MapElement(np.array([x, 1.0, 4.0]), 0.0, 1, 2, governed)
 

@@ -12,10 +12,15 @@ from tflane_jax.scene import Example, MarkerObservations, SdMap
 def full_example() -> Example:
     """An example with every part present."""
     markers = MarkerObservations(
-        marker_id=np.arange(2), pose=np.zeros((2, 4, 4)), score=np.ones(2), residual=np.zeros(2),
-        lanes=np.zeros((2, 3, 4, 3)), lane_valid=np.ones((2, 3), bool), successor=np.zeros((2, 3, 3), bool),
+        marker_id=np.arange(2),
+        pose=np.zeros((2, 4, 4)),
+        score=np.ones(2),
+        residual=np.zeros(2),
+        lanes=np.zeros((2, 3, 4, 3)),
+        lane_valid=np.ones((2, 3), bool),
+        successor=np.zeros((2, 3, 3), bool),
         valid=np.ones(2, bool),
-    )  # fmt: skip
+    )
     sd_map = SdMap(points=np.ones((1, 5, 2)), category=np.zeros(1, int), valid=np.ones(1, bool))
     return fake_example().replace(markers=markers, sd_map=sd_map, cameras=fake_views())
 

@@ -43,9 +43,19 @@ def test_a_whole_folder_is_counted(whole):
     assert found.faults == []
     assert found.subset == "B"
     assert found.rows == [
-        {"split": "train", "segments": 1, "frames": FRAMES, "-ls files": FRAMES, "images": 6 * FRAMES,
-         "lanes": 3 * FRAMES, "lane segments": 3 * FRAMES, "elements": 2 * FRAMES, "areas": FRAMES, "faults": 0}
-    ]  # fmt: skip
+        {
+            "split": "train",
+            "segments": 1,
+            "frames": FRAMES,
+            "-ls files": FRAMES,
+            "images": 6 * FRAMES,
+            "lanes": 3 * FRAMES,
+            "lane segments": 3 * FRAMES,
+            "elements": 2 * FRAMES,
+            "areas": FRAMES,
+            "faults": 0,
+        }
+    ]
 
 
 def set_rotation(content):
@@ -93,7 +103,7 @@ def element(**entries):
         ("-ls", lambda content: content["annotation"]["area"][0].update(category=3), "whole number from 1 to 2"),
         ("-ls", lambda content: content["annotation"]["lane_segment"][0].pop("left_laneline"), "lacks the entry"),
     ],
-)  # fmt: skip
+)
 def test_a_damaged_frame_is_named(folder, suffix, function, said):
     path = frame(folder, suffix=suffix)
     change(path, function)

@@ -106,8 +106,10 @@ def test_ids_stay_with_their_lanes(exported):
 
 def test_the_scorer_reads_it_too(exported):
     made = DriveDataset().example(0)
-    for frames, graph in ((read_truth(exported, progress=False), made.lanes),
-                          (read_segment_truth(exported, progress=False), made.segments)):  # fmt: skip
+    for frames, graph in (
+        (read_truth(exported, progress=False), made.lanes),
+        (read_segment_truth(exported, progress=False), made.segments),
+    ):
         assert len(frames) == 2 * len(DriveDataset())
         truth = next(iter(frames.values()))
         lanes = getattr(truth, "lanes", truth)

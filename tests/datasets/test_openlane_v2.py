@@ -80,8 +80,9 @@ def test_presets_have_the_papers_sizes(config, front, others, canvas):
     assert canvas_size([fit.size for fit in fits], config.divisor) == canvas
 
 
-@pytest.mark.parametrize("config", [ImageConfig(front_rows=(8, 28), scale=0.5), ImageConfig(front_size=(60, 20)),
-                                    ImageConfig(scale=0.25)])  # fmt: skip
+@pytest.mark.parametrize(
+    "config", [ImageConfig(front_rows=(8, 28), scale=0.5), ImageConfig(front_size=(60, 20)), ImageConfig(scale=0.25)]
+)
 def test_pixels_intrinsics_and_boxes_move_together(config):
     """A marked pixel, a point projected there and a box around it stay together."""
     fit = fit_image(48, 32, config, front=True)
@@ -89,8 +90,10 @@ def test_pixels_intrinsics_and_boxes_move_together(config):
     image[16:20, 20:24] = 250
     result = fit.image(image)
     assert result.shape[1::-1] == fit.size
-    v, u = (np.average(np.arange(n) + 0.5, weights=result[..., 0].sum(axis)) for n, axis in zip(
-        result.shape[:2], (1, 0), strict=True))  # fmt: skip
+    v, u = (
+        np.average(np.arange(n) + 0.5, weights=result[..., 0].sum(axis))
+        for n, axis in zip(result.shape[:2], (1, 0), strict=True)
+    )
     intrinsics = np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
     place = np.array([[(22 - 24) / 40 * 10, (18 - 16) / 40 * 10, 10.0]])  # the middle of the mark, camera frame
     pixel, _, _ = project(place, fit.intrinsics(intrinsics), np.eye(4))
@@ -109,8 +112,9 @@ def test_images_in_an_example(whole):
     block = made.cameras.image[1, :32, :48].reshape(16, 2, 24, 2, 3).mean((1, 3))
     np.testing.assert_allclose(views.image[1], block, atol=1)
     assert not views.image[0, 13:].any()
-    np.testing.assert_allclose(example.traffic_elements.box[:2],
-                               [[[5, 0], [7, 3.25]], [[15, 0], [16.5, 1.5]]], atol=1e-4)  # fmt: skip
+    np.testing.assert_allclose(
+        example.traffic_elements.box[:2], [[[5, 0], [7, 3.25]], [[15, 0], [16.5, 1.5]]], atol=1e-4
+    )
     lower = opened(whole, ImageConfig(front_rows=(10, 32), divisor=8)).example(0).traffic_elements
     assert lower.valid.tolist() == [True, False, False]
     assert lower.attribute[0] == 2
@@ -179,15 +183,20 @@ def copied_image(folder):
         (copied_image, "is 48 x 16 pixels, the first image of CAM_FRONT|is 48 x 32 pixels"),
         (lambda folder: info(folder).write_text("{"), "is no JSON file"),
         (lambda folder: change(info(folder), lambda content: content.pop("sensor")), "lacks the entry 'sensor'"),
-        (lambda folder: change(info(folder), lambda content: content["sensor"]["CAM_FRONT"]["intrinsic"].update(
-            K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]])), "is no camera matrix"),
+        (
+            lambda folder: change(
+                info(folder),
+                lambda content: content["sensor"]["CAM_FRONT"]["intrinsic"].update(K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]]),
+            ),
+            "is no camera matrix",
+        ),
         (lambda folder: info(folder, 1).unlink(), r"1 of 3 frames are missing \(train/01000/"),
         (lambda folder: shutil.rmtree(folder / "train"), "3 of 3 frames are missing"),
         (lambda folder: (folder / "data_dict_subset_B.json").write_text("{}"), "lacks the entry 'train'"),
         (lambda folder: (folder / "data_dict_subset_B.json").write_text('{"train": {}}'), "names no frame of split"),
         (shutil.rmtree, "there is no folder"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_named(folder, damage, said):
     damage(folder)
     with pytest.raises(UserError, match=said):
@@ -210,8 +219,9 @@ def test_settings_that_do_not_fit_the_folder_are_named(whole, change, said):
 
 def test_it_is_training_data(whole):
     """Through the system: streamed, augmented in the workers, shapes as announced."""
-    data = OpenLaneV2Data(whole, val="train", subset="B", image=NATIVE, example=SIZES,
-                          loading=StreamingConfig(threads=2, ahead=2))  # fmt: skip
+    data = OpenLaneV2Data(
+        whole, val="train", subset="B", image=NATIVE, example=SIZES, loading=StreamingConfig(threads=2, ahead=2)
+    )
     config = RunConfig(data=data)
     system = system_of(config)
     loaded = system.load(data.source("train"))

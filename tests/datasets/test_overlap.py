@@ -78,9 +78,12 @@ def test_openlane_folders_on_the_command_line(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("pose", "message"),
-    [({}, "lacks the entry 'pose'"), ({"pose": {"translation": [0, 1]}}, "expected \\(3,\\)"),
-     ({"pose": {"translation": [0, float("nan"), 1]}}, "must be finite")],
-)  # fmt: skip
+    [
+        ({}, "lacks the entry 'pose'"),
+        ({"pose": {"translation": [0, 1]}}, "expected \\(3,\\)"),
+        ({"pose": {"translation": [0, float("nan"), 1]}}, "must be finite"),
+    ],
+)
 def test_damaged_frames_are_named(tmp_path, pose, message):
     (tmp_path / "s" / "info").mkdir(parents=True)
     (tmp_path / "s" / "info" / "7.json").write_text(json.dumps(pose))

@@ -37,8 +37,9 @@ def test_views_change_on_their_own_and_nothing_else_changes():
         np.testing.assert_array_equal(after.image[i, height:], views.image[i, height:])
         np.testing.assert_array_equal(after.image[i, :, width:], views.image[i, :, width:])
     alone = views.replace(valid=np.arange(6) == 1)
-    np.testing.assert_array_equal(augment_views(alone, PhotometricConfig(), 3).image[1],
-                                  augment_views(views, PhotometricConfig(), 3).image[1])  # fmt: skip
+    np.testing.assert_array_equal(
+        augment_views(alone, PhotometricConfig(), 3).image[1], augment_views(views, PhotometricConfig(), 3).image[1]
+    )
     assert after.intrinsics is views.intrinsics
 
 
@@ -71,13 +72,16 @@ def test_saturation_and_hue_are_those_of_hsv(colour):
     hues = [(360 * (colorsys.rgb_to_hsv(*colour)[0] - hue) + 180) % 360 - 180 for colour in turned]
     assert -19 < min(hues) < -10
     assert 10 < max(hues) < 19
-    np.testing.assert_allclose([colorsys.rgb_to_hsv(*colour)[1:] for colour in turned],
-                               [(saturation, value)] * 30, atol=0.01)  # fmt: skip
+    np.testing.assert_allclose(
+        [colorsys.rgb_to_hsv(*colour)[1:] for colour in turned], [(saturation, value)] * 30, atol=0.01
+    )
 
 
 def test_channels_are_swapped():
-    swaps = {tuple(np.argsort(distorted(replace(NOTHING, swap=1.0), seed, np.array([[[10, 20, 30]]], np.uint8))[0, 0]))
-             for seed in range(40)}  # fmt: skip
+    swaps = {
+        tuple(np.argsort(distorted(replace(NOTHING, swap=1.0), seed, np.array([[[10, 20, 30]]], np.uint8))[0, 0]))
+        for seed in range(40)
+    }
     assert len(swaps) == 6
 
 

@@ -196,9 +196,14 @@ def test_numbers_in_other_units_are_refused(shape, camera, message):
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.integers(1, 6000), st.integers(1, 6000), st.floats(0.06, 1e4), st.floats(-1.0, 0.99), st.floats(0, 1),
-    st.booleans(), st.booleans(),
-)  # fmt: skip
+    st.integers(1, 6000),
+    st.integers(1, 6000),
+    st.floats(0.06, 1e4),
+    st.floats(-1.0, 0.99),
+    st.floats(0, 1),
+    st.booleans(),
+    st.booleans(),
+)
 def test_placements_lie_in_the_photo_and_invert(height, width, focal, horizon, column, has_focal, has_horizon):
     focal, horizon = focal * width if has_focal else None, horizon * height if has_horizon else None
     camera = PhotoCamera(focal, horizon, column * width)

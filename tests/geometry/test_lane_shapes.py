@@ -24,8 +24,11 @@ AHEAD = np.linspace(8.0, 90.0, 30)
 
 curves = st.builds(
     lambda k, m, n, b: GroundCurve(*map(np.float64, (k, m, n, b))),
-    st.floats(-1e-5, 1e-5), st.floats(-2e-3, 2e-3), st.floats(-0.2, 0.2), st.floats(-8, 8),
-)  # fmt: skip
+    st.floats(-1e-5, 1e-5),
+    st.floats(-2e-3, 2e-3),
+    st.floats(-0.2, 0.2),
+    st.floats(-8, 8),
+)
 pitches = st.floats(-0.15, 0.15)
 
 

@@ -61,8 +61,9 @@ def test_resampling_commutes_with_motion_and_reversal(seed, points, count):
     yaw = seed % 7
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     pose = pose_matrix(turn, np.array([3.0, -40.0, 2.0]))
-    np.testing.assert_allclose(resample(transform_points(pose, line), count),
-                               transform_points(pose, resample(line, count)), atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(
+        resample(transform_points(pose, line), count), transform_points(pose, resample(line, count)), atol=1e-9
+    )
     np.testing.assert_allclose(resample(line[::-1], count), resample(line, count)[::-1], atol=1e-9)
 
 

@@ -38,12 +38,14 @@ def test_inverse_composition_and_rigidity(seed, dims):
     a, b = random_poses(seed, (3,), dims=dims), random_poses(seed + 1, (3,), dims=dims)
     points = np.random.default_rng(seed).uniform(-50, 50, (3, 7, dims))
     np.testing.assert_allclose(invert_pose(a) @ a, np.broadcast_to(np.eye(dims + 1), a.shape), atol=1e-12)
-    np.testing.assert_allclose(transform_points(a @ b, points), transform_points(a, transform_points(b, points)),
-                               atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        transform_points(a @ b, points), transform_points(a, transform_points(b, points)), atol=1e-12
+    )
     np.testing.assert_allclose(transform_points(invert_pose(a), transform_points(a, points)), points, atol=1e-12)
     moved = transform_points(a, points)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(moved, axis=1), axis=-1),
-                               np.linalg.norm(np.diff(points, axis=1), axis=-1), atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(moved, axis=1), axis=-1), np.linalg.norm(np.diff(points, axis=1), axis=-1), atol=1e-12
+    )
 
 
 @QUICK

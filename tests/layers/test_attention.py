@@ -349,6 +349,7 @@ def test_module_matches_torch(path):
         assert not np.any(np.asarray(actual[name])[np.isnan(case.outputs[name])])
 
     if case.gradients:
+
         def scalar(torch, arrays):
             return sum((outputs(torch, arrays)[name] * weight).sum() for name, weight in case.weights.items())
 

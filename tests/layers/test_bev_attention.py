@@ -88,8 +88,12 @@ def test_spatial_attention_matches_the_reference(path, capacity):
             factor = np.maximum(seen[0], 1) / np.maximum(count, 1)
             return query + (attended - bias[None]) * factor[:, None] + bias[None]
 
-        per_element = (arrays["query"], arrays["feats"].transpose(2, 0, 1, 3),
-                       arrays["reference_points_cam"].swapaxes(0, 1), seen)  # fmt: skip
+        per_element = (
+            arrays["query"],
+            arrays["feats"].transpose(2, 0, 1, 3),
+            arrays["reference_points_cam"].swapaxes(0, 1),
+            seen,
+        )
         out = jnp.stack([one(*a) for a in zip(*per_element, strict=True)])
         return (out * case.weights["output"]).sum(), out
 

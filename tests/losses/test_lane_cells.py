@@ -51,8 +51,9 @@ def test_offsets_are_in_cells_and_directions_in_metres():
 def test_the_nearer_of_two_lanes_speaks_and_those_outside_fill_nothing():
     cells = lane_cells(
         graph([[0.0, 0.5, 0], [8.0, 0.5, 0]], [[8.0, 3.0, 0], [0.0, 3.0, 0]], [[0.0, 4.5, 0], [-3.0, -1.0, 0]]),
-        SHAPE, RANGE,
-    )  # fmt: skip
+        SHAPE,
+        RANGE,
+    )
     np.testing.assert_allclose(cells.direction[:2, 2:, 0], 1.0, atol=1e-6)
     np.testing.assert_allclose(cells.direction[2:, 2:, 0], -1.0, atol=1e-6)
     np.testing.assert_array_equal(cells.inside[0], True)

@@ -21,7 +21,6 @@ def jitted_loss(lanes, truth, config):
     return lane_graph_loss(Prediction(lanes), truth, config)
 
 
-
 BATCH, LAYERS, QUERIES, LANES, POINTS = 3, 2, 7, 5, 4
 
 

@@ -74,8 +74,9 @@ def test_few_lines(count):
 def test_the_order_of_lines_and_queries_does_not_matter():
     truth, prediction = lines(), predictions()
     turn = lambda tree, order, axis: jax.tree.map(lambda leaf: jnp.take(leaf, order, axis), tree)  # noqa: E731
-    mixed = value_and_gradient(turn(prediction, jnp.array([3, 1, 6, 0, 2, 5, 4]), 2),
-                               turn(truth, jnp.array([2, 3, 0, 1]), 1))  # fmt: skip
+    mixed = value_and_gradient(
+        turn(prediction, jnp.array([3, 1, 6, 0, 2, 5, 4]), 2), turn(truth, jnp.array([2, 3, 0, 1]), 1)
+    )
     for ours, expected in zip(mixed[:2], value_and_gradient(prediction, truth)[:2], strict=True):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), ours, expected)
 
@@ -83,8 +84,9 @@ def test_the_order_of_lines_and_queries_does_not_matter():
 def test_gradient_is_that_of_finite_differences():
     targets = lane_curve_targets(lines())
     config = LaneCurveLossConfig(least_depth=1e-2)
-    check_grads(lambda p: lane_curve_loss(p, targets, config)[0], (predictions(),), 1, ["rev"], eps=1e-3, atol=2e-2,
-                rtol=2e-2)  # fmt: skip
+    check_grads(
+        lambda p: lane_curve_loss(p, targets, config)[0], (predictions(),), 1, ["rev"], eps=1e-3, atol=2e-2, rtol=2e-2
+    )
 
 
 def test_a_perfect_prediction_costs_nothing_but_doubt():

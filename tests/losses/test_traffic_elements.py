@@ -32,10 +32,14 @@ def make_elements(seed, counts, related):
         one = TrafficElements.empty(ELEMENTS, truth.valid.shape[1])
         low = rng.uniform(0, 30, (ELEMENTS, 2))
         box = np.stack([low, low + rng.uniform(4, 18, (ELEMENTS, 2))], 1).astype(np.float32)
-        elements.append(one.replace(
-            box=box, attribute=rng.integers(0, 13, ELEMENTS).astype(np.int32),
-            lane=rng.random(one.lane.shape) < 0.5, valid=rng.permutation(ELEMENTS) < count,
-        ))  # fmt: skip
+        elements.append(
+            one.replace(
+                box=box,
+                attribute=rng.integers(0, 13, ELEMENTS).astype(np.int32),
+                lane=rng.random(one.lane.shape) < 0.5,
+                valid=rng.permutation(ELEMENTS) < count,
+            )
+        )
     low = rng.uniform(0, 30, (BATCH, LAYERS, FOUND, 2))
     found = ElementPrediction(
         box=np.stack([low, low + rng.uniform(4, 18, low.shape)], -2).astype(np.float32),

@@ -68,10 +68,16 @@ def test_the_picture_is_written(tmp_path):
     assert path.stat().st_size > 1000
 
 
-@pytest.mark.parametrize("config", [
-    replace(SMALL, distances=()), replace(SMALL, distances=(0.5,)), replace(SMALL, seeds=0), replace(SMALL, turns=()),
-    replace(SMALL, mounts=()),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "config",
+    [
+        replace(SMALL, distances=()),
+        replace(SMALL, distances=(0.5,)),
+        replace(SMALL, seeds=0),
+        replace(SMALL, turns=()),
+        replace(SMALL, mounts=()),
+    ],
+)
 def test_configs_that_mean_nothing_are_refused(config):
     with pytest.raises(UserError, match="markers are measured"):
         measure([config])

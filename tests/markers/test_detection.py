@@ -38,8 +38,11 @@ ARUCO, APRILTAG = MarkerFamily.ARUCO_5X5_100, MarkerFamily.APRILTAG_36H11
 INTRINSICS = np.array([[900.0, 0.0, 480.0], [0.0, 900.0, 270.0], [0.0, 0.0, 1.0]])
 AHEAD = FrontCamera(960, 540, INTRINSICS, camera_pose(1.5, 0.0))
 # A second one a metre to the left and turned to the right.
-ASIDE = replace(AHEAD, camera_from_ego=camera_pose(1.5, 0.0, np.deg2rad(-8.0)) @ np.array(
-    [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]))  # fmt: skip
+ASIDE = replace(
+    AHEAD,
+    camera_from_ego=camera_pose(1.5, 0.0, np.deg2rad(-8.0))
+    @ np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]),
+)
 
 
 def pose(x, y, z, turn=0.0):
@@ -179,8 +182,15 @@ def test_nothing_is_found_where_nothing_is(shape):
 
 
 def test_no_views_hold_no_markers():
-    found = detect(CameraViews(np.zeros((0, 4, 4, 3), np.uint8), np.zeros((0, 2)), np.zeros((0, 3, 3)),
-                               np.zeros((0, 4, 4)), np.zeros(0, bool)))  # fmt: skip
+    found = detect(
+        CameraViews(
+            np.zeros((0, 4, 4, 3), np.uint8),
+            np.zeros((0, 2)),
+            np.zeros((0, 3, 3)),
+            np.zeros((0, 4, 4)),
+            np.zeros(0, bool),
+        )
+    )
     assert not found.valid.any()
 
 
@@ -203,8 +213,11 @@ def test_score_is_the_stated_formula():
 
 
 @given(
-    x=st.floats(4.0, 40.0), bearing=st.floats(-0.4, 0.4), z=st.floats(0.5, 4.0), turn=st.floats(-70.0, 70.0),
-)  # fmt: skip
+    x=st.floats(4.0, 40.0),
+    bearing=st.floats(-0.4, 0.4),
+    z=st.floats(0.5, 4.0),
+    turn=st.floats(-70.0, 70.0),
+)
 @settings(deadline=None, max_examples=30)
 def test_exact_corners_give_the_exact_pose(x, bearing, z, turn):
     """Turned far enough for the two poses to differ, the right one is preferred."""
@@ -284,9 +297,17 @@ def test_outline_is_upper_left_first():
     np.testing.assert_allclose(middle[0], [0.5 * (left + right), 0.5 * (top + bottom)])
 
 
-@pytest.mark.parametrize("change", [
-    {"capacity": 0}, {"enlarge": 0}, {"size": 0.0}, {"least_pixels": float("nan")}, {"tilt": 0.0}, {"turn": -1.0},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"capacity": 0},
+        {"enlarge": 0},
+        {"size": 0.0},
+        {"least_pixels": float("nan")},
+        {"tilt": 0.0},
+        {"turn": -1.0},
+    ],
+)
 def test_settings_that_mean_nothing_are_refused(change):
     with pytest.raises(UserError, match=next(iter(change))):
         find_markers(np.zeros((60, 60), np.uint8), DetectorConfig(**change))

@@ -17,9 +17,10 @@ RANGE = PerceptionRange()
 SIZES = {"markers": 3, "lanes": 6, "points": 5}
 # Two lanes along x that join a third, which bends out of the range and comes back.
 LANES = lane_map(
-    segment(1, [(-60, 0), (20, 0)], [3]), segment(2, [(-60, 4), (0, 4), (20, 0)], [3]),
+    segment(1, [(-60, 0), (20, 0)], [3]),
+    segment(2, [(-60, 4), (0, 4), (20, 0)], [3]),
     segment(3, [(20, 0), (30, 0), (30, 40), (35, 40), (35, 0)]),
-).segments  # fmt: skip
+).segments
 PLACED = PlacedMarkers(
     np.array([5, 8, 2]), marker_pose(np.array([[20, -5, 3], [40, -5, 3], [-10, -5, 3.0]]), np.full(3, np.pi))
 )
@@ -159,9 +160,7 @@ def test_a_marker_without_lanes_has_the_residual_of_its_place():
     store = store_of({}, PLACED)
     before = detect(PLACED.pose)
     before.pose[:, :2, 3] += [3.0, 4.0]
-    markers = observe(
-        detect(PLACED.pose), store, RANGE, previous=before, now_from_previous=np.eye(4), **SIZES
-    ).markers
+    markers = observe(detect(PLACED.pose), store, RANGE, previous=before, now_from_previous=np.eye(4), **SIZES).markers
     np.testing.assert_allclose(markers.residual, 5.0, atol=1e-5)
 
 

@@ -244,7 +244,13 @@ def test_a_log_of_real_data_gets_virtual_markers():
     # Both segments are one merged centerline, from the range's border, or 50 m before the marker, to the other border.
     assert observed.lane_valid[row].sum() == 1
     np.testing.assert_allclose(observed.lanes[row, 0, [0, -1], 0], [40.0 - np.sqrt(50.0**2 - 3.05**2), 50.0], atol=0.1)
-    turned = replace(scene, seed=2, keyframes=(replace(scene.keyframes[0], global_from_ego=yaw_pose(
-        np.array([0.0]), np.array([0.0]), np.array([np.pi])
-    )[0]),))  # fmt: skip
+    turned = replace(
+        scene,
+        seed=2,
+        keyframes=(
+            replace(
+                scene.keyframes[0], global_from_ego=yaw_pose(np.array([0.0]), np.array([0.0]), np.array([np.pi]))[0]
+            ),
+        ),
+    )
     assert not marker_observations(turned, 0, config, PerceptionRange(), bike_lanes=True).valid.any()

@@ -43,10 +43,12 @@ def in_map(marker: StoredMarker):
 def fork():
     """A lane along x that forks at x = 0; its left branch leaves the circle around the origin and comes back."""
     return lane_map(
-        segment(1, [(-80, 0), (-40, 0), (0, 0)], [2, 3]), segment(2, [(0, 0), (60, 0)]),
-        segment(3, [(0, 0), (0, 60), (10, 60), (10, 0)], [5]), segment(4, [(0, 200), (10, 200)]),
+        segment(1, [(-80, 0), (-40, 0), (0, 0)], [2, 3]),
+        segment(2, [(0, 0), (60, 0)]),
+        segment(3, [(0, 0), (0, 60), (10, 60), (10, 0)], [5]),
+        segment(4, [(0, 200), (10, 200)]),
         segment(5, [(10, 0), (20, 0)]),
-    ).segments  # fmt: skip
+    ).segments
 
 
 def test_lanes_within_the_radius_are_cut_at_the_circle():
@@ -150,7 +152,7 @@ def saved(tmp_path):
         (lambda r: r["markers"][1]["global_from_marker"].reverse(), "marker 1: global_from_marker is no pose"),
         (lambda r: r["markers"].append(3), "markers[2] is of type int"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_in_a_file_is_named(tmp_path, change, message):
     record = saved(tmp_path)
     change(record)
@@ -208,9 +210,14 @@ def test_unknown_ids_give_no_prior_and_are_counted():
 
 
 def test_entries_out_of_date_give_no_prior():
-    store = MarkerStore({
-        1: dated(1), 2: dated(2, DAY), 3: dated(3, DAY, DAY + datetime.timedelta(10)), 4: dated(4, None, DAY),
-    })  # fmt: skip
+    store = MarkerStore(
+        {
+            1: dated(1),
+            2: dated(2, DAY),
+            3: dated(3, DAY, DAY + datetime.timedelta(10)),
+            4: dated(4, None, DAY),
+        }
+    )
     with pytest.warns(StaleMarkerWarning, match="survey them again"):
         looked = look_up(store, [1, 2, 3, 4], today=DAY)
     assert [m is not None for m in looked.found] == [True, True, True, False]

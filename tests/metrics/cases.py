@@ -18,28 +18,32 @@ def hand_frame() -> tuple[LaneDetections, LaneTruth]:
     Detections, best first: A 0.5 m aside; B 2 m above (1.9 m after relaxation); A again; C reversed (9.8 m).
     """
     truth = LaneTruth(
-        points=np.stack([
-            straight((0, 0, 0), (10, 0, 0)),
-            straight((10, 0, 0), (20, 0, 0)),
-            straight((0, 4, 0), (10, 4, 0)),
-        ]),
+        points=np.stack(
+            [
+                straight((0, 0, 0), (10, 0, 0)),
+                straight((10, 0, 0), (20, 0, 0)),
+                straight((0, 4, 0), (10, 4, 0)),
+            ]
+        ),
         successor=np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0]], bool),
         visibility=np.array([1.0, 0.2, 0.4]),
         elements=ElementTruth(
             boxes=np.array([[[0, 0], [10, 10]]]), attributes=np.array([2]), lane=np.array([[1], [0], [0]], bool)
         ),
-    )  # fmt: skip
+    )
     successor = np.zeros((4, 4))
     successor[0, 1], successor[0, 0] = 0.8, 0.6
     lane = np.zeros((4, 2))
     lane[0, 1] = 0.7
     detections = LaneDetections(
-        points=np.stack([
-            straight((0, 0.5, 0), (10, 0.5, 0)),
-            straight((10, 0, 2), (20, 0, 2)),
-            straight((0, 0.2, 0), (10, 0.2, 0)),
-            straight((10, 4, 0), (0, 4, 0)),
-        ]),
+        points=np.stack(
+            [
+                straight((0, 0.5, 0), (10, 0.5, 0)),
+                straight((10, 0, 2), (20, 0, 2)),
+                straight((0, 0.2, 0), (10, 0.2, 0)),
+                straight((10, 4, 0), (0, 4, 0)),
+            ]
+        ),
         scores=np.array([0.9, 0.8, 0.7, 0.6]),
         successor=successor,
         elements=ElementDetections(
@@ -48,7 +52,7 @@ def hand_frame() -> tuple[LaneDetections, LaneTruth]:
             scores=np.array([0.5, 0.9]),
             lane=lane,
         ),
-    )  # fmt: skip
+    )
     return detections, truth
 
 

@@ -40,21 +40,27 @@ def load_segments(name: str) -> list[tuple[SegmentDetections, SegmentTruth, Arra
     """Return the same of a lane-segment case."""
     case = _Case("lanesegment", name)
     detections, truths = case.lanes()
-    sides = {(who, which): case.lines(f"{who}_{which}", f"{who}_lane")
-             for who in ("gt", "pd") for which in ("left", "right")}  # fmt: skip
+    sides = {
+        (who, which): case.lines(f"{who}_{which}", f"{who}_lane") for who in ("gt", "pd") for which in ("left", "right")
+    }
     areas = {who: case.lines(f"{who}_area", f"{who}_area") for who in ("gt", "pd")}
     categories = {who: case.rows(f"{who}_area_cat", f"{who}_area") for who in ("gt", "pd")}
     scores = case.rows("pd_area_conf", "pd_area")
     return [
         (
-            SegmentDetections(detection, sides["pd", "left"][f], sides["pd", "right"][f],
-                              AreaDetections(areas["pd"][f], categories["pd"][f], scores[f])),
-            SegmentTruth(truth, sides["gt", "left"][f], sides["gt", "right"][f],
-                         AreaTruth(areas["gt"][f], categories["gt"][f])),
+            SegmentDetections(
+                detection,
+                sides["pd", "left"][f],
+                sides["pd", "right"][f],
+                AreaDetections(areas["pd"][f], categories["pd"][f], scores[f]),
+            ),
+            SegmentTruth(
+                truth, sides["gt", "left"][f], sides["gt", "right"][f], AreaTruth(areas["gt"][f], categories["gt"][f])
+            ),
             official,
         )
         for f, (detection, truth, official) in enumerate(zip(detections, truths, case.official(), strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def load_maps(name: str) -> list[tuple[MapDetections, MapTruth, list[Arrays]]]:
@@ -113,18 +119,21 @@ class _Case:
         scores, element_scores = self.rows("pd_lane_conf", "pd_lane"), self.rows("pd_te_conf", "pd_te")
         detections = [
             LaneDetections(
-                points["pd"][f], scores[f], ll["pd"][f],
+                points["pd"][f],
+                scores[f],
+                ll["pd"][f],
                 ElementDetections(boxes["pd"][f], attributes["pd"][f], element_scores[f], lt["pd"][f]),
             )
             for f in self.frames
-        ]  # fmt: skip
+        ]
         truths = [
             LaneTruth(
-                points["gt"][f], ll["gt"][f].astype(bool),
+                points["gt"][f],
+                ll["gt"][f].astype(bool),
                 elements=ElementTruth(boxes["gt"][f], attributes["gt"][f], lt["gt"][f].astype(bool)),
             )
             for f in self.frames
-        ]  # fmt: skip
+        ]
         return detections, truths
 
     def official(self) -> list[Arrays]:

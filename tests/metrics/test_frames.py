@@ -108,7 +108,9 @@ def _sure(edges):
 
 def test_device_arrays_are_taken_too():
     prediction = make_prediction()
-    on_device = LanePrediction(*(jnp.asarray(leaf) for leaf in (
-        prediction.points, prediction.logits, prediction.successor_logits)))  # fmt: skip
-    np.testing.assert_array_equal(detections_from_prediction(on_device).points,
-                                  detections_from_prediction(prediction).points)  # fmt: skip
+    on_device = LanePrediction(
+        *(jnp.asarray(leaf) for leaf in (prediction.points, prediction.logits, prediction.successor_logits))
+    )
+    np.testing.assert_array_equal(
+        detections_from_prediction(on_device).points, detections_from_prediction(prediction).points
+    )

@@ -49,9 +49,11 @@ def test_golden_totals(case):
         assert lanesegnet[name] == pytest.approx(stable[name], abs=1e-6), name
     if not expected["tie_sensitive"]:
         for ours, official, thresholds in (
-            ("DET_l", "DET_l", LANE_THRESHOLDS), ("crossing", "DET_a_ped", AREA_THRESHOLDS),
-            ("boundary", "DET_a_boundary", AREA_THRESHOLDS), ("DET_t", "DET_t", range(13)),
-        ):  # fmt: skip
+            ("DET_l", "DET_l", LANE_THRESHOLDS),
+            ("crossing", "DET_a_ped", AREA_THRESHOLDS),
+            ("boundary", "DET_a_boundary", AREA_THRESHOLDS),
+            ("DET_t", "DET_t", range(13)),
+        ):
             key = f"{official}_per_{'attribute' if ours == 'DET_t' else 'threshold'}"
             got = [result[f"{ours}@{t}"] for t in thresholds]
             np.testing.assert_allclose(got, expected["olus"][key], atol=1e-6, err_msg=key)
@@ -112,10 +114,14 @@ def frame(true, found, scores, areas=((), ()), found_areas=((), (), ())):
     )
     g, p = len(true), len(found)
     return (
-        SegmentDetections(LaneDetections(fc, np.array(scores, float), np.zeros((p, p))), fl, fr,
-                          AreaDetections(found_areas[0], np.array(found_areas[1], int), np.array(found_areas[2]))),
+        SegmentDetections(
+            LaneDetections(fc, np.array(scores, float), np.zeros((p, p))),
+            fl,
+            fr,
+            AreaDetections(found_areas[0], np.array(found_areas[1], int), np.array(found_areas[2])),
+        ),
         SegmentTruth(LaneTruth(tc, np.zeros((g, g), bool)), tl, tr, AreaTruth(areas[0], np.array(areas[1], int))),
-    )  # fmt: skip
+    )
 
 
 def test_a_shift_counts_one_and_a_half_times():
@@ -173,8 +179,10 @@ def test_order_does_not_matter_and_parts_merge(seed):
     pick = lambda lines: [lines[i] for i in order]  # noqa: E731
     shuffled = SegmentDetections(
         LaneDetections(pick(detections.lanes.points), detections.lanes.scores[order], detections.lanes.successor),
-        pick(detections.left), pick(detections.right), detections.areas,
-    )  # fmt: skip
+        pick(detections.left),
+        pick(detections.right),
+        detections.areas,
+    )
     assert evaluate([(shuffled, truth), *frames[1:]]) == pytest.approx(whole)
     first, second = LaneSegmentMetrics(), LaneSegmentMetrics()
     first.update(*frames[0])

@@ -34,9 +34,11 @@ def images(case):
         yield (
             RowLanes(np.array(guess["lanes"], float), run_time=guess["run_time"]),
             RowLanes(np.array(record["lanes"], float), np.array(record["h_samples"], float)),
-            {name: expected[name][i] for name in
-             ("per_frame_acc_fp_fn", "pixel_threshold_per_gt_lane", "line_accuracy_gt_x_pred")},
-        )  # fmt: skip
+            {
+                name: expected[name][i]
+                for name in ("per_frame_acc_fp_fn", "pixel_threshold_per_gt_lane", "line_accuracy_gt_x_pred")
+            },
+        )
 
 
 @pytest.mark.golden

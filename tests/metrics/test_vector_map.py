@@ -135,8 +135,10 @@ def test_points_vanish_and_lines_without_length_stay():
 def test_sampling_of_detections():
     # 100 points bunched at both ends: resampled they equal the truth, as given they leave its middle alone.
     bunched = line(0, np.concatenate([np.linspace(0, 0.1, 50), np.linspace(9.9, 10, 50)]))
-    for points, hits in ((bunched, {"maptr": 1, "maptrv2": 0, "as_given": 0}),
-                         (bunched[:-1], {"maptr": 1, "maptrv2": 1, "as_given": 0})):  # fmt: skip
+    for points, hits in (
+        (bunched, {"maptr": 1, "maptrv2": 0, "as_given": 0}),
+        (bunched[:-1], {"maptr": 1, "maptrv2": 1, "as_given": 0}),
+    ):
         one = frame([line(0)], [points], [0.9])
         assert {sampling: evaluate([one], sampling)["AP_divider@0.5"] for sampling in KEYS} == hits
 

@@ -60,16 +60,26 @@ def make_example(seed: int = 0, instances: int = 9, lanes: int = 4) -> Example:
 CAMERA = CameraEncoderConfig(
     ImageEncoderConfig(ResNetConfig((1, 1, 1, 1), (4, 4, 8, 8), stem_channels=4), pyramid=FeaturePyramidConfig(16, 2)),
     BevFormerConfig(
-        BevGrid(rows=4, columns=6), dim=16, heads=2, layers=1, hidden=16, dropout=0.1, spatial_points=4, anchors=2,
-        levels=2, cameras=2,
+        BevGrid(rows=4, columns=6),
+        dim=16,
+        heads=2,
+        layers=1,
+        hidden=16,
+        dropout=0.1,
+        spatial_points=4,
+        anchors=2,
+        levels=2,
+        cameras=2,
     ),
     cells=True,
-)  # fmt: skip
+)
 ELEMENTS = ElementDecoderConfig(dim=16, heads=2, layers=2, queries=5, hidden=16, sampling_points=2, dropout=0.1)
 CAMERA_TOPONET = dataclasses.replace(
-    WITH_TRAFFIC, encoder=CAMERA, elements=ELEMENTS,
+    WITH_TRAFFIC,
+    encoder=CAMERA,
+    elements=ELEMENTS,
     decoder=dataclasses.replace(BASELINE.decoder, refine="fixed", dropout=0.1),
-)  # fmt: skip
+)
 CAMERA_DETR = BevFormerDetrConfig(
     CAMERA, dataclasses.replace(CAMERA_TOPONET.decoder, points=11), ELEMENTS, control_points=5
 )
@@ -88,6 +98,8 @@ def make_camera_example(seed: int = 0, instances: int = 9, lanes: int = 4, eleme
         truth.box[i] = [[10.0 + 20 * i, 8.0], [22.0 + 20 * i, 20.0 + i]]
         truth.attribute[i], truth.lane[i, i], truth.valid[i] = 1 + i, True, True
     return make_example(seed, instances, lanes).replace(
-        bev=None, hidden=None, traffic_elements=truth,
+        bev=None,
+        hidden=None,
+        traffic_elements=truth,
         cameras=CameraViews(image, size, intrinsics, np.stack([ahead, back]), np.ones(2, bool)),
-    )  # fmt: skip
+    )

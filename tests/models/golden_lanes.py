@@ -13,10 +13,16 @@ from tflane_jax.scene import LaneGraph, stack_examples
 def decoder_config(sizes, points):
     low_x, low_y, low_z, high_x, high_y, high_z = sizes["pc_range"]
     return LaneDecoderConfig(
-        dim=sizes["C"], heads=sizes["heads"], layers=sizes["layers"], queries=sizes["num_query"], points=points,
-        hidden=sizes["ffn"], relation=128, refine="fixed",
+        dim=sizes["C"],
+        heads=sizes["heads"],
+        layers=sizes["layers"],
+        queries=sizes["num_query"],
+        points=points,
+        hidden=sizes["ffn"],
+        relation=128,
+        refine="fixed",
         range=PerceptionRange((low_x, high_x), (low_y, high_y), (low_z, high_z)),
-    )  # fmt: skip
+    )
 
 
 def truth(case, points, capacity=4):

@@ -31,9 +31,7 @@ def road_image(seed, lines=3, capacity=4):
     points = np.stack([columns, np.broadcast_to(ROWS, columns.shape)], -1).astype(np.float32)
     point_valid = np.arange(len(ROWS)) >= rng.integers(0, 5, (capacity, 1))
     image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-    return RoadImage(
-        image, np.ones((HEIGHT, WIDTH), bool), LaneLines(points, point_valid, np.arange(capacity) < lines)
-    )
+    return RoadImage(image, np.ones((HEIGHT, WIDTH), bool), LaneLines(points, point_valid, np.arange(capacity) < lines))
 
 
 def road_images(count, **options):

@@ -42,11 +42,20 @@ def golden_config(case):
     low, high = np.array(config["pc_range"]).reshape(2, 3)
     limits = PerceptionRange(*map(tuple, zip(low, high, strict=True)))
     return BevFormerConfig(
-        BevGrid(limits, *config["bev"]), config["C"], config["heads"], config.get("layers", 1),
-        config.get("ffn", 2 * config["C"]), temporal_points=config.get("tsa_points", 4),
-        spatial_points=config.get("num_points", 8), anchors=config.get("D", 4), levels=2, cameras=config["cams"],
-        align="reference", rotation_center=tuple(config.get("rotate_center", ())) or None, temporal_value="initial",
-    )  # fmt: skip
+        BevGrid(limits, *config["bev"]),
+        config["C"],
+        config["heads"],
+        config.get("layers", 1),
+        config.get("ffn", 2 * config["C"]),
+        temporal_points=config.get("tsa_points", 4),
+        spatial_points=config.get("num_points", 8),
+        anchors=config.get("D", 4),
+        levels=2,
+        cameras=config["cams"],
+        align="reference",
+        rotation_center=tuple(config.get("rotate_center", ())) or None,
+        temporal_value="initial",
+    )
 
 
 def golden_views(arrays):
@@ -74,8 +83,16 @@ def test_encoder_matches_the_reference(path):
         history = BevMemory(past, jnp.asarray("prev_bev" in arrays))
         out = BevEncoder(config).apply(
             {"params": renamed_params(torch_params, ENCODER)},
-            queries, position, tokens, shapes, reference, visible, history, arrays["shift"][0], True,
-        )  # fmt: skip
+            queries,
+            position,
+            tokens,
+            shapes,
+            reference,
+            visible,
+            history,
+            arrays["shift"][0],
+            True,
+        )
         return (out[None] * case.weights["output"]).sum(), out[None]
 
     gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
@@ -136,8 +153,9 @@ def test_paper_size_has_the_published_parameters():
     views = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, ring(7, (800, 1024))))
     for config in (BevFormerConfig(), BevFormerConfig(capacity=6000, remat=True, precision="bfloat16")):
         model = BevFormer(config)
-        out, fresh = jax.eval_shape(lambda *a, m=model: m.init_with_output(jax.random.key(0), *a, None, jnp.eye(4)),
-                                    levels, views)  # fmt: skip
+        out, fresh = jax.eval_shape(
+            lambda *a, m=model: m.init_with_output(jax.random.key(0), *a, None, jnp.eye(4)), levels, views
+        )
         assert sum(leaf.size for leaf in jax.tree.leaves(fresh)) == 7_667_648
         assert out.shape == (100, 200, 256)
         assert {leaf.dtype for leaf in jax.tree.leaves((fresh, out))} == {np.dtype("float32")}
@@ -156,9 +174,12 @@ def ring(cameras=3, shape=(48, 64)):
     k = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]], np.float32)
     size = np.tile([width, height], (cameras, 1)).astype(np.int32)
     return CameraViews(
-        np.zeros((cameras, *shape, 3), np.uint8), size, np.tile(k, (cameras, 1, 1)),
-        np.stack(turns).astype(np.float32), np.ones(cameras, bool),
-    )  # fmt: skip
+        np.zeros((cameras, *shape, 3), np.uint8),
+        size,
+        np.tile(k, (cameras, 1, 1)),
+        np.stack(turns).astype(np.float32),
+        np.ones(cameras, bool),
+    )
 
 
 def levels(seed=0, cameras=3):

@@ -93,9 +93,10 @@ def soiled(example):
     relation = elements.lane | ~elements.valid | ~lanes.valid[:, None]
     points = np.where(lanes.valid[:, None, None], lanes.points, np.nan)
     return example.replace(
-        cameras=example.cameras.replace(image=image), lanes=lanes.replace(points=points),
+        cameras=example.cameras.replace(image=image),
+        lanes=lanes.replace(points=points),
         traffic_elements=elements.replace(box=box, attribute=attribute, lane=relation),
-    )  # fmt: skip
+    )
 
 
 def test_what_stands_in_padding_changes_no_answer(fitted):
@@ -123,9 +124,17 @@ def test_a_broken_camera_may_show_anything(fitted):
 
 
 TERMS = {
-    "class", "points", "successor", "element_class", "element_box", "element_iou", "element_lane", "cells",
-    "matching/lanes", "matching/elements",
-}  # fmt: skip
+    "class",
+    "points",
+    "successor",
+    "element_class",
+    "element_box",
+    "element_iou",
+    "element_lane",
+    "cells",
+    "matching/lanes",
+    "matching/elements",
+}
 
 
 def test_both_hosts_have_one_loss(fitted):
@@ -209,9 +218,7 @@ def test_what_does_not_fit_is_an_error():
     with pytest.raises(UserError, match=r"have 3 and 2: set elements\.layers"):
         dataclasses.replace(CAMERA_TOPONET, elements=dataclasses.replace(CAMERA_TOPONET.elements, layers=3)).build()
     with pytest.raises(UserError, match='refine to "fixed"'):
-        dataclasses.replace(
-            CAMERA_DETR, decoder=dataclasses.replace(CAMERA_DETR.decoder, refine="iterative")
-        ).build()
+        dataclasses.replace(CAMERA_DETR, decoder=dataclasses.replace(CAMERA_DETR.decoder, refine="iterative")).build()
     unlabelled = batch_of(make_camera_example().replace(traffic_elements=None))
     with pytest.raises(UserError, match=r"set task\.model\.elements to None"):
         jax.eval_shape(task.loss, fit("toponet").params, unlabelled, key)

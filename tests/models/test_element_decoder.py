@@ -24,9 +24,15 @@ from tflane_jax.scene import ElementPrediction, TrafficElements, stack_examples
 
 def reference_config(sizes):
     return ElementDecoderConfig(
-        dim=sizes["C"], heads=sizes["heads"], levels=sizes["levels"], encoder_layers=sizes["enc"], layers=sizes["dec"],
-        queries=sizes["num_query"], sampling_points=sizes["points"], hidden=sizes["ffn"],
-    )  # fmt: skip
+        dim=sizes["C"],
+        heads=sizes["heads"],
+        levels=sizes["levels"],
+        encoder_layers=sizes["enc"],
+        layers=sizes["dec"],
+        queries=sizes["num_query"],
+        sampling_points=sizes["points"],
+        hidden=sizes["ffn"],
+    )
 
 
 def reference_truth(case, image, capacity=4):

@@ -102,10 +102,16 @@ def test_paper_size_has_the_published_parameters():
     encoder = ImageEncoder(PAPER_IMAGE_ENCODER)
     levels, fresh = jax.eval_shape(lambda c: encoder.init_with_output(jax.random.key(0), c), cameras)
     assert [level.shape for level in levels] == [
-        (7, 97, 128, 256), (7, 49, 64, 256), (7, 25, 32, 256), (7, 13, 16, 256)
-    ]  # fmt: skip
+        (7, 97, 128, 256),
+        (7, 49, 64, 256),
+        (7, 25, 32, 256),
+        (7, 13, 16, 256),
+    ]
     count = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))  # noqa: E731
     assert count(fresh["params"]["pyramid"]) == 3_278_592
-    norms = [leaf for path, leaf in jax.tree_util.tree_leaves_with_path(fresh["batch_stats"])
-             if path[-1].key in ("scale", "bias")]  # fmt: skip
+    norms = [
+        leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(fresh["batch_stats"])
+        if path[-1].key in ("scale", "bias")
+    ]
     assert count(fresh["params"]["backbone"]) + count(norms) == 23_508_032

@@ -72,9 +72,10 @@ def test_a_query_belongs_to_its_own_lane():
     lanes.successor[0, 0, 1] = True
     truth = np.nan_to_num(lanes.points)[:, None, None, :4]  # four queries, five slots
     perfect = LanePrediction(
-        points=jnp.asarray(truth), logits=jnp.where(jnp.arange(4) < 3, 20.0, -20.0)[None, None, None, :, None],
+        points=jnp.asarray(truth),
+        logits=jnp.where(jnp.arange(4) < 3, 20.0, -20.0)[None, None, None, :, None],
         successor_logits=jnp.where(lanes.successor[:, None, None, :4, :4], 20.0, -20.0),
-    )  # fmt: skip
+    )
     losses = lane_denoising_losses(perfect, lanes, LaneGraphLossConfig())
     assert all(float(term.sum()) < 1e-6 for term in losses.values())
     swapped = perfect.replace(points=perfect.points[:, :, :, [1, 0, 2, 3]])

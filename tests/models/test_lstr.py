@@ -63,8 +63,13 @@ def test_network_matches_the_reference(path):
 
         def one(image, padded):
             arguments = (image.transpose(1, 2, 0), padded[0] == 0)
-            return model.apply(variables, *arguments, train=train, mutable=["batch_stats", "intermediates"],
-                               rngs={"dropout": jax.random.key(0)})  # fmt: skip
+            return model.apply(
+                variables,
+                *arguments,
+                train=train,
+                mutable=["batch_stats", "intermediates"],
+                rngs={"dropout": jax.random.key(0)},
+            )
 
         prediction, state = jax.vmap(one, axis_name=BATCH_AXIS)(images, case.inputs["masks"])
         layers = state["intermediates"]["encoder"]

@@ -32,9 +32,11 @@ LINES = PolylineEncoderConfig(
     dim=8, layers=1, heads=2, hidden=8, dropout=0.0, bands=4, layout="interleaved", attend="points"
 )
 CONFIG = MarkerFusionConfig(
-    prior=MarkerPriorConfig(points=3, lanes=4), lines=LINES, heads=2,
+    prior=MarkerPriorConfig(points=3, lanes=4),
+    lines=LINES,
+    heads=2,
     memory=MarkerMemoryConfig(frames=3, decay=0.5, threshold=0.05),
-)  # fmt: skip
+)
 HOST = LaneGraphTask(replace(BASELINE, markers=CONFIG))
 PLAIN = LaneGraphTask(BASELINE)
 POSE = np.array([[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)

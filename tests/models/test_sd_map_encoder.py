@@ -72,9 +72,14 @@ def padded(rows, capacity, filler=np.nan):
 
 def golden_module_config(config):
     lines = PolylineEncoderConfig(
-        config["dmodel"], config["layers"], config["heads"], config["hidden"], 0.0, config["num_feats"],
+        config["dmodel"],
+        config["layers"],
+        config["heads"],
+        config["hidden"],
+        0.0,
+        config["num_feats"],
         config["temperature"],
-    )  # fmt: skip
+    )
     return SdMapModuleConfig(SdMapPriorConfig(categories=config["categories"]), lines)
 
 
@@ -92,9 +97,10 @@ def test_map_encoder_matches_the_reference(path):
         for i, category in enumerate(categories):
             lines = arrays[f"poly{i}"]
             sd_map = SdMap(
-                padded(lines, capacity), jnp.asarray(np.resize(category, capacity), jnp.int32),
+                padded(lines, capacity),
+                jnp.asarray(np.resize(category, capacity), jnp.int32),
                 jnp.arange(capacity) < len(lines),
-            )  # fmt: skip
+            )
             tokens, valid = encoder.apply(variables, sd_map)
             out[f"feat{i}"] = tokens[: len(lines)]
             np.testing.assert_array_equal(valid.shape, (capacity,))
@@ -137,9 +143,9 @@ def test_attention_to_the_map_matches_the_reference(path):
             with nn.intercept_methods(no_norm):
                 return fusion.apply(variables, query, position, tokens, valid)
 
-        out = jnp.stack([
-            one(*a) for a in zip(arrays["query"], arrays["query_pos"], arrays["value"], lines, strict=True)
-        ])
+        out = jnp.stack(
+            [one(*a) for a in zip(arrays["query"], arrays["query_pos"], arrays["value"], lines, strict=True)]
+        )
         return (out * case.weights["output"]).sum(), out
 
     gradient = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
@@ -164,9 +170,7 @@ def test_constructer_matches_the_reference(path):
     arrays = case.inputs
     config = replace(golden_config(case), value_projections=2)
     model, module = BevFormer(config), SdMapModuleConfig(heads=case.meta["config"]["heads"], absent="reference")
-    views = [
-        golden_views({"lidar2img": arrays["lidar2img"][i : i + 1], "img_hw": arrays["img_hw"]}) for i in range(2)
-    ]
+    views = [golden_views({"lidar2img": arrays["lidar2img"][i : i + 1], "img_hw": arrays["img_hw"]}) for i in range(2)]
     masks = np.stack([see_pillars(config, view)[1] for view in views])
     assert (masks[0] != masks[1]).any()
     counts = np.maximum(masks.any(-1).sum(1), 1)
@@ -186,9 +190,15 @@ def test_constructer_matches_the_reference(path):
 
             with nn.intercept_methods(serve_whom_the_first_sees):
                 return model.apply(
-                    variables, features, views, BevMemory.empty(config), jnp.zeros(2), motion,
-                    fuse=fused_with(module, maps, valid), method="encode",
-                ).reshape(-1, config.dim)  # fmt: skip
+                    variables,
+                    features,
+                    views,
+                    BevMemory.empty(config),
+                    jnp.zeros(2),
+                    motion,
+                    fuse=fused_with(module, maps, valid),
+                    method="encode",
+                ).reshape(-1, config.dim)
 
         features = [inputs[f"feat{k}"].transpose(0, 1, 3, 4, 2) for k in range(2)]
         maps = [inputs[f"map_feat{i}"] for i in range(2)]
@@ -216,8 +226,9 @@ def small_map(valid=VALID, filler=0.0):
     points = np.random.default_rng(0).uniform(-20, 20, (3, 11, 2)).astype(np.float32)
     return SdMap(
         np.where(valid[:, None, None], points, filler).astype(np.float32),
-        np.where(valid, [0, 7, 1], -5 if np.isnan(filler) else 0).astype(np.int32), valid,
-    )  # fmt: skip
+        np.where(valid, [0, 7, 1], -5 if np.isnan(filler) else 0).astype(np.int32),
+        valid,
+    )
 
 
 @pytest.mark.parametrize("attend", ["lines", "points"])
@@ -331,10 +342,11 @@ def test_encoders_fuse_the_map_in_every_layer(make, layers):
     out, gradients = run(params, small_map(filler=np.nan))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     assert all(
-        np.asarray(leaf).any() for path, leaf in jax.tree.leaves_with_path(gradients)
-        if any(key.key.startswith("sd_map") for key in path) and "key/bias" not in jax.tree_util.keystr(
-            path, simple=True, separator="/")
-    )  # fmt: skip
+        np.asarray(leaf).any()
+        for path, leaf in jax.tree.leaves_with_path(gradients)
+        if any(key.key.startswith("sd_map") for key in path)
+        and "key/bias" not in jax.tree_util.keystr(path, simple=True, separator="/")
+    )
     absent, gradients = run(params, small_map(np.zeros(3, bool), np.nan))
     assert np.abs(out - absent).max() > 0.05
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))

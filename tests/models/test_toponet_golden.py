@@ -67,13 +67,15 @@ def test_lane_head_matches_the_reference(path):
         assignment = match(cost, lanes.valid[:, None])
         terms = lane_losses(prediction.lanes, assignment, lanes, weights)
         terms["lcte"] = element_lane_loss(prediction.elements, assignment, found, lanes, elements, weights)
-        out = layers_first({
-            "all_cls_scores": prediction.lanes.logits,
-            "all_lanes_preds": prediction.lanes.points,
-            "all_lclc_preds": prediction.lanes.successor_logits[..., None],
-            "all_lcte_preds": prediction.elements.lane_logits[..., None],
-            "history_states": queries,
-        })
+        out = layers_first(
+            {
+                "all_cls_scores": prediction.lanes.logits,
+                "all_lanes_preds": prediction.lanes.points,
+                "all_lclc_preds": prediction.lanes.successor_logits[..., None],
+                "all_lcte_preds": prediction.elements.lane_logits[..., None],
+                "history_states": queries,
+            }
+        )
         names = {"lane_cls": "class", "lane_reg": "points", "lclc_rel": "successor", "lcte_rel": "lcte"}
         for name, term in names.items():
             out |= {f"loss.loss_{name}": terms[term][1], f"loss.d0.loss_{name}": terms[term][0]}

@@ -38,9 +38,7 @@ def tokens(seed=0, instances=4, **prior):
 def spatial(config, seed=0, valid=None, lane_mask=None):
     """Build a spatial encoder with random inputs; return module, parameters and arguments."""
     rng = np.random.default_rng(seed)
-    lanes, position, traffic = (
-        jnp.asarray(rng.normal(size=(n, DIM)).astype(np.float32)) for n in (LANES, LANES, 5)
-    )
+    lanes, position, traffic = (jnp.asarray(rng.normal(size=(n, DIM)).astype(np.float32)) for n in (LANES, LANES, 5))
     valid = jnp.arange(5) < 3 if valid is None else valid
     module = SpatialEncoder(config, DIM)
     arguments = (lanes, position, traffic, SpatialMask.from_validity(LANES, valid, lane_mask))

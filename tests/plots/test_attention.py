@@ -23,9 +23,13 @@ def test_lines_join_lanes_and_the_road_users_they_look_at(ax):
     weights = np.asarray([[0.0, 0.6, 0.9], [0.3, 0.01, np.nan]])
     # Token 0 is road user 1 and token 1 is road user 0; token 2 is padding.
     draw_lane_attention(
-        ax, example.lanes.points[:2], example.traffic_flow, weights,
-        instance=np.asarray([1, 0, 0]), valid=np.asarray([True, True, False]),
-    )  # fmt: skip
+        ax,
+        example.lanes.points[:2],
+        example.traffic_flow,
+        weights,
+        instance=np.asarray([1, 0, 0]),
+        valid=np.asarray([True, True, False]),
+    )
     middle, last = example.lanes.points[:, 2, :2], example.traffic_flow.position[:, -1, :2]
     np.testing.assert_allclose(
         ax.collections[0].get_segments(), [[middle[0], last[0]], [middle[1], last[1]]], rtol=1e-6
@@ -36,9 +40,14 @@ def test_lines_join_lanes_and_the_road_users_they_look_at(ax):
 def test_lanes_that_are_not_valid_are_left_out(ax):
     example = fake_example()
     draw_lane_attention(
-        ax, example.lanes.points[:2], example.traffic_flow, np.ones((2, 2)), instance=np.arange(2),
-        valid=np.ones(2, bool), lane_valid=np.asarray([True, False]),
-    )  # fmt: skip
+        ax,
+        example.lanes.points[:2],
+        example.traffic_flow,
+        np.ones((2, 2)),
+        instance=np.arange(2),
+        valid=np.ones(2, bool),
+        lane_valid=np.asarray([True, False]),
+    )
     assert len(ax.collections[0].get_segments()) == 2
 
 

@@ -17,9 +17,12 @@ RECORDS = [
 def test_values_are_sorted_by_split_name_step_and_seed():
     series = curves(reversed(RECORDS))
     assert set(series) == {
-        ("train", "loss"), ("train", "loss/points"), ("train", "learning_rate"),
-        ("val", "all/DET_l"), ("val", "occluded/DET_l"),
-    }  # fmt: skip
+        ("train", "loss"),
+        ("train", "loss/points"),
+        ("train", "learning_rate"),
+        ("val", "all/DET_l"),
+        ("val", "occluded/DET_l"),
+    }
     np.testing.assert_array_equal(series["train", "loss"][0], [10, 20])
     np.testing.assert_array_equal(series["train", "loss"][1], [[9.0], [0.1]])
     np.testing.assert_array_equal(series["val", "all/DET_l"][1], [[0.1, 0.3]])
@@ -33,8 +36,11 @@ def test_a_panel_holds_a_group_and_a_band_holds_the_seeds(tmp_path, monkeypatch)
     assert save_curves(tmp_path / "curves.png", records).stat().st_size > 2000
     drawn = [ax for ax in figures[0].axes if ax.axison]
     assert [ax.get_title(loc="left") for ax in drawn] == [
-        "train: loss", "train: learning_rate", "val: all", "val: occluded",
-    ]  # fmt: skip
+        "train: loss",
+        "train: learning_rate",
+        "val: all",
+        "val: occluded",
+    ]
     assert [line.get_label() for line in drawn[0].lines] == ["loss", "points"]
     assert drawn[0].get_yscale() == "log"
     np.testing.assert_allclose(drawn[2].lines[0].get_ydata(), [0.2, 0.5])

@@ -47,7 +47,6 @@ def test_many_models_take_further_lines(tmp_path):
     assert two_lines[0] > 1.7 * one_line[0]
 
 
-
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (1, 4), (5, 3)])
 def test_contact_sheet_shows_no_more_than_there_is(tmp_path, size, count):
     out = show_dataset(FakeDataset(FakeConfig(size=size)), count, tmp_path / "sheet.png")

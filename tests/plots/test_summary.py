@@ -15,8 +15,13 @@ def test_quantities_are_counted_over_the_examples():
     rows = summary(fake_example(0), full)
     # Five slots for lanes: two used in the first example, all in the second; visibility is 0.25, 1, 0, 0, 0.
     assert rows["lanes"] == {
-        "quantity": "lanes", "mean": 3.5, "least": 2, "most": 5, "capacity": 5, "full": 0.5,
-    }  # fmt: skip
+        "quantity": "lanes",
+        "mean": 3.5,
+        "least": 2,
+        "most": 5,
+        "capacity": 5,
+        "full": 0.5,
+    }
     assert rows["- hidden"]["mean"] == (1 + 4) / 2
     assert rows["- share in line of sight"]["mean"] == np.mean([1.25 / 2, 1.25 / 5])
     assert rows["- topology links"]["most"] == 1

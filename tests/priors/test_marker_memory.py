@@ -22,9 +22,11 @@ step = jax.jit(remember, static_argnums=4)
 def seen(trust, lanes=2, at=1.0):
     """Return a frame with some lanes of one marker, all points of the first one at (at, 0)."""
     out = MarkerLanes(
-        points=np.full((LANES, POINTS, 2), np.nan, np.float32), confidence=np.zeros(LANES, np.float32),
-        successor=np.zeros((LANES, LANES), bool), valid=np.arange(LANES) < lanes,
-    )  # fmt: skip
+        points=np.full((LANES, POINTS, 2), np.nan, np.float32),
+        confidence=np.zeros(LANES, np.float32),
+        successor=np.zeros((LANES, LANES), bool),
+        valid=np.arange(LANES) < lanes,
+    )
     for i in range(lanes):
         out.points[i] = [at, float(i)]
         out.confidence[i] = trust

@@ -17,12 +17,15 @@ def observations(markers=2, lanes=3, points=5, seed=0, valid=(True, True), garba
     pose = np.tile(np.eye(4, dtype=np.float32), (markers, 1, 1))
     pose[:, :3, 3] = rng.uniform(-30, 30, (markers, 3))
     out = MarkerObservations(
-        marker_id=np.arange(markers), pose=pose, score=rng.uniform(0.5, 1, markers).astype(np.float32),
+        marker_id=np.arange(markers),
+        pose=pose,
+        score=rng.uniform(0.5, 1, markers).astype(np.float32),
         residual=rng.uniform(0, 5, markers).astype(np.float32),
         lanes=rng.uniform(-40, 40, (markers, lanes, points, 3)).astype(np.float32),
-        lane_valid=rng.random((markers, lanes)) < 0.7, successor=rng.random((markers, lanes, lanes)) < 0.3,
+        lane_valid=rng.random((markers, lanes)) < 0.7,
+        successor=rng.random((markers, lanes, lanes)) < 0.3,
         valid=np.array(valid[:markers], bool),
-    )  # fmt: skip
+    )
     out.validate()
     gone, lane_gone = ~out.valid, ~(out.lane_valid & out.valid[:, None])
     for value in (out.pose, out.score, out.residual):

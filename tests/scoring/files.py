@@ -16,11 +16,12 @@ def centerline_annotation(truth: LaneTruth) -> dict[str, Any]:
     elements = zip(truth.elements.boxes, truth.elements.attributes, strict=True)
     return {
         "lane_centerline": [{"id": str(i), "points": np.asarray(p).tolist()} for i, p in enumerate(truth.points)],
-        "traffic_element": [{"id": str(i), "points": b.tolist(), "attribute": int(a)} for i, (b, a) in
-                            enumerate(elements)],
+        "traffic_element": [
+            {"id": str(i), "points": b.tolist(), "attribute": int(a)} for i, (b, a) in enumerate(elements)
+        ],
         "topology_lclc": truth.successor.astype(int).tolist(),
         "topology_lcte": truth.elements.lane.astype(int).tolist(),
-    }  # fmt: skip
+    }
 
 
 def centerline_prediction(detections: LaneDetections) -> dict[str, Any]:
@@ -31,11 +32,12 @@ def centerline_prediction(detections: LaneDetections) -> dict[str, Any]:
     lanes = zip(detections.points, detections.scores, strict=True)
     return {
         "lane_centerline": [{"id": i, "points": np.array(p), "confidence": c} for i, (p, c) in enumerate(lanes)],
-        "traffic_element": [{"id": i, "points": b, "attribute": a, "confidence": c} for i, (b, a, c) in
-                            enumerate(elements)],
+        "traffic_element": [
+            {"id": i, "points": b, "attribute": a, "confidence": c} for i, (b, a, c) in enumerate(elements)
+        ],
         "topology_lclc": detections.successor,
         "topology_lcte": found.lane,
-    }  # fmt: skip
+    }
 
 
 def write_submission(path, frames: dict[tuple[str, str, str], LaneDetections], change=lambda results: None) -> None:

@@ -109,24 +109,40 @@ DAMAGE = {
     "extra frame": (rename, r"missing .*: val/10000/100 .*; 1 of 3 frames are predicted, but not .*: val/99/7"),
     "key": (bad_key, r"'100' is no frame, expected \(split, segment, timestamp\)"),
     "field": (lambda r: r[FRAMES[1]]["predictions"].pop("topology_lclc"), "frame val/10000/150 lacks .*topology_lclc"),
-    "no list": (lambda r: r[FRAMES[1]]["predictions"].update(lane_centerline=3),
-                "frame val/10000/150: lane_centerline is of type int, expected a list"),
-    "points": (lambda r: first(r, "lane_centerline")[2].update(points=np.zeros((11, 2))),
-               r"frame val/10000/150: lane_centerline\[2\].points has shape \(11, 2\), expected \(any, 3\)"),
+    "no list": (
+        lambda r: r[FRAMES[1]]["predictions"].update(lane_centerline=3),
+        "frame val/10000/150: lane_centerline is of type int, expected a list",
+    ),
+    "points": (
+        lambda r: first(r, "lane_centerline")[2].update(points=np.zeros((11, 2))),
+        r"frame val/10000/150: lane_centerline\[2\].points has shape \(11, 2\), expected \(any, 3\)",
+    ),
     "empty line": (lambda r: first(r, "lane_centerline")[2].update(points=[]), r"lane_centerline\[2\].points is empty"),
-    "NaN": (lambda r: first(r, "lane_centerline")[1]["points"].__setitem__((3, 0), np.nan),
-            r"frame val/10000/150: lane_centerline\[1\].points holds nan at \[3, 0\]"),
-    "words": (lambda r: first(r, "lane_centerline")[1].update(points="a line"),
-              r"frame val/10000/150: lane_centerline\[1\].points is of type str"),
-    "confidence": (lambda r: first(r, "lane_centerline")[3].update(confidence=1.5),
-                   r"frame val/10000/150: lane_centerline: confidence: number 3 is 1.5, expected 0 to 1"),
-    "topology": (lambda r: r[FRAMES[1]]["predictions"].update(topology_lclc=np.zeros((4, 3))),
-                 r"frame val/10000/150: topology_lclc has shape \(4, 3\), expected \(4, 4\)"),
-    "attribute": (lambda r: first(r, "traffic_element")[0].update(attribute=13),
-                  r"frame val/10000/150: traffic_element\[0\].attribute is 13, expected .* from 0 to 12"),
-    "box": (lambda r: first(r, "traffic_element")[0].update(points=np.zeros(4)),
-            r"traffic_element\[0\].points has shape \(4,\), expected \(2, 2\)"),
-}  # fmt: skip
+    "NaN": (
+        lambda r: first(r, "lane_centerline")[1]["points"].__setitem__((3, 0), np.nan),
+        r"frame val/10000/150: lane_centerline\[1\].points holds nan at \[3, 0\]",
+    ),
+    "words": (
+        lambda r: first(r, "lane_centerline")[1].update(points="a line"),
+        r"frame val/10000/150: lane_centerline\[1\].points is of type str",
+    ),
+    "confidence": (
+        lambda r: first(r, "lane_centerline")[3].update(confidence=1.5),
+        r"frame val/10000/150: lane_centerline: confidence: number 3 is 1.5, expected 0 to 1",
+    ),
+    "topology": (
+        lambda r: r[FRAMES[1]]["predictions"].update(topology_lclc=np.zeros((4, 3))),
+        r"frame val/10000/150: topology_lclc has shape \(4, 3\), expected \(4, 4\)",
+    ),
+    "attribute": (
+        lambda r: first(r, "traffic_element")[0].update(attribute=13),
+        r"frame val/10000/150: traffic_element\[0\].attribute is 13, expected .* from 0 to 12",
+    ),
+    "box": (
+        lambda r: first(r, "traffic_element")[0].update(points=np.zeros(4)),
+        r"traffic_element\[0\].points has shape \(4,\), expected \(2, 2\)",
+    ),
+}
 
 
 @pytest.mark.parametrize("damage", DAMAGE)

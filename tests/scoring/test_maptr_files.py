@@ -56,14 +56,18 @@ DAMAGE = {
     "missing": (lambda r: r.pop(1), "frames are missing from the predictions: s1"),
     "twice": (lambda r: r.append(r[0]), "sample s0 is there twice"),
     "class": (lambda r: r[1]["vectors"][0].update(cls_name="kerb"), r"sample s1: vectors\[0\].cls_name is 'kerb'"),
-    "NaN": (lambda r: r[1]["vectors"][0]["pts"].__setitem__(1, [0.0, float("nan")]),
-            r"sample s1: vectors\[0\].pts holds nan at \[1, 1\]"),
+    "NaN": (
+        lambda r: r[1]["vectors"][0]["pts"].__setitem__(1, [0.0, float("nan")]),
+        r"sample s1: vectors\[0\].pts holds nan at \[1, 1\]",
+    ),
     "flat": (lambda r: r[1]["vectors"][0].update(pts=[1, 2, 3]), r"vectors\[0\].pts has shape \(3,\)"),
     "no score": (lambda r: r[1]["vectors"][0].pop("confidence_level"), "lacks the entry 'confidence_level'"),
-    "score": (lambda r: r[1]["vectors"][2].update(confidence_level=1.2),
-              r"sample s1: confidence_level: number 2 is 1.2, expected 0 to 1"),
+    "score": (
+        lambda r: r[1]["vectors"][2].update(confidence_level=1.2),
+        r"sample s1: confidence_level: number 2 is 1.2, expected 0 to 1",
+    ),
     "no token": (lambda r: r[1].pop("sample_token"), r"results\[1\] lacks the entry 'sample_token'"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.golden

@@ -22,10 +22,22 @@ def json_frames():
         detections, truth = random_frame(seed)
         metrics.update(detections, truth)
         name = {"scene": scene, "timestamp_ns": time}
-        predictions.append(name | {"points": [p.tolist() for p in detections.points],
-                                   "scores": detections.scores.tolist(), "successor": detections.successor.tolist()})
-        truths.append(name | {"points": [p.tolist() for p in truth.points], "visibility": truth.visibility.tolist(),
-                              "successor": truth.successor.astype(int).tolist()})  # fmt: skip
+        predictions.append(
+            name
+            | {
+                "points": [p.tolist() for p in detections.points],
+                "scores": detections.scores.tolist(),
+                "successor": detections.successor.tolist(),
+            }
+        )
+        truths.append(
+            name
+            | {
+                "points": [p.tolist() for p in truth.points],
+                "visibility": truth.visibility.tolist(),
+                "successor": truth.successor.astype(int).tolist(),
+            }
+        )
     return predictions, truths, metrics.compute()
 
 
@@ -39,13 +51,28 @@ def write_npz(folder, **changes):
     detections, truth = hand_frame()
     name = {"scene": np.array([s for s, _ in SCENES]), "timestamp_ns": np.array([t for _, t in SCENES])}
     three = lambda array: np.stack([np.asarray(array)] * 3)  # noqa: E731
-    predictions = name | {"points": three(detections.points), "scores": three(detections.scores),
-                          "successor": three(detections.successor)}  # fmt: skip
-    slot = lambda array, axes: np.pad(three(array).astype(float), [(0, 0), *[(0, 1)] * axes,  # noqa: E731
-                                      *[(0, 0)] * (np.ndim(array) - axes)], constant_values=np.nan)  # fmt: skip
+    predictions = name | {
+        "points": three(detections.points),
+        "scores": three(detections.scores),
+        "successor": three(detections.successor),
+    }
+    def slot(array, axes):
+        return np.pad(
+            three(array).astype(float),
+            [
+                (0, 0),
+                *[(0, 1)] * axes,
+                *[(0, 0)] * (np.ndim(array) - axes),
+            ],
+            constant_values=np.nan,
+        )
     valid = three([True] * len(truth.points) + [False])
-    truths = name | {"points": slot(truth.points, 1), "successor": slot(truth.successor, 2), "valid": valid,
-                     "visibility": slot(truth.visibility, 1)}  # fmt: skip
+    truths = name | {
+        "points": slot(truth.points, 1),
+        "successor": slot(truth.successor, 2),
+        "valid": valid,
+        "visibility": slot(truth.visibility, 1),
+    }
     np.savez(folder / "p.npz", **(predictions | changes))
     np.savez(folder / "t.npz", **truths)
 

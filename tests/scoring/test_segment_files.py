@@ -43,8 +43,7 @@ def write(folder, frames, change=lambda results: None):
 
 def run(folder, protocol):
     out = folder / "out"
-    code = main(["score", protocol, str(folder / "submission.pkl"), str(folder / "annotations.pkl"),
-                 "--out", str(out)])  # fmt: skip
+    code = main(["score", protocol, str(folder / "submission.pkl"), str(folder / "annotations.pkl"), "--out", str(out)])
     return code, json.loads(out.with_suffix(".json").read_text())["rows"][0] if code == 0 else {}
 
 

@@ -33,9 +33,11 @@ class LineTask:
         x = batch["x"] * jax.random.bernoulli(key, 0.9, batch["x"].shape)
         error = jax.vmap(lambda features: self._apply(params, features))(x) - batch["y"][:, None]
         total = jax.pure_callback(
-            _host_sum, jax.ShapeDtypeStruct(x.shape[:-1], jnp.float32), jax.lax.stop_gradient(x),
+            _host_sum,
+            jax.ShapeDtypeStruct(x.shape[:-1], jnp.float32),
+            jax.lax.stop_gradient(x),
             vmap_method="expand_dims",
-        )  # fmt: skip
+        )
         fit = (error**2).mean()
         explosive = jnp.where((batch["x"] > self.blow_up).any(), jnp.inf, 0.0)
         return fit + explosive + 0.0 * total.mean(), {"fit": fit, "explosive": explosive}

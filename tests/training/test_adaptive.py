@@ -86,9 +86,19 @@ def test_no_restart_near_the_end_of_the_run(left, verdict):
 
 @pytest.mark.parametrize(
     "change",
-    [{"threshold": 1.0}, {"threshold": -0.1}, {"share": 1.5}, {"extend": -1.0}, {"extend": math.inf},
-     {"max_extensions": -1}, {"grace": math.nan}, {"patience": 0}, {"shrink": 0.0}, {"shrink": 1.1}],
-)  # fmt: skip
+    [
+        {"threshold": 1.0},
+        {"threshold": -0.1},
+        {"share": 1.5},
+        {"extend": -1.0},
+        {"extend": math.inf},
+        {"max_extensions": -1},
+        {"grace": math.nan},
+        {"patience": 0},
+        {"shrink": 0.0},
+        {"shrink": 1.1},
+    ],
+)
 def test_settings_that_cannot_work_are_named(change):
     check_adaptive(RULE)
     with pytest.raises(UserError, match=rf"adaptive\.{next(iter(change))} is"):

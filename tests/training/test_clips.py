@@ -25,10 +25,13 @@ CLIPS = replace(ALONE, clip=3)
 
 def scenes(count=2, length=3, sight=(True, False, False)):
     """Return frames of some scenes in order, markers in sight in some of them."""
-    return stack_examples([
-        seeing(observed(seed=s, valid=sight[i % len(sight)]), 10 * s + i, has_previous=np.asarray(i > 0))
-        for s in range(count) for i in range(length)
-    ])  # fmt: skip
+    return stack_examples(
+        [
+            seeing(observed(seed=s, valid=sight[i % len(sight)]), 10 * s + i, has_previous=np.asarray(i > 0))
+            for s in range(count)
+            for i in range(length)
+        ]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -253,9 +253,14 @@ def test_two_processes_never_share_a_folder(tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "name"),
-    [({"steps": 0}, "steps"), ({"batch_size": 0}, "batch_size"), ({"log_every": 0}, "log_every"),
-     ({"seeds": ()}, "seeds"), ({"seeds": (1, 1)}, "seeds")],
-)  # fmt: skip
+    [
+        ({"steps": 0}, "steps"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"log_every": 0}, "log_every"),
+        ({"seeds": ()}, "seeds"),
+        ({"seeds": (1, 1)}, "seeds"),
+    ],
+)
 def test_settings_that_cannot_work_are_named(tmp_path, change, name):
     with pytest.raises(UserError, match=rf"training\.{name} is"):
         run(tmp_path / "run", config=dataclasses.replace(CONFIG, **change))
@@ -265,8 +270,13 @@ def test_settings_that_cannot_work_are_named(tmp_path, change, name):
 def test_training_needs_no_evaluation(tmp_path):
     config = dataclasses.replace(CONFIG, steps=3)
     result = train(
-        LineTask(), line_arrays(), tmp_path / "run", config=config, optim=dataclasses.replace(OPTIM, warmup_steps=0),
-        resolved=RESOLVED, progress=False,
-    )  # fmt: skip
+        LineTask(),
+        line_arrays(),
+        tmp_path / "run",
+        config=config,
+        optim=dataclasses.replace(OPTIM, warmup_steps=0),
+        resolved=RESOLVED,
+        progress=False,
+    )
     assert (result.step, result.metrics) == (3, {})
     assert Checkpoints(tmp_path / "run" / "checkpoints").find("last") == 3

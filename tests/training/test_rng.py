@@ -21,8 +21,10 @@ def test_stream_is_the_documented_derivation():
 def test_streams_differ_by_root_name_and_step():
     keys = [
         words(stream(jax.random.key(seed), name, step))
-        for seed in (0, 1) for name in ("params", "dropout") for step in (0, 1, 2)
-    ]  # fmt: skip
+        for seed in (0, 1)
+        for name in ("params", "dropout")
+        for step in (0, 1, 2)
+    ]
     assert len(set(keys)) == len(keys)
 
 

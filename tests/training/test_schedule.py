@@ -189,9 +189,12 @@ def test_cosine_by_epoch_is_mmcvs(path):
     expected = case.outputs["mmcv_cosine_warmup_lr"]
     for group, lr in enumerate(mmcv["base"]):
         config = OptimConfig(
-            lr=lr, warmup_steps=mmcv["warmup_iters"], warmup_ratio=mmcv["warmup_ratio"],
-            final_ratio=mmcv["min_lr_ratio"], epoch_steps=mmcv["iters_per_epoch"],
-        )  # fmt: skip
+            lr=lr,
+            warmup_steps=mmcv["warmup_iters"],
+            warmup_ratio=mmcv["warmup_ratio"],
+            final_ratio=mmcv["min_lr_ratio"],
+            epoch_steps=mmcv["iters_per_epoch"],
+        )
         np.testing.assert_allclose(rates_of(config, steps, steps), expected[:, group], rtol=1e-6)
 
 

@@ -15,9 +15,7 @@ MIDDLE = np.array([[X, Y]])
 
 def ground(window, wear=0.5, levels=6):
     paint = paint_of(np.random.default_rng(1), STREET, paint_wear=wear, log_seed=3)
-    return draw_ground(
-        np.random.default_rng(2), STREET, paint, window, dirt=0.4, wet=0.0, urban=True, levels=levels
-    )  # fmt: skip
+    return draw_ground(np.random.default_rng(2), STREET, paint, window, dirt=0.4, wet=0.0, urban=True, levels=levels)
 
 
 def test_ground_stays_where_it_is_in_every_window():

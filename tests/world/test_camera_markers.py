@@ -85,10 +85,13 @@ def test_a_picture_darkens_the_image_by_its_area(distance):
     assert image[..., 0].sum() == pytest.approx(expected, rel=0.03, abs=0.5 * covered + 4.0)
 
 
-@pytest.mark.parametrize("corners", [
-    [(0.5, -0.5, 1.0), (0.5, 0.5, 1.0), (0.5, 0.5, 2.0), (0.5, -0.5, 2.0)],  # behind what is nearest
-    [(9.0, 90.5, 1.0), (9.0, 90.0, 1.0), (9.0, 90.0, 2.0), (9.0, 90.5, 2.0)],  # beside the image
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(0.5, -0.5, 1.0), (0.5, 0.5, 1.0), (0.5, 0.5, 2.0), (0.5, -0.5, 2.0)],  # behind what is nearest
+        [(9.0, 90.5, 1.0), (9.0, 90.0, 1.0), (9.0, 90.0, 2.0), (9.0, 90.5, 2.0)],  # beside the image
+    ],
+)
 def test_a_picture_outside_the_image_is_left_out(corners):
     image = np.full((CAMERA.height, CAMERA.width, 3), 7, np.uint8)
     paint_picture(image, np.array(corners), np.ones((2, 2)), CAMERA, np.full((2, 3), 200.0))
@@ -116,9 +119,10 @@ def test_a_marker_is_seen_from_its_face_only():
 
 def test_pictures_stay_with_their_polygons():
     """Whatever bodies are joined, chosen and moved."""
-    some, more = marker_bodies(markers(pose(9.0, 0.0, 2.5), pose(12.0, 1.0, 2.5))), marker_bodies(
-        markers(pose(15.0, 2.0, 2.5), ids=[5])
-    )  # fmt: skip
+    some, more = (
+        marker_bodies(markers(pose(9.0, 0.0, 2.5), pose(12.0, 1.0, 2.5))),
+        marker_bodies(markers(pose(15.0, 2.0, 2.5), ids=[5])),
+    )
     both = join([some, pack([], []), more])
     keep = np.ones(len(both.boxes), bool)
     keep[:2] = False  # first board and its post
@@ -158,9 +162,15 @@ def test_nothing_to_draw():
         assert (drawn(bodies) == 120).all()
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"covered": 1.2}, "share"), ({"size": 0.0}, "size"), ({"ids": [100]}, "0 to 99"), ({"ids": [-1]}, "0 to 99"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"covered": 1.2}, "share"),
+        ({"size": 0.0}, "size"),
+        ({"ids": [100]}, "0 to 99"),
+        ({"ids": [-1]}, "0 to 99"),
+    ],
+)
 def test_what_means_nothing_is_refused(change, words):
     covered = change.pop("covered", 0.0)
     with pytest.raises(UserError, match=words):

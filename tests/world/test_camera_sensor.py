@@ -135,9 +135,13 @@ def test_a_light_shows_its_state_inside_its_box(attribute, channel):
 
 def test_which_elements_are_seen():
     elements = [
-        light(), light(y=1.75, yaw=0.0), light(x=-25.0), light(y=-40.0), light(x=50.0, z=2.5, y=-5.0),
+        light(),
+        light(y=1.75, yaw=0.0),
+        light(x=-25.0),
+        light(y=-40.0),
+        light(x=50.0, z=2.5, y=-5.0),
         light(x=20.0, y=1.0, z=2.0, category=2, attribute=4),
-    ]  # fmt: skip
+    ]
     plain = visible_elements(scene(street(elements)), 0, FRONT)
     # Facing away, behind, outside of the image: not seen.
     assert plain.visible.tolist() == [True, False, False, False, True, True]

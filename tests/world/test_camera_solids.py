@@ -31,17 +31,31 @@ RED, GREEN = (0.9, 0.05, 0.05), (0.05, 0.9, 0.05)
 # Red must hide green at the point, wherever the middles of the bodies are.
 PAIRS = {
     "a car before a long wall whose middle is nearer": (
-        block(24.0, 4.0, 4.0, 1.8, 1.5, RED), block(15.0, 6.0, 30.0, 1.0, 5.0, GREEN), (22.0, 3.1, 1.0)),
+        block(24.0, 4.0, 4.0, 1.8, 1.5, RED),
+        block(15.0, 6.0, 30.0, 1.0, 5.0, GREEN),
+        (22.0, 3.1, 1.0),
+    ),
     "a wall before a car": (
-        block(15.0, 4.0, 30.0, 1.0, 3.0, RED), block(20.0, 6.0, 4.0, 1.8, 1.5, GREEN), (18.0, 3.4, 1.0)),
+        block(15.0, 4.0, 30.0, 1.0, 3.0, RED),
+        block(20.0, 6.0, 4.0, 1.8, 1.5, GREEN),
+        (18.0, 3.4, 1.0),
+    ),
     "the nearer of two in a row": (
-        block(10.0, 0.0, 4.0, 2.0, 2.5, RED), block(17.0, 0.0, 4.0, 2.0, 2.5, GREEN), (8.0, 0.5, 1.2)),
+        block(10.0, 0.0, 4.0, 2.0, 2.5, RED),
+        block(17.0, 0.0, 4.0, 2.0, 2.5, GREEN),
+        (8.0, 0.5, 1.2),
+    ),
     "a trunk below its crown, seen from below": (
-        block(10.0, 0.0, 0.4, 0.4, 3.0, RED), block(10.0, 0.0, 4.0, 4.0, 2.0, GREEN, base=3.0), (9.8, 0.0, 2.9)),
+        block(10.0, 0.0, 0.4, 0.4, 3.0, RED),
+        block(10.0, 0.0, 4.0, 4.0, 2.0, GREEN, base=3.0),
+        (9.8, 0.0, 2.9),
+    ),
     "a turned body beside another": (
-        block(14.0, 1.0, 8.0, 1.0, 2.0, RED, yaw=0.5), block(20.0, 2.0, 12.0, 1.0, 3.0, GREEN, yaw=0.5),
-        (13.0, 1.05, 1.0)),
-}  # fmt: skip
+        block(14.0, 1.0, 8.0, 1.0, 2.0, RED, yaw=0.5),
+        block(20.0, 2.0, 12.0, 1.0, 3.0, GREEN, yaw=0.5),
+        (13.0, 1.05, 1.0),
+    ),
+}
 
 
 @pytest.mark.parametrize("order", [1, -1])

@@ -19,9 +19,15 @@ TO_LINE = REACH - STOP
 def convoy(table, ways, position, speed, half=2.25):
     n = len(ways)
     return Convoy(
-        _routes(list(ways), table), np.full(n, half), np.ones(n), np.full(n, 30.0), np.full(n, 1.5), np.full(n, 1.2),
-        np.asarray(position, float), np.asarray(speed, float),
-    )  # fmt: skip
+        _routes(list(ways), table),
+        np.full(n, half),
+        np.ones(n),
+        np.full(n, 30.0),
+        np.full(n, 1.5),
+        np.full(n, 1.2),
+        np.asarray(position, float),
+        np.asarray(speed, float),
+    )
 
 
 def chosen(table, cars, red=(), walked_over=NOBODY):

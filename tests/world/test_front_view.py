@@ -91,9 +91,12 @@ def test_a_mirrored_road_has_mirrored_labels(scene_id):
     camera = FrontCamera(scene.camera.width, scene.camera.height, intrinsics, pose)
     axis = scene.road.axis
     road = replace(
-        scene.road, axis=ReferenceLine(axis.s, axis.xy * [1.0, -1.0], -axis.heading),
-        ego_offset=-scene.road.ego_offset, lines=-scene.road.lines[::-1], present=scene.road.present[::-1],
-    )  # fmt: skip
+        scene.road,
+        axis=ReferenceLine(axis.s, axis.xy * [1.0, -1.0], -axis.heading),
+        ego_offset=-scene.road.ego_offset,
+        lines=-scene.road.lines[::-1],
+        present=scene.road.present[::-1],
+    )
     there, back = label_lines(scene.camera, scene.road, 90.0), label_lines(camera, road, 90.0)
     count = int(there.valid.sum())
     assert back.valid.sum() == count

@@ -149,10 +149,12 @@ def test_a_polygon_that_hardly_begins_before_the_camera_is_no_trouble():
 
 def fleet(count: int) -> FrontTraffic:
     return FrontTraffic(
-        xy=np.linspace([12.0, -8.0], [40.0, 8.0], count).reshape(count, 2), yaw=np.zeros(count),
-        size=np.tile([4.5, 1.8, 1.5], (count, 1)), category=np.arange(count, dtype=np.int32) % 4,
+        xy=np.linspace([12.0, -8.0], [40.0, 8.0], count).reshape(count, 2),
+        yaw=np.zeros(count),
+        size=np.tile([4.5, 1.8, 1.5], (count, 1)),
+        category=np.arange(count, dtype=np.int32) % 4,
         look=np.full((count, 4), 0.3),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1, 8])

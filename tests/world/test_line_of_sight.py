@@ -81,11 +81,19 @@ def test_equals_walking_along_every_ray(seed, boxes, buildings):
     rng = np.random.default_rng(seed)
     points = rng.uniform(-40, 40, (20, 2))
     box = np.concatenate(
-        [rng.uniform(-30, 30, (boxes, 2)), rng.uniform(1, 8, (boxes, 2)), rng.uniform(-7, 7, (boxes, 1)),
-         rng.uniform(0.5, 4, (boxes, 1)), rng.uniform(-0.5, 1.0, (boxes, 1))], -1)  # fmt: skip
+        [
+            rng.uniform(-30, 30, (boxes, 2)),
+            rng.uniform(1, 8, (boxes, 2)),
+            rng.uniform(-7, 7, (boxes, 1)),
+            rng.uniform(0.5, 4, (boxes, 1)),
+            rng.uniform(-0.5, 1.0, (boxes, 1)),
+        ],
+        -1,
+    )
     building = np.concatenate(
-        [rng.uniform(-30, 30, (buildings, 2)), rng.uniform(3, 15, (buildings, 2)),
-         rng.uniform(-7, 7, (buildings, 1))], -1)  # fmt: skip
+        [rng.uniform(-30, 30, (buildings, 2)), rng.uniform(3, 15, (buildings, 2)), rng.uniform(-7, 7, (buildings, 1))],
+        -1,
+    )
     height = float(rng.uniform(0, 2.5))
     found = hidden_points(points, box, building, target_height=height)
     rows = [[*b[:5], b[6], b[6] + b[5]] for b in box] + [[*b, -np.inf, np.inf] for b in building]

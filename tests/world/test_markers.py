@@ -24,10 +24,12 @@ EXACT = PlacementConfig(toe_in=0.0, jitter=0.0)
 def two_lanes(**other):
     """Two lanes that drive along x into an intersection at x = 0: the right one is at y = -1.75."""
     return lane_map(
-        segment(1, [(-50, 1.75), (0, 1.75)], [3]), segment(2, [(-50, -1.75), (0, -1.75)], [4]),
+        segment(1, [(-50, 1.75), (0, 1.75)], [3]),
+        segment(2, [(-50, -1.75), (0, -1.75)], [4]),
         segment(3, [(0, 1.75), (20, 1.75)], is_intersection=True),
-        segment(4, [(0, -1.75), (20, -1.75)], is_intersection=True), **other,
-    )  # fmt: skip
+        segment(4, [(0, -1.75), (20, -1.75)], is_intersection=True),
+        **other,
+    )
 
 
 def test_a_marker_stands_right_of_the_approach_and_faces_its_traffic():
@@ -46,9 +48,10 @@ def test_a_marker_stands_right_of_the_approach_and_faces_its_traffic():
 
 def test_boards_behind_a_junction_face_those_who_come_across():
     crossing = lane_map(
-        segment(2, [(-50, -1.75), (0, -1.75)], [4]), segment(4, [(0, -1.75), (20, -1.75)], [5], is_intersection=True),
+        segment(2, [(-50, -1.75), (0, -1.75)], [4]),
+        segment(4, [(0, -1.75), (20, -1.75)], [5], is_intersection=True),
         segment(5, [(20, -1.75), (60, -1.75)]),
-    )  # fmt: skip
+    )
     near, both = (place_markers(crossing, 0, replace(EXACT, side=side)) for side in ("near", "both"))
     assert (len(near.pose), len(both.pose)) == (1, 2)
     far = both.pose[np.argmax(both.pose[:, 0, 3])]
@@ -80,12 +83,18 @@ def test_without_a_kerb_the_lane_ends_the_road_and_a_far_kerb_is_none():
         # A split, a merge, and both of a road closed to motor vehicles.
         ([segment(1, [(0, 0), (50, 0)], [2, 3]), segment(2, [(50, 0), (90, 0)]), segment(3, [(50, 0), (90, 20)])], 1),
         ([segment(1, [(0, 0), (50, 0)], [3]), segment(2, [(0, 40), (50, 0)], [3]), segment(3, [(50, 0), (90, 0)])], 2),
-        ([segment(1, [(0, 0), (50, 0)], [2, 3], vehicle=False), segment(2, [(50, 0), (90, 0)]),
-          segment(3, [(50, 0), (90, 20)])], 0),
+        (
+            [
+                segment(1, [(0, 0), (50, 0)], [2, 3], vehicle=False),
+                segment(2, [(50, 0), (90, 0)]),
+                segment(3, [(50, 0), (90, 20)]),
+            ],
+            0,
+        ),
         # A successor that the map does not hold.
         ([segment(1, [(0, 0), (50, 0)], [7, 8])], 0),
     ],
-)  # fmt: skip
+)
 def test_approaches_end_where_intersections_splits_and_merges_begin(segments, count):
     placed = place_markers(lane_map(*segments), 3)
     assert placed.marker_id.shape == (count,)

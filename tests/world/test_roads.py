@@ -87,8 +87,10 @@ def test_successors_exist_and_start_where_their_predecessor_ends():
 def test_joints_are_smooth():
     worst = max(
         turn_between(s, net.map.segments[j])
-        for net in case_networks() for s in net.map.segments.values() for j in s.successors
-    )  # fmt: skip
+        for net in case_networks()
+        for s in net.map.segments.values()
+        for j in s.successors
+    )
     assert worst < math.radians(8.0)
 
 
@@ -243,7 +245,7 @@ def test_buildings_stand_off_the_road():
         on_road = np.concatenate(
             [line[:, :2] for s in net.map.segments.values() for line in (s.centerline, s.left, s.right)]
             + [resample(b, int(arc_length(b)[-1]) + 2)[:, :2] for b in net.map.road_boundaries]
-        )  # fmt: skip
+        )
         assert boxes.shape[1:] == (5,)
         assert not inside_boxes(grown, on_road).any()
         standing += len(boxes)

@@ -168,8 +168,12 @@ def test_simplifying_drops_what_a_straight_line_says():
 def test_beyond_capacity_the_nearest_pieces_stay_in_order():
     range_ = PerceptionRange((-10, 10), (-10, 10))
     # The first line leaves the range and comes back.
-    lines = [np.array([[-9, 9], [-9, 12], [-7, 12], [-7, 9.0]]), np.array([[-20, 20], [20, 20.0]]),
-             np.array([[1, 0], [2, 0.0]]), np.array([[5, 0], [30, 0.0]])]  # fmt: skip
+    lines = [
+        np.array([[-9, 9], [-9, 12], [-7, 12], [-7, 9.0]]),
+        np.array([[-20, 20], [20, 20.0]]),
+        np.array([[1, 0], [2, 0.0]]),
+        np.array([[5, 0], [30, 0.0]]),
+    ]
     sd_map, dropped = pack_lines(lines, [0, 1, 2, 3], capacity=3, points=2, range_=range_)
     assert dropped == 1
     assert sd_map.category.tolist() == [0, 2, 3]

@@ -169,8 +169,14 @@ def test_very_short_recordings(frames):
 
 
 def test_parked_vehicles_stand_in_their_slots():
-    config = TrafficConfig(parked_share=1.0, vehicles_per_metre=0.0, bicycles_per_metre=0.0, pedestrians_per_metre=0.0,
-                           crossers_per_minute=0.0, range=1e3)  # fmt: skip
+    config = TrafficConfig(
+        parked_share=1.0,
+        vehicles_per_metre=0.0,
+        bicycles_per_metre=0.0,
+        pedestrians_per_metre=0.0,
+        crossers_per_minute=0.0,
+        range=1e3,
+    )
     traffic = simulate_traffic(np.random.default_rng([1]), crossroads("signals"), config, frames=5, rate_hz=RATE)
     np.testing.assert_allclose(traffic.xy, np.broadcast_to([[40.0, 3.5], [46.5, 3.5]], (5, 2, 2)), atol=0.2)
     assert (traffic.xy == traffic.xy[0]).all()

@@ -227,9 +227,14 @@ def _step(folder: Path) -> int:
 
 
 def _report(
-    system: System, variants: list[Variant], remarks: dict[str, dict[str, str]], protocol: str, out: Path,
-    picture: Path | None, seeds: Sequence[int],
-) -> Path:  # fmt: skip
+    system: System,
+    variants: list[Variant],
+    remarks: dict[str, dict[str, str]],
+    protocol: str,
+    out: Path,
+    picture: Path | None,
+    seeds: Sequence[int],
+) -> Path:
     """Print the tables and save them beside the pictures."""
     title = f"{protocol}, test split, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}, percent (mean ± std)"
     every = [scores for variant in variants for scores in variant.scores]

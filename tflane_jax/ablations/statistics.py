@@ -28,9 +28,7 @@ class PairedDifference:
     seeds: int
 
 
-def paired_difference(
-    treatment: Float[np.ndarray, " s"], control: Float[np.ndarray, " s"]
-) -> PairedDifference:
+def paired_difference(treatment: Float[np.ndarray, " s"], control: Float[np.ndarray, " s"]) -> PairedDifference:
     """Return how treatment and control differ; entry i of both comes from the same seed.
 
     Raises ValueError for unequal lengths or none at all.

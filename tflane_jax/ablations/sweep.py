@@ -17,9 +17,14 @@ from tflane_jax.tasks import load_test_data, system_of
 
 
 def sweep(
-    models: Mapping[str, Path], setting: str, values: Sequence[str], out: Path, overrides: Sequence[str] = (), *,
+    models: Mapping[str, Path],
+    setting: str,
+    values: Sequence[str],
+    out: Path,
+    overrides: Sequence[str] = (),
+    *,
     metrics: Sequence[str] | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Evaluate every run of every model with each value of the setting; print and save a table and a plot.
 
     Args:

@@ -37,9 +37,7 @@ def show(options: argparse.Namespace) -> int:
     source = lane_graph_source(config, options)
     # Not from the cache: a few examples are made sooner than all of them.
     dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else open_dataset(source)
-    picture = show_dataset(
-        dataset, options.count, options.out, ground=source.example.ground, view=source.example.range
-    )
+    picture = show_dataset(dataset, options.count, options.out, ground=source.example.ground, view=source.example.range)
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
     written = [picture]
@@ -88,8 +86,10 @@ def check(options: argparse.Namespace) -> int:
             print(f"{folder}: cannot be read", *(f"  - {fault}" for fault in faults), sep="\n")
             continue
         log = load_log(folder)
-        print(f"{folder}: ok, {len(log.keyframes)} key frames, {log.tracks.frames} annotated frames, "
-              f"{len(log.tracks.uuid)} road users, {len(log.map.segments)} lane segments")  # fmt: skip
+        print(
+            f"{folder}: ok, {len(log.keyframes)} key frames, {log.tracks.frames} annotated frames, "
+            f"{len(log.tracks.uuid)} road users, {len(log.map.segments)} lane segments"
+        )
     return 2 if lacking else 0
 
 

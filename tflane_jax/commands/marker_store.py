@@ -33,10 +33,17 @@ def run(options: argparse.Namespace) -> int:
     for number, marker in load_store(path).markers.items():
         x, y, z = marker.global_from_marker[:3, 3]
         length = np.linalg.norm(np.diff(marker.lanes, axis=1), axis=-1).sum()
-        rows.append({
-            "marker": number, "x [m]": f"{x:.2f}", "y [m]": f"{y:.2f}", "z [m]": f"{z:.2f}", "lanes": len(marker.lanes),
-            "joints": int(marker.successor.sum()), "lane metres": round(float(length)),
-        })  # fmt: skip
+        rows.append(
+            {
+                "marker": number,
+                "x [m]": f"{x:.2f}",
+                "y [m]": f"{y:.2f}",
+                "z [m]": f"{z:.2f}",
+                "lanes": len(marker.lanes),
+                "joints": int(marker.successor.sum()),
+                "lane metres": round(float(length)),
+            }
+        )
     print(format_table(rows, title=f"{log.name}: markers and the lanes within {options.radius:g} m of each"))
     print(f"\nwritten to {path} ({path.stat().st_size / 1000:.0f} kB)")
     return 0

@@ -73,11 +73,14 @@ def curves(options: argparse.Namespace) -> int:
         # The same scenes for all ways of finding corners.
         configs = [
             CurveConfig(
-                seeds=options.seeds, scale=scale, severity=options.severity, distances=tuple(options.distances),
+                seeds=options.seeds,
+                scale=scale,
+                severity=options.severity,
+                distances=tuple(options.distances),
                 detector=DetectorConfig(_family(options.family), corners=corners, enlarge=options.enlarge),
             )
             for corners in options.corners
-        ]  # fmt: skip
+        ]
         for corners, config, sightings in zip(options.corners, configs, measure(configs), strict=True):
             name = f"{corners}, scale {scale:g}"
             drawn[name] = summarise(sightings)
@@ -138,9 +141,13 @@ def _record(found: DetectedMarkers, k: int) -> dict[str, Any]:
 
 
 def _write_picture(
-    path: Path, photo: UInt8[np.ndarray, "h w 3"], found: DetectedMarkers, size: float,
-    intrinsics: Float[np.ndarray, "3 3"], camera_from_ego: Float[np.ndarray, "4 4"],
-) -> None:  # fmt: skip
+    path: Path,
+    photo: UInt8[np.ndarray, "h w 3"],
+    found: DetectedMarkers,
+    size: float,
+    intrinsics: Float[np.ndarray, "3 3"],
+    camera_from_ego: Float[np.ndarray, "4 4"],
+) -> None:
     cv2 = opencv()
     image = np.ascontiguousarray(photo)
     width = max(1, round(max(image.shape) / 900))

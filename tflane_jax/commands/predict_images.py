@@ -50,8 +50,11 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
         # A lane goes on beyond the picture's edge; what lies outside it is neither drawn nor written.
         inside = [_inside(lane, photo.shape) for lane in lanes]
         scores = image_lanes.lane_scores(answer)[image_lanes.left_to_right(answer)]
-        found = [{"score": float(s), "points": np.round(lane, 2).tolist()}
-                 for s, lane in zip(scores, inside, strict=True) if len(lane) > 1]  # fmt: skip
+        found = [
+            {"score": float(s), "points": np.round(lane, 2).tolist()}
+            for s, lane in zip(scores, inside, strict=True)
+            if len(lane) > 1
+        ]
         height, width = photo.shape[:2]
         records.append({"file": str(path), "width": width, "height": height, "picture": name, "lanes": found})
         title = f"{path.name}: {len(found)} lane line{'' if len(found) == 1 else 's'}"

@@ -72,15 +72,26 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
     names, ground, view = titles(dataset, indices), source.example.ground, source.example.range
     save_examples(
-        options.out / "pictures.png", examples, {f"{Path(trained.name).name}, step {trained.step}": lanes},
-        titles=names, ground=ground, view=view, threshold=options.threshold,
-    )  # fmt: skip
+        options.out / "pictures.png",
+        examples,
+        {f"{Path(trained.name).name}, step {trained.step}": lanes},
+        titles=names,
+        ground=ground,
+        view=view,
+        threshold=options.threshold,
+    )
     written = ["predictions.npz", "truth.npz", "predictions.json", "pictures.png"]
     if examples.cameras is not None:
         save_camera_views(
-            options.out / "cameras.png", examples, lanes, elements, titles=names, ground=ground, view=view,
+            options.out / "cameras.png",
+            examples,
+            lanes,
+            elements,
+            titles=names,
+            ground=ground,
+            view=view,
             threshold=options.threshold,
-        )  # fmt: skip
+        )
         written.append("cameras.png")
     print(f"{len(indices)} frames written to {options.out}: {', '.join(written)}")
     return 0
@@ -101,10 +112,14 @@ def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> 
         best = arrays["attribute_score"].max(-1)
         shown = _best_first(best, threshold)
         frame["elements"] = [
-            {"query": int(e), "score": float(best[e]), "attribute": int(arrays["attribute_score"][e].argmax()),
-             "box": arrays["box"][e].tolist()}
+            {
+                "query": int(e),
+                "score": float(best[e]),
+                "attribute": int(arrays["attribute_score"][e].argmax()),
+                "box": arrays["box"][e].tolist(),
+            }
             for e in shown
-        ]  # fmt: skip
+        ]
         frame["governs"] = _relations(arrays["element_lane"][np.ix_(kept, shown)].T, "element", "lane")
     return frame
 

@@ -29,9 +29,12 @@ def run(options: argparse.Namespace) -> int:
     shown = [name for name in ("part", *protocol.columns, "frames") if any(name in row for row in rows)]
     print(format_table(rows, shown, title=title, digits=4))
     meta = {
-        "protocol": scored.protocol, "predictions": str(options.predictions), "ground_truth": str(options.truth),
-        "scenes": len(scored.scenes), "bootstrap": options.bootstrap,
-    }  # fmt: skip
+        "protocol": scored.protocol,
+        "predictions": str(options.predictions),
+        "ground_truth": str(options.truth),
+        "scenes": len(scored.scenes),
+        "bootstrap": options.bootstrap,
+    }
     paths = save_table(options.out, rows, meta, columns=shown, title=title, digits=4)
     print(f"\nwritten to {paths[0]} and {paths[1]}")
     return 0

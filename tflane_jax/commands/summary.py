@@ -21,8 +21,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     params = shapes_of_params(config.task, example)
     counts = parameter_counts(params, options.depth)
     total = sum(counts.values())
-    parts = [{"part": name, "parameters": f"{count:,}", "share": f"{count / total:.1%}"}
-             for name, count in counts.items()]  # fmt: skip
+    parts = [
+        {"part": name, "parameters": f"{count:,}", "share": f"{count / total:.1%}"} for name, count in counts.items()
+    ]
     parts.append({"part": "all", "parameters": f"{total:,}", "share": "100.0%"})
     title = f"Parameters of {options.config or 'the default configuration'}"
     print(format_table(parts, title=title), flush=True)
@@ -33,10 +34,16 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if not options.no_training:
         programs.append(training_program(config.task, example, batch_size, config.optim, compiled=compiled))
     rows = [
-        {"program": each.name, "batch": each.batch, "GFLOP": each.gflop, "memory, MiB": each.memory,
-         "of it intermediate": each.between, "compile, s": each.compile_s}
+        {
+            "program": each.name,
+            "batch": each.batch,
+            "GFLOP": each.gflop,
+            "memory, MiB": each.memory,
+            "of it intermediate": each.between,
+            "compile, s": each.compile_s,
+        }
         for each in programs
-    ]  # fmt: skip
+    ]
     title = "Operations as XLA counts them before fusion; memory as the compiler for this machine plans it"
     print("\n" + format_table(rows, title=title, digits=1))
     if options.out is not None:

@@ -31,11 +31,14 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     result = train_run(config, out, start=options.start)
     if result.stopped_by is not None:
         name = signal.Signals(result.stopped_by).name
-        print(f"stopped by {name} after step {result.step}; go on with: tflane train --resume --out {out}",
-              file=sys.stderr)  # fmt: skip
+        print(
+            f"stopped by {name} after step {result.step}; go on with: tflane train --resume --out {out}",
+            file=sys.stderr,
+        )
         return 128 + result.stopped_by
-    print(f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in "
-          f"{result.compile_seconds:.1f} s")  # fmt: skip
+    print(
+        f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in {result.compile_seconds:.1f} s"
+    )
     for name, value in result.metrics.items():
         if "@" not in name:  # single thresholds are in metrics.jsonl
             print(f"  {name} = {value:.4f}")

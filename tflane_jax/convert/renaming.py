@@ -85,8 +85,10 @@ def check_fits(found: Any, expected: Any, path: Path | str) -> None:
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf.shape
-            for path, leaf in jax.tree.leaves_with_path(tree)}  # fmt: skip
+    return {
+        jax.tree_util.keystr(path, simple=True, separator="/"): leaf.shape
+        for path, leaf in jax.tree.leaves_with_path(tree)
+    }
 
 
 def size_text(shape: tuple[int, ...] | None) -> str:

@@ -182,10 +182,12 @@ def camera_shapes(encoder: CameraEncoderConfig) -> Any:
     count, side = encoder.bev.cameras, 128
     shape = jax.ShapeDtypeStruct
     cameras = CameraViews(
-        image=shape((count, side, side, 3), jnp.uint8), size=shape((count, 2), jnp.int32),
-        intrinsics=shape((count, 3, 3), jnp.float32), camera_from_ego=shape((count, 4, 4), jnp.float32),
+        image=shape((count, side, side, 3), jnp.uint8),
+        size=shape((count, 2), jnp.int32),
+        intrinsics=shape((count, 3, 3), jnp.float32),
+        camera_from_ego=shape((count, 4, 4), jnp.float32),
         valid=shape((count,), jnp.bool_),
-    )  # fmt: skip
+    )
     nothing = dict.fromkeys(field.name for field in dataclasses.fields(Example))
     pose, flag = shape((4, 4), jnp.float32), shape((), jnp.bool_)
     return Example(**nothing | {"cameras": cameras, "previous_from_ego": pose, "has_previous": flag})  # pyright: ignore

@@ -74,9 +74,11 @@ KINDS: dict[str, Kind] = {
     "bool": Kind(np.dtype(np.uint8), np.dtype(bool)),
     "bytes without a type": Kind(np.dtype(np.uint8), np.dtype(np.uint8)),
     "complex32": Kind(np.dtype((np.void, 4)), None),
-    **{name: Kind(np.dtype((np.void, size)), None)
-       for name, size in (("qint8", 1), ("quint8", 1), ("qint32", 4), ("quint4x2", 1), ("quint2x4", 1))},
-}  # fmt: skip
+    **{
+        name: Kind(np.dtype((np.void, size)), None)
+        for name, size in (("qint8", 1), ("quint8", 1), ("qint32", 4), ("quint4x2", 1), ("quint2x4", 1))
+    },
+}
 
 
 def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *rest: Any) -> Tensor:
@@ -84,8 +86,9 @@ def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *rest: Any) -> 
     return _view(storage, offset, shape, strides, None, rest[2] if len(rest) > 2 else None)
 
 
-def _typed_tensor(storage: Any, offset: Any, shape: Any, strides: Any, grad: Any, hooks: Any, kind: Any,
-                  metadata: Any = None) -> Tensor:  # fmt: skip
+def _typed_tensor(
+    storage: Any, offset: Any, shape: Any, strides: Any, grad: Any, hooks: Any, kind: Any, metadata: Any = None
+) -> Tensor:
     """Stand for `_rebuild_tensor_v3`."""
     return _view(storage, offset, shape, strides, kind, metadata)
 
@@ -117,11 +120,25 @@ def _unreadable(what: str) -> Sealed:
 
 
 _STORAGES = {
-    "Float": "float32", "Double": "float64", "Half": "float16", "BFloat16": "bfloat16", "Char": "int8",
-    "Byte": "uint8", "Short": "int16", "Int": "int32", "Long": "int64", "Bool": "bool", "ComplexFloat": "complex64",
-    "ComplexDouble": "complex128", "ComplexHalf": "complex32", "QInt8": "qint8", "QUInt8": "quint8",
-    "QInt32": "qint32", "QUInt4x2": "quint4x2", "QUInt2x4": "quint2x4",
-}  # fmt: skip
+    "Float": "float32",
+    "Double": "float64",
+    "Half": "float16",
+    "BFloat16": "bfloat16",
+    "Char": "int8",
+    "Byte": "uint8",
+    "Short": "int16",
+    "Int": "int32",
+    "Long": "int64",
+    "Bool": "bool",
+    "ComplexFloat": "complex64",
+    "ComplexDouble": "complex128",
+    "ComplexHalf": "complex32",
+    "QInt8": "qint8",
+    "QUInt8": "quint8",
+    "QInt32": "qint32",
+    "QUInt4x2": "quint4x2",
+    "QUInt2x4": "quint2x4",
+}
 _REBUILD = {
     "_rebuild_tensor": Sealed(_tensor),
     "_rebuild_tensor_v2": Sealed(_tensor),
@@ -134,8 +151,13 @@ _REBUILD = {
     "_rebuild_qtensor": _unreadable("a quantised tensor"),
     "_rebuild_meta_tensor_no_storage": _unreadable("a tensor without content (device meta)"),
 }
-_SCHEMES = ("per_tensor_affine", "per_channel_affine", "per_tensor_symmetric", "per_channel_symmetric",
-            "per_channel_affine_float_qparams")  # fmt: skip
+_SCHEMES = (
+    "per_tensor_affine",
+    "per_channel_affine",
+    "per_tensor_symmetric",
+    "per_channel_symmetric",
+    "per_channel_affine_float_qparams",
+)
 ALLOWED = {
     **PLAIN,
     **{("torch", f"{name}Storage"): kind for name, kind in _STORAGES.items()},

@@ -29,9 +29,7 @@ def crop_areas(
     rings = [crossings.line(i) for i in crossings.near(range_)]
     rings = [ring for ring in rings if clip_to_range(ring, range_)]
     low, high = BOUNDARY_MARGIN, -BOUNDARY_MARGIN
-    inner = PerceptionRange(
-        (range_.x[0] + low, range_.x[1] + high), (range_.y[0] + low, range_.y[1] + high), range_.z
-    )
+    inner = PerceptionRange((range_.x[0] + low, range_.x[1] + high), (range_.y[0] + low, range_.y[1] + high), range_.z)
     lines = prepared.boundaries.moved(ego_from_global)
     boundaries = [piece for i in lines.near(inner) for piece in clip_ring(lines.line(i), inner)]
     found = rings + boundaries

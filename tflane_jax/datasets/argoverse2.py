@@ -26,8 +26,14 @@ from tflane_jax.scene.logs import KeyFrame, Log, Tracks
 ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
 _POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _BOX_COLUMNS = (
-    *_POSE_COLUMNS, "track_uuid", "category", "length_m", "width_m", "height_m", "num_interior_pts",
-)  # fmt: skip
+    *_POSE_COLUMNS,
+    "track_uuid",
+    "category",
+    "length_m",
+    "width_m",
+    "height_m",
+    "num_interior_pts",
+)
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
 
@@ -95,8 +101,7 @@ def load_log(
     times = np.unique(boxes["timestamp_ns"])
     if len(times) == 0:
         raise UserError(
-            f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): "
-            "use a train or val log"
+            f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
         )
     tracks = _tracks(boxes, times, categories, folder)
     moments = times if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
@@ -259,8 +264,7 @@ class Argoverse2Dataset:
     def __init__(self, config: Argoverse2Config):
         self.config = config
         self.logs = tuple(
-            load_log(folder, keyframes=config.keyframes, openlane=config.openlane)
-            for folder in find_logs(config.root)
+            load_log(folder, keyframes=config.keyframes, openlane=config.openlane) for folder in find_logs(config.root)
         )
         self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
 

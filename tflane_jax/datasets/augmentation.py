@@ -24,11 +24,13 @@ GREY = np.array([0.299, 0.587, 0.114])
 # Principal components of the colours of natural images in [0, 1] (Krizhevsky et al. 2012), with CornerNet's numbers.
 # Rows are red, green, blue; the reference has them the other way round, because its images are BGR.
 PCA_VALUES = np.array([0.2141788, 0.01817699, 0.00341571])
-PCA_VECTORS = np.array([
-    [-0.56089297, 0.71832671, 0.41158938],
-    [-0.5832747, 0.00994535, -0.81221408],
-    [-0.58752847, -0.69563484, 0.41340352],
-])  # fmt: skip
+PCA_VECTORS = np.array(
+    [
+        [-0.56089297, 0.71832671, 0.41158938],
+        [-0.5832747, 0.00994535, -0.81221408],
+        [-0.58752847, -0.69563484, 0.41340352],
+    ]
+)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 
 # The code that decides what an example is, relative to the package.
-_SOURCES = ("scene.py", "logs.py", "geometry", "world", "markers", "datasets")
+_SOURCES = ("scene", "geometry", "world", "markers", "datasets")
 
 
 class Cacheable(Source, Protocol):
@@ -179,9 +179,7 @@ class CachedDataset:
             if parts is None or name.split(".")[0] in parts:
                 read[name] = array.view(np.ndarray) if mapped else np.array(array)
                 if zlib.crc32(read[name].reshape(-1).view(np.uint8)) != self._index["leaves"][name]["crc32"]:
-                    raise UserError(
-                        f"{leaf_path(self.folder, name)} is corrupt: delete {self.folder} and run again"
-                    )
+                    raise UserError(f"{leaf_path(self.folder, name)} is corrupt: delete {self.folder} and run again")
         return read
 
     def nbytes(self, parts: Collection[str]) -> int:

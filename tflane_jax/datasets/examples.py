@@ -86,36 +86,68 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     sensor, rig = config.sensor, config.cameras
     hidden = None if sensor is None else hidden_cells(sensor.grid, boxes, buildings)
     lanes = lane_graph(
-        prepared.centerlines, ego_from_global, config.range,
-        capacity=config.lanes, points=config.lane_points, boxes=boxes, buildings=buildings,
-    )  # fmt: skip
+        prepared.centerlines,
+        ego_from_global,
+        config.range,
+        capacity=config.lanes,
+        points=config.lane_points,
+        boxes=boxes,
+        buildings=buildings,
+    )
     segments = lane_graph(
-        prepared.segments, ego_from_global, config.range,
-        capacity=config.segments, points=config.segment_points, boxes=boxes, buildings=buildings,
-    )  # fmt: skip
+        prepared.segments,
+        ego_from_global,
+        config.range,
+        capacity=config.segments,
+        points=config.segment_points,
+        boxes=boxes,
+        buildings=buildings,
+    )
     areas, areas_dropped = crop_areas(
         prepared, ego_from_global, config.range, capacity=config.areas, points=config.area_points
     )
     elements, elements_dropped = traffic_elements(
-        log.map.elements, _attributes(log, moment.track_frame), prepared, lanes, ego_from_global, config.range,
-        capacity=config.elements, seen=None if rig is None else visible_elements(log, keyframe, rig),
-    )  # fmt: skip
+        log.map.elements,
+        _attributes(log, moment.track_frame),
+        prepared,
+        lanes,
+        ego_from_global,
+        config.range,
+        capacity=config.elements,
+        seen=None if rig is None else visible_elements(log, keyframe, rig),
+    )
     flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks)
     sd_map, lines_dropped = (None, 0) if config.sd_map is None else make_sd_map(log, keyframe, config.sd_map)
     _warn_dropped(
-        config, lanes=lanes.dropped, segments=segments.dropped, areas=areas_dropped,
-        elements=elements_dropped, tracks=tracks_dropped, **{"sd_map.lines": lines_dropped},
-    )  # fmt: skip
+        config,
+        lanes=lanes.dropped,
+        segments=segments.dropped,
+        areas=areas_dropped,
+        elements=elements_dropped,
+        tracks=tracks_dropped,
+        **{"sd_map.lines": lines_dropped},
+    )
     previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
     return Example(
-        bev=None if sensor is None or hidden is None else render_bev(
-            prepared.samples, ego_from_global, boxes, buildings, hidden,
-            weather=log.weather, paint_wear=log.paint_wear, log_seed=log.seed, frame=keyframe,
+        bev=None
+        if sensor is None or hidden is None
+        else render_bev(
+            prepared.samples,
+            ego_from_global,
+            boxes,
+            buildings,
+            hidden,
+            weather=log.weather,
+            paint_wear=log.paint_wear,
+            log_seed=log.seed,
+            frame=keyframe,
             config=sensor,
         ),
         hidden=hidden,
         traffic_flow=flow,
-        markers=None if config.markers is None else marker_observations(
+        markers=None
+        if config.markers is None
+        else marker_observations(
             log, keyframe, config.markers, config.range, bike_lanes=config.bike_lanes == "include"
         ),
         sd_map=sd_map,
@@ -126,7 +158,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         previous_from_ego=relative_pose(previous.global_from_ego, moment.global_from_ego).astype(np.float32),
         has_previous=np.asarray(keyframe > 0),
         cameras=None if rig is None else render_cameras(log, keyframe, rig),
-    )  # fmt: skip
+    )
 
 
 def _buildings(log: Log, ego_from_global: np.ndarray) -> Float[np.ndarray, "b 5"]:

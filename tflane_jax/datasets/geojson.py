@@ -24,20 +24,37 @@ from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
 
 # Names of SMERF's categories (specs/modules.md section 9).
 CATEGORIES = {
-    "road": SdCategory.ROAD, "cross_walk": SdCategory.CROSSWALK, "side_walk": SdCategory.CROSSWALK,
-    "pedestrian": SdCategory.CROSSWALK, "truck_road": SdCategory.TRUCK_ROAD, "highway": SdCategory.HIGHWAY,
-    "residential": SdCategory.RESIDENTIAL, "service": SdCategory.SERVICE, "bus_way": SdCategory.BUS_WAY,
+    "road": SdCategory.ROAD,
+    "cross_walk": SdCategory.CROSSWALK,
+    "side_walk": SdCategory.CROSSWALK,
+    "pedestrian": SdCategory.CROSSWALK,
+    "truck_road": SdCategory.TRUCK_ROAD,
+    "highway": SdCategory.HIGHWAY,
+    "residential": SdCategory.RESIDENTIAL,
+    "service": SdCategory.SERVICE,
+    "bus_way": SdCategory.BUS_WAY,
     "other": SdCategory.OTHER,
-}  # fmt: skip
+}
 # OpenStreetMap's values of `highway`; a link counts as what it links.
 HIGHWAYS = {
-    "motorway": SdCategory.HIGHWAY, "trunk": SdCategory.TRUCK_ROAD, "primary": SdCategory.ROAD,
-    "secondary": SdCategory.ROAD, "tertiary": SdCategory.ROAD, "unclassified": SdCategory.ROAD,
-    "road": SdCategory.ROAD, "residential": SdCategory.RESIDENTIAL, "living_street": SdCategory.RESIDENTIAL,
-    "service": SdCategory.SERVICE, "busway": SdCategory.BUS_WAY, "bus_guideway": SdCategory.BUS_WAY,
-    "crossing": SdCategory.CROSSWALK, "footway": SdCategory.CROSSWALK, "pedestrian": SdCategory.CROSSWALK,
-    "path": SdCategory.CROSSWALK, "steps": SdCategory.CROSSWALK,
-}  # fmt: skip
+    "motorway": SdCategory.HIGHWAY,
+    "trunk": SdCategory.TRUCK_ROAD,
+    "primary": SdCategory.ROAD,
+    "secondary": SdCategory.ROAD,
+    "tertiary": SdCategory.ROAD,
+    "unclassified": SdCategory.ROAD,
+    "road": SdCategory.ROAD,
+    "residential": SdCategory.RESIDENTIAL,
+    "living_street": SdCategory.RESIDENTIAL,
+    "service": SdCategory.SERVICE,
+    "busway": SdCategory.BUS_WAY,
+    "bus_guideway": SdCategory.BUS_WAY,
+    "crossing": SdCategory.CROSSWALK,
+    "footway": SdCategory.CROSSWALK,
+    "pedestrian": SdCategory.CROSSWALK,
+    "path": SdCategory.CROSSWALK,
+    "steps": SdCategory.CROSSWALK,
+}
 _LINES = {"LineString": 1, "MultiLineString": 2}
 _OTHERS = ("Point", "MultiPoint", "Polygon", "MultiPolygon", "GeometryCollection")
 # WGS84: semi-major axis, metres, and squared eccentricity.

@@ -21,9 +21,16 @@ from tflane_jax.scene import Areas, Example, LaneGraph
 
 # What training on merged centerlines looks at.
 TRAINING_PARTS = (
-    "bev", "cameras", "traffic_flow", "markers", "sd_map", "lanes", "traffic_elements", "previous_from_ego",
+    "bev",
+    "cameras",
+    "traffic_flow",
+    "markers",
+    "sd_map",
+    "lanes",
+    "traffic_elements",
+    "previous_from_ego",
     "has_previous",
-)  # fmt: skip
+)
 # Fields of `Example` without which there is none.
 _ALWAYS = ("previous_from_ego", "has_previous")
 

@@ -42,9 +42,13 @@ def store_of_log(
     """
     lanes = prepare_map(log.map, bike_lanes=bike_lanes).centerlines.lanes
     return store_of(
-        {lane.id: lane for lane in lanes}, markers_of(log), radius=radius, surveyed=surveyed, expires=expires,
+        {lane.id: lane for lane in lanes},
+        markers_of(log),
+        radius=radius,
+        surveyed=surveyed,
+        expires=expires,
         source=log.name,
-    )  # fmt: skip
+    )
 
 
 def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarkers, MarkerStore]:
@@ -66,15 +70,21 @@ def marker_observations(
     simulation, (markers, store) = config.simulation, _remembered(log, config.radius, bike_lanes)
     moment, before = log.keyframes[keyframe], moment_before(log, keyframe, simulation.residual_interval)
     observed = observe(
-        simulate_detections(log, moment, markers, simulation), store, range_,
-        markers=config.markers, lanes=config.lanes, points=config.points, first_residual=simulation.first_residual,
+        simulate_detections(log, moment, markers, simulation),
+        store,
+        range_,
+        markers=config.markers,
+        lanes=config.lanes,
+        points=config.points,
+        first_residual=simulation.first_residual,
         previous=None if before is None else simulate_detections(log, before, markers, simulation),
         now_from_previous=None if before is None else relative_pose(moment.global_from_ego, before.global_from_ego),
-    )  # fmt: skip
+    )
     for name, dropped in (("markers", observed.markers_dropped), ("lanes", observed.lanes_dropped)):
         if dropped:
             warnings.warn(
                 f"more {name} in range than MarkerConfig.{name} = {getattr(config, name)}: the farthest are left out",
-                TruncationWarning, stacklevel=3,
-            )  # fmt: skip
+                TruncationWarning,
+                stacklevel=3,
+            )
     return observed.markers

@@ -73,7 +73,11 @@ def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
         )
         areas, area_category = read_areas(record, where)
     return Annotation(
-        lines=lines, left=left, right=right, left_type=left_type, right_type=right_type,
+        lines=lines,
+        left=left,
+        right=right,
+        left_type=left_type,
+        right_type=right_type,
         is_connector=np.array(
             [bool(lane.get("is_intersection_or_connector", False)) for lane in items(record, names.lanes, where)], bool
         ),
@@ -82,8 +86,9 @@ def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
         element_category=read_labels(record, "traffic_element", "category", 1, 2, where),
         attribute=attribute,
         lane_element=_binary(record, names.lane_element, (lanes, elements), where),
-        areas=areas, area_category=area_category,
-    )  # fmt: skip
+        areas=areas,
+        area_category=area_category,
+    )
 
 
 def _binary(record: Any, field: str, shape: tuple[int, int], where: str) -> Bool[np.ndarray, "n m"]:

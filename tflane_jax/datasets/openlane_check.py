@@ -96,8 +96,11 @@ def _named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
                 if isinstance(content, Mapping) and split not in content:
                     continue
                 keys = frames_of(content, split, str(file))
-                faults += [f"{file}: {key} has no whole number as its timestamp" for key in keys
-                           if not key.timestamp.isdecimal()]  # fmt: skip
+                faults += [
+                    f"{file}: {key} has no whole number as its timestamp"
+                    for key in keys
+                    if not key.timestamp.isdecimal()
+                ]
                 named[split] += [key for key in keys if key.timestamp.isdecimal()]
         except UserError as error:
             faults.append(str(error))

@@ -156,14 +156,17 @@ def centerline_annotation(example: Example, ids: Identities) -> dict[str, Any]:
     elements = _elements(example.traffic_elements, ids)
     return {
         CENTERLINE.lanes: [
-            {"id": ids.lanes[n], "points": _rounded(dense(example.lanes.points[n])),
-             "is_intersection_or_connector": bool(example.lanes.is_connector[n])}
+            {
+                "id": ids.lanes[n],
+                "points": _rounded(dense(example.lanes.points[n])),
+                "is_intersection_or_connector": bool(example.lanes.is_connector[n]),
+            }
             for n in rows.tolist()
         ],
         "traffic_element": elements,
         CENTERLINE.lane_lane: example.lanes.successor[np.ix_(rows, rows)].astype(int).tolist(),
         CENTERLINE.lane_element: _governed(example)[rows].astype(int).tolist(),
-    }  # fmt: skip
+    }
 
 
 def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
@@ -173,10 +176,15 @@ def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
     lane_element = segments_on_lanes(graph, example.lanes)[rows] @ _governed(example)
     return {
         SEGMENT.lanes: [
-            {"id": ids.segments[n], "centerline": _rounded(graph.points[n]),
-             "left_laneline": _rounded(graph.left[n]), "left_laneline_type": int(graph.left_type[n]),
-             "right_laneline": _rounded(graph.right[n]), "right_laneline_type": int(graph.right_type[n]),
-             "is_intersection_or_connector": bool(graph.is_connector[n])}
+            {
+                "id": ids.segments[n],
+                "centerline": _rounded(graph.points[n]),
+                "left_laneline": _rounded(graph.left[n]),
+                "left_laneline_type": int(graph.left_type[n]),
+                "right_laneline": _rounded(graph.right[n]),
+                "right_laneline_type": int(graph.right_type[n]),
+                "is_intersection_or_connector": bool(graph.is_connector[n]),
+            }
             for n in rows.tolist()
         ],
         "traffic_element": _elements(example.traffic_elements, ids),
@@ -186,7 +194,7 @@ def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
         ],
         SEGMENT.lane_lane: graph.successor[np.ix_(rows, rows)].astype(int).tolist(),
         SEGMENT.lane_element: lane_element.astype(int).tolist(),
-    }  # fmt: skip
+    }
 
 
 def dense(line: Float[np.ndarray, "p 3"], count: int = DENSE_POINTS) -> Float[np.ndarray, "count 3"]:
@@ -226,10 +234,14 @@ def _elements(elements: TrafficElements | None, ids: Identities) -> list[dict[st
     if elements is None:
         return []
     return [
-        {"id": ids.elements[e], "category": int(elements.category[e]), "attribute": int(elements.attribute[e]),
-         "points": _rounded(elements.box[e])}
+        {
+            "id": ids.elements[e],
+            "category": int(elements.category[e]),
+            "attribute": int(elements.attribute[e]),
+            "points": _rounded(elements.box[e]),
+        }
         for e in np.flatnonzero(elements.valid).tolist()
-    ]  # fmt: skip
+    ]
 
 
 def _pose(pose: Float[np.ndarray, "4 4"]) -> dict[str, Any]:

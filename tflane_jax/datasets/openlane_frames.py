@@ -51,8 +51,15 @@ class Subset:
 
 SUBSETS: Mapping[SubsetName, Subset] = {
     "A": Subset(
-        cameras=("ring_front_center", "ring_front_left", "ring_front_right", "ring_rear_left", "ring_rear_right",
-                 "ring_side_left", "ring_side_right"),
+        cameras=(
+            "ring_front_center",
+            "ring_front_left",
+            "ring_front_right",
+            "ring_rear_left",
+            "ring_rear_right",
+            "ring_side_left",
+            "ring_side_right",
+        ),
         sizes=((1550, 2048), *6 * ((2048, 1550),)),
         tick_ns=1,
         first_segment={"train": 0, "val": 10_000, "test": 20_000},
@@ -65,7 +72,7 @@ SUBSETS: Mapping[SubsetName, Subset] = {
         first_segment={"train": 1000, "val": 11_000, "test": 21_000},
         data_dict="data_dict_subset_B.json",
     ),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)

@@ -117,12 +117,19 @@ class OpenLaneV2Dataset:
         before = index > 0 and self.keys[index - 1].segment == key.segment
         pose = files[0].global_from_ego
         return Example(
-            bev=None, hidden=None, traffic_flow=None, markers=None, sd_map=None,
-            lanes=lanes, segments=segments, areas=areas, traffic_elements=elements,
+            bev=None,
+            hidden=None,
+            traffic_flow=None,
+            markers=None,
+            sd_map=None,
+            lanes=lanes,
+            segments=segments,
+            areas=areas,
+            traffic_elements=elements,
             previous_from_ego=relative_pose(self._pose(index - 1) if before else pose, pose).astype(np.float32),
             has_previous=np.asarray(before),
             cameras=None if self.config.image is None else self._views(files[0]),
-        )  # fmt: skip
+        )
 
     def info(self, index: int) -> FrameInfo:
         """Return segment, time and pose of one frame."""
@@ -201,11 +208,19 @@ def nominal_example(config: OpenLaneV2Config) -> Example:
     segments = LaneGraph.empty(sizes.segments, sizes.segment_points)
     governed = segments if config.flavour == "lane_segment" else lanes
     return Example(
-        bev=None, hidden=None, traffic_flow=None, markers=None, sd_map=None, lanes=lanes, segments=segments,
+        bev=None,
+        hidden=None,
+        traffic_flow=None,
+        markers=None,
+        sd_map=None,
+        lanes=lanes,
+        segments=segments,
         areas=Areas.empty(sizes.areas, sizes.area_points),
         traffic_elements=TrafficElements.empty(sizes.elements, len(governed.valid)),
-        previous_from_ego=np.eye(4, dtype=np.float32), has_previous=np.asarray(False), cameras=views,
-    )  # fmt: skip
+        previous_from_ego=np.eye(4, dtype=np.float32),
+        has_previous=np.asarray(False),
+        cameras=views,
+    )
 
 
 def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraViews:
@@ -213,10 +228,12 @@ def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraV
     width, height = canvas_size([fit.size for fit in fits if fit is not None], config.divisor)
     count = len(fits)
     return CameraViews(
-        image=np.zeros((count, height, width, 3), np.uint8), size=np.zeros((count, 2), np.int32),
+        image=np.zeros((count, height, width, 3), np.uint8),
+        size=np.zeros((count, 2), np.int32),
         intrinsics=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
-        camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)), valid=np.zeros(count, bool),
-    )  # fmt: skip
+        camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)),
+        valid=np.zeros(count, bool),
+    )
 
 
 def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph, Int[np.ndarray, " n"]]:
@@ -226,9 +243,9 @@ def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph
     if n:
         graph.points[:n] = _with_points([found.lines[i] for i in kept], points)
         graph.left[:n] = graph.points[:n] if found.left is None else _with_points([found.left[i] for i in kept], points)
-        graph.right[:n] = graph.points[:n] if found.right is None else _with_points(
-            [found.right[i] for i in kept], points
-        )  # fmt: skip
+        graph.right[:n] = (
+            graph.points[:n] if found.right is None else _with_points([found.right[i] for i in kept], points)
+        )
         graph.left_type[:n], graph.right_type[:n] = found.left_type[kept], found.right_type[kept]
         graph.is_connector[:n] = found.is_connector[kept]
         graph.visibility[:n] = 1.0

@@ -77,9 +77,7 @@ class _Job:
     slots: dict[str, Slot]
 
 
-def fill(
-    folder: Path, dataset: Source, template: dict[str, np.ndarray], *, workers: int, progress: bool
-) -> list[str]:
+def fill(folder: Path, dataset: Source, template: dict[str, np.ndarray], *, workers: int, progress: bool) -> list[str]:
     """Write every example of `dataset` below `folder`, one .npy file per leaf, and return each one's scene
     name.
 

@@ -120,7 +120,6 @@ def draw_grid(
     period = 2 + int(period * (height - 2))
     kept = min(max(round(period * config.grid_ratio), 1), period - 1)
     rows, columns = (
-        (np.arange(size) + int(start * period)) % period >= kept
-        for size, start in ((height, row), (width, column))
+        (np.arange(size) + int(start * period)) % period >= kept for size, start in ((height, row), (width, column))
     )
     return rows[:, None] & columns

@@ -64,9 +64,7 @@ class Streamed:
         example = self.dataset.example(index)
         return example if self.select is None else self.select(example)
 
-    def stream(
-        self, requests: Callable[[int], Request], count: int, prepare: Prepare | None = None
-    ) -> Generator[Any]:
+    def stream(self, requests: Callable[[int], Request], count: int, prepare: Prepare | None = None) -> Generator[Any]:
         """Yield the examples that requests 0 to count - 1 name, in this order.
 
         Args:
@@ -82,9 +80,7 @@ class Streamed:
         grain = _grain()
         wanted = grain.MapDataset.range(count).map(_Load(self, requests, prepare))
         ahead = self.config.ahead if self.config.threads else 0
-        loaded = wanted.to_iter_dataset(
-            grain.ReadOptions(num_threads=self.config.threads, prefetch_buffer_size=ahead)
-        )
+        loaded = wanted.to_iter_dataset(grain.ReadOptions(num_threads=self.config.threads, prefetch_buffer_size=ahead))
         if self.config.processes:
             _mark_flags_as_parsed()
             loaded = loaded.mp_prefetch(grain.MultiprocessingOptions(num_workers=self.config.processes))

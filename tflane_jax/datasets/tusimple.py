@@ -33,8 +33,11 @@ Split = Literal["train", "val", "test", "all"]
 
 _TRAIN, _VAL = ("label_data_0313.json", "label_data_0601.json"), ("label_data_0531.json",)
 _SPLIT_FILES: dict[Split, tuple[str, ...]] = {
-    "train": _TRAIN, "val": _VAL, "test": ("test_label.json",), "all": tuple(sorted(_TRAIN + _VAL)),
-}  # fmt: skip
+    "train": _TRAIN,
+    "val": _VAL,
+    "test": ("test_label.json",),
+    "all": tuple(sorted(_TRAIN + _VAL)),
+}
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,12 @@ _NUMPY: dict[str, dict[str, Callable[..., Any]]] = {
     "numeric": {"_frombuffer": _from_buffer},
 }
 _BUILTINS = {
-    "set": set, "frozenset": frozenset, "complex": complex, "bytes": Sealed(_bytes), "bytearray": Sealed(_bytearray),
-}  # fmt: skip
+    "set": set,
+    "frozenset": frozenset,
+    "complex": complex,
+    "bytes": Sealed(_bytes),
+    "bytearray": Sealed(_bytearray),
+}
 PLAIN: Mapping[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _NDARRAY,
     ("numpy", "dtype"): Sealed(_dtype),
@@ -132,7 +136,11 @@ PLAIN: Mapping[tuple[str, str], Any] = {
     ("_codecs", "encode"): Sealed(_bytes),
     # Python 2 and 3, numpy 1 and 2 keep the same things in different places.
     **{(module, name): value for module in ("builtins", "__builtin__") for name, value in _BUILTINS.items()},
-    **{(f"numpy.{core}.{module}", name): Sealed(value)
-       for core in ("core", "_core") for module, names in _NUMPY.items() for name, value in names.items()},
-}  # fmt: skip
+    **{
+        (f"numpy.{core}.{module}", name): Sealed(value)
+        for core in ("core", "_core")
+        for module, names in _NUMPY.items()
+        for name, value in names.items()
+    },
+}
 """What plain data may name."""

@@ -59,9 +59,13 @@ def flat_image_curve(curve: GroundCurve, focal: float, height: float) -> ImageCu
     # u = f X / Z and v = f h / Z, so that Z = f h / v.
     depth = focal * height
     return ImageCurve(
-        k=focal * depth**2 * curve.k, f=0.0 * curve.k, m=focal * depth * curve.m,
-        n=focal * curve.n, b=curve.b / height, offset=0.0 * curve.b,
-    )  # fmt: skip
+        k=focal * depth**2 * curve.k,
+        f=0.0 * curve.k,
+        m=focal * depth * curve.m,
+        n=focal * curve.n,
+        b=curve.b / height,
+        offset=0.0 * curve.b,
+    )
 
 
 def tilted_image_curve(flat: ImageCurve, focal: float, pitch: float) -> ImageCurve:
@@ -75,9 +79,13 @@ def tilted_image_curve(flat: ImageCurve, focal: float, pitch: float) -> ImageCur
     xp = namespace(flat.k)
     cos, sin, tan = xp.cos(pitch), xp.sin(pitch), xp.tan(pitch)
     return ImageCurve(
-        k=flat.k * cos**2, f=focal * sin + 0.0 * flat.k, m=flat.m * cos, n=flat.n,
-        b=flat.b / cos, offset=flat.b * focal * tan,
-    )  # fmt: skip
+        k=flat.k * cos**2,
+        f=focal * sin + 0.0 * flat.k,
+        m=flat.m * cos,
+        n=flat.n,
+        b=flat.b / cos,
+        offset=flat.b * focal * tan,
+    )
 
 
 def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: float) -> ImageCurve:
@@ -100,9 +108,13 @@ def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: 
     constant = 3.0 * k * near * tan**2 + 2.0 * m * near * tan + curve.n * near
     linear = k * tan**3 + m * tan**2 + curve.n * tan + curve.b / height
     return ImageCurve(
-        k=inverse_square / cos**2, f=horizon + 0.0 * k, m=inverse / cos, n=constant,
-        b=linear * cos, offset=linear * cos * horizon,
-    )  # fmt: skip
+        k=inverse_square / cos**2,
+        f=horizon + 0.0 * k,
+        m=inverse / cos,
+        n=constant,
+        b=linear * cos,
+        offset=linear * cos * horizon,
+    )
 
 
 def normalised_image_curve(curve: ImageCurve, centre: tuple[float, float], size: tuple[float, float]) -> ImageCurve:
@@ -115,9 +127,13 @@ def normalised_image_curve(curve: ImageCurve, centre: tuple[float, float], size:
     """
     (cu, cv), (width, height) = centre, size
     return ImageCurve(
-        k=curve.k / height**2 / width, f=(curve.f + cv) / height, m=curve.m / height / width,
-        n=(curve.n + cu) / width, b=curve.b * height / width, offset=(curve.offset + curve.b * cv) / width,
-    )  # fmt: skip
+        k=curve.k / height**2 / width,
+        f=(curve.f + cv) / height,
+        m=curve.m / height / width,
+        n=(curve.n + cu) / width,
+        b=curve.b * height / width,
+        offset=(curve.offset + curve.b * cv) / width,
+    )
 
 
 def curve_columns(

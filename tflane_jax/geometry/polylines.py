@@ -95,9 +95,7 @@ def clip_to_range(points: Float[AnyArray, "n d"], range_: PerceptionRange) -> li
     continues = inside[1:] & inside[:-1] & (leave[:-1] == 1.0) & (enter[1:] == 0.0)
     starts = np.flatnonzero(inside & ~np.concatenate([[False], continues]))
     stops = np.flatnonzero(inside & ~np.concatenate([continues, [False]])) + 1
-    pieces = [
-        np.concatenate([enter_point[i : i + 1], leave_point[i:j]]) for i, j in zip(starts, stops, strict=True)
-    ]
+    pieces = [np.concatenate([enter_point[i : i + 1], leave_point[i:j]]) for i, j in zip(starts, stops, strict=True)]
     return [p for p in pieces if _has_length(p)]
 
 

@@ -13,9 +13,7 @@ from jaxtyping import Float
 from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
 
 
-def pose_matrix(
-    rotation: Float[AnyArray, "*b d d"], translation: Float[AnyArray, "*b d"]
-) -> Float[Any, "*b d+1 d+1"]:
+def pose_matrix(rotation: Float[AnyArray, "*b d d"], translation: Float[AnyArray, "*b d"]) -> Float[Any, "*b d+1 d+1"]:
     """Return the homogeneous matrix of `p -> rotation @ p + translation` (SE(2) for d = 2, SE(3) for d = 3)."""
     xp = namespace(rotation, translation)
     top = xp.concatenate([rotation, translation[..., None]], -1)

@@ -80,9 +80,12 @@ def offsets_and_logits(
     """Return where to look and how much to take, in float32, as layers of the module whose method calls this."""
     bias = compass_offsets(heads, levels, points).reshape(-1)
     offsets = nn.Dense(
-        heads * levels * points * 2, kernel_init=nn.initializers.zeros,
-        bias_init=lambda *_: jnp.asarray(bias), dtype=dtype, name="sampling_offsets",
-    )(query)  # fmt: skip
+        heads * levels * points * 2,
+        kernel_init=nn.initializers.zeros,
+        bias_init=lambda *_: jnp.asarray(bias),
+        dtype=dtype,
+        name="sampling_offsets",
+    )(query)
     logits = nn.Dense(
         heads * levels * points, kernel_init=nn.initializers.zeros, dtype=dtype, name="attention_weights"
     )(query)

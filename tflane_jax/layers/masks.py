@@ -80,7 +80,9 @@ class SpatialMask:
         def full(quadrant, rows, columns):
             return jnp.broadcast_to(quadrant, (rows, columns))
 
-        return jnp.block([
-            [full(lane_lane, lanes, lanes), full(self.lane_traffic, lanes, traffic)],
-            [full(self.traffic_lane, traffic, lanes), full(self.traffic_traffic, traffic, traffic)],
-        ])
+        return jnp.block(
+            [
+                [full(lane_lane, lanes, lanes), full(self.lane_traffic, lanes, traffic)],
+                [full(self.traffic_lane, traffic, lanes), full(self.traffic_traffic, traffic, traffic)],
+            ]
+        )

@@ -113,8 +113,9 @@ class PolylineEncoder(nn.Module):
                 over_lines = nn.vmap(
                     lambda layer, x, nowhere: layer(x, nowhere, deterministic=deterministic),
                     variable_axes={"params": None, "intermediates": 0},
-                    split_rngs={"params": False, "dropout": True}, in_axes=0,
-                )  # fmt: skip
+                    split_rngs={"params": False, "dropout": True},
+                    in_axes=0,
+                )
                 x = over_lines(layer, x, nowhere)
             x = nn.Dense(config.dim, name="out")(x.reshape(lines, count * config.dim))
         return jnp.where(valid[:, None], x, 0.0)

@@ -189,6 +189,12 @@ def _shortcut(x: jax.Array, channels: int, stride: int, frozen: bool, train: boo
 def _conv(channels: int, size: int, stride: int, name: str, dtype: Any) -> nn.Conv:
     pad = size // 2
     return nn.Conv(
-        channels, (size, size), (stride, stride), [(pad, pad), (pad, pad)],
-        use_bias=False, kernel_init=_INIT, dtype=dtype, name=name,
-    )  # fmt: skip
+        channels,
+        (size, size),
+        (stride, stride),
+        [(pad, pad), (pad, pad)],
+        use_bias=False,
+        kernel_init=_INIT,
+        dtype=dtype,
+        name=name,
+    )

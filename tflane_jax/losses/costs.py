@@ -22,9 +22,7 @@ def pairwise_l1(prediction: Float[Array, "*b q d"], target: Float[Array, "*#b n 
     return jnp.abs(prediction[..., :, None, :] - target[..., None, :, :]).sum(-1)
 
 
-def generalised_iou(
-    a: Float[Array, "*#b 2 2"], b: Float[Array, "*#b 2 2"], eps: float = 1e-6
-) -> Float[Array, "*b"]:
+def generalised_iou(a: Float[Array, "*#b 2 2"], b: Float[Array, "*#b 2 2"], eps: float = 1e-6) -> Float[Array, "*b"]:
     """Return the overlap of boxes less the share of their hull that neither covers, -1 to 1 (Rezatofighi et al. 2019).
 
     Args:

@@ -182,9 +182,12 @@ def _window(outlines: Float[np.ndarray, "b 4 2"], camera: FrontCamera) -> tuple[
 
 
 def _compared(
-    sight: Sighting, corners: Float[np.ndarray, "4 2"], camera: FrontCamera, ego_from_marker: Float[np.ndarray, "4 4"],
+    sight: Sighting,
+    corners: Float[np.ndarray, "4 2"],
+    camera: FrontCamera,
+    ego_from_marker: Float[np.ndarray, "4 4"],
     detector: DetectorConfig,
-) -> Sighting:  # fmt: skip
+) -> Sighting:
     """Return the sighting with what its corners say about the pose."""
     fit = solve_square(corners, camera.intrinsics, camera.camera_from_ego, detector)
     truth = camera.camera_from_ego @ ego_from_marker
@@ -194,9 +197,14 @@ def _compared(
     axes = np.stack([along, right, np.cross(along, right)])
     turned = [_angle_between(pose[:3, :3], truth[:3, :3]) for pose in fit.camera_from_marker]
     return replace(
-        sight, found=True, translation=axes @ (fit.camera_from_marker[0, :3, 3] - truth[:3, 3]), rotation=turned[0],
-        other=turned[1], error=float(fit.error[0]), ambiguity=fit.ambiguity,
-    )  # fmt: skip
+        sight,
+        found=True,
+        translation=axes @ (fit.camera_from_marker[0, :3, 3] - truth[:3, 3]),
+        rotation=turned[0],
+        other=turned[1],
+        error=float(fit.error[0]),
+        ambiguity=fit.ambiguity,
+    )
 
 
 def summarise(sightings: Sequence[Sighting]) -> list[dict[str, Any]]:
@@ -213,19 +221,21 @@ def summarise(sightings: Sequence[Sighting]) -> list[dict[str, Any]]:
         shift = np.array([sighting.translation for sighting in here]).reshape(-1, 3)
         turned = np.array([sighting.rotation for sighting in here])
         other = np.array([sighting.other for sighting in here])
-        rows.append({
-            "distance m": distance,
-            "boards": len(all_here),
-            "pixels": _mean([sighting.pixels for sighting in all_here]),
-            "found": len(here) / len(all_here),
-            "translation m": _mean(np.linalg.norm(shift, axis=-1)),
-            "forward m": _rms(shift[:, 0]),
-            "sideways m": _rms(np.linalg.norm(shift[:, 1:], axis=-1)),
-            "rotation median": float(np.median(turned)) if len(here) else np.nan,
-            "rotation rms": _rms(turned),
-            "wrong pose": _mean(other < turned - 1.0),
-            "reprojection px": _mean([sighting.error for sighting in here]),
-        })  # fmt: skip
+        rows.append(
+            {
+                "distance m": distance,
+                "boards": len(all_here),
+                "pixels": _mean([sighting.pixels for sighting in all_here]),
+                "found": len(here) / len(all_here),
+                "translation m": _mean(np.linalg.norm(shift, axis=-1)),
+                "forward m": _rms(shift[:, 0]),
+                "sideways m": _rms(np.linalg.norm(shift[:, 1:], axis=-1)),
+                "rotation median": float(np.median(turned)) if len(here) else np.nan,
+                "rotation rms": _rms(turned),
+                "wrong pose": _mean(other < turned - 1.0),
+                "reprojection px": _mean([sighting.error for sighting in here]),
+            }
+        )
     return rows
 
 
@@ -241,9 +251,11 @@ def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma
 
     figure, axes = new_figure(1, 4, panel=(3.6, 3.0))
     panels = (
-        ("found", "detection rate"), ("forward m", "forward error, rms [m]"),
-        ("rotation median", "rotation error, median [deg]"), ("wrong pose", "other pose nearer to the truth"),
-    )  # fmt: skip
+        ("found", "detection rate"),
+        ("forward m", "forward error, rms [m]"),
+        ("rotation median", "rotation error, median [deg]"),
+        ("wrong pose", "other pose nearer to the truth"),
+    )
     far = np.linspace(0.0, PAPER_DISTANCE, 61)
     paper = {
         "found": np.exp(-0.5 * (far / sigma_d) ** 2),
@@ -282,17 +294,28 @@ def street(seed: int, config: CurveConfig) -> Log:
     ids = rng.choice(marker_count(config.detector.family), len(poses), replace=False)
     frames = len(keyframes)
     nothing = Tracks(
-        np.zeros((frames, 0, 3)), np.zeros((frames, 0)), np.zeros((0, 3)), np.zeros(0, np.int32),
-        np.zeros((frames, 0), bool), np.zeros((frames, 0), bool), np.zeros(0, str),
-    )  # fmt: skip
+        np.zeros((frames, 0, 3)),
+        np.zeros((frames, 0)),
+        np.zeros((0, 3)),
+        np.zeros(0, np.int32),
+        np.zeros((frames, 0), bool),
+        np.zeros((frames, 0), bool),
+        np.zeros(0, str),
+    )
     return Log(
-        name=f"markers {seed}", source="markers", map=_street_map(global_from_street, float(eyes.max())),
-        timestamps_ns=np.arange(frames) * 500_000_000, global_from_ego=np.stack(keyframes), tracks=nothing,
+        name=f"markers {seed}",
+        source="markers",
+        map=_street_map(global_from_street, float(eyes.max())),
+        timestamps_ns=np.arange(frames) * 500_000_000,
+        global_from_ego=np.stack(keyframes),
+        tracks=nothing,
         actors=nothing,
         keyframes=tuple(KeyFrame(int(n) * 500_000_000, keyframes[n], int(n)) for n in range(frames)),
-        weather=float(rng.random()), paint_wear=0.5, seed=seed,
+        weather=float(rng.random()),
+        paint_wear=0.5,
+        seed=seed,
         markers=PlacedMarkers(ids, np.stack(poses), config.detector.size, config.detector.family),
-    )  # fmt: skip
+    )
 
 
 def _turns(seed: int, config: CurveConfig) -> list[float]:
@@ -318,10 +341,11 @@ def _street_map(global_from_street: Float[np.ndarray, "4 4"], length: float) -> 
         return local @ global_from_street[:3, :3].T + global_from_street[:3, 3]
 
     lanes = {
-        n: LaneSegment(n, line(y), line(y + 0.5 * _LANE), line(y - 0.5 * _LANE), LineType.DASHED, LineType.SOLID,
-                       False, ())
+        n: LaneSegment(
+            n, line(y), line(y + 0.5 * _LANE), line(y - 0.5 * _LANE), LineType.DASHED, LineType.SOLID, False, ()
+        )
         for n, y in enumerate((0.5 * _LANE, -0.5 * _LANE))
-    }  # fmt: skip
+    }
     # A closed ring has no kerb along which trees and lamps could stand before the boards.
     low, high = line(-_LANE - 0.5), line(_LANE + 0.5)
     ring = np.concatenate([low, high[::-1], low[:1]])

@@ -271,15 +271,21 @@ def refine_corners(
         u, v = (pixels - low[:, None] - 0.5).astype(np.float32)
 
         def seen(du: float, dv: float, u: np.ndarray = u, v: np.ndarray = v) -> np.ndarray:
-            return cv2.remap(
-                picture, u + np.float32(du), v + np.float32(dv), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-            ).ravel().astype(np.float64)  # fmt: skip
+            return (
+                cv2.remap(
+                    picture, u + np.float32(du), v + np.float32(dv), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                )
+                .ravel()
+                .astype(np.float64)
+            )
 
         slope = np.stack([seen(0.5, 0.0) - seen(-0.5, 0.0), seen(0.0, 0.5) - seen(0.0, -0.5)])
         # How the pixel of a point moves with the eight numbers of the homography, and these with the corners.
         moves = _homography_slopes(s, t, pixels) / top[2]
-        at_corners = _homography_slopes(square[:, 0], square[:, 1], now.T) / (image_from_square @ np.vstack(
-            [square.T, np.ones(4)]))[2]  # fmt: skip
+        at_corners = (
+            _homography_slopes(square[:, 0], square[:, 1], now.T)
+            / (image_from_square @ np.vstack([square.T, np.ones(4)]))[2]
+        )
         by_corner = np.linalg.inv(at_corners.transpose(2, 0, 1).reshape(8, 8))
         along = np.einsum("cp,ckp->pk", slope, moves) @ by_corner
         unknown = np.column_stack([along, -np.ones_like(s), -template])
@@ -308,16 +314,20 @@ def _homography_slopes(
     """Return how the pixel of (s, t) moves with the first eight entries of a homography, times its third coordinate."""
     one, none = np.ones(len(s)), np.zeros(len(s))
     u, v = pixels
-    return np.array([
-        [s, t, one, none, none, none, -u * s, -u * t],
-        [none, none, none, s, t, one, -v * s, -v * t],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [s, t, one, none, none, none, -u * s, -u * t],
+            [none, none, none, s, t, one, -v * s, -v * t],
+        ]
+    )
 
 
 def solve_square(
-    corners: Float[np.ndarray, "4 2"], intrinsics: Float[np.ndarray, "3 3"], camera_from_ego: Float[np.ndarray, "4 4"],
+    corners: Float[np.ndarray, "4 2"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    camera_from_ego: Float[np.ndarray, "4 4"],
     config: DetectorConfig = DetectorConfig(),
-) -> SquarePose:  # fmt: skip
+) -> SquarePose:
     """Return both poses of a marker whose corners are seen (in the order of `ImageMarkers`), the preferred one first.
 
     A square seen from afar looks nearly the same when its face is mirrored about the line of sight, so that four
@@ -390,9 +400,11 @@ def detection_score(corners: Float[np.ndarray, "4 2"], wrong_bits: int, error: f
 
 
 def marker_outline(
-    pose: Float[np.ndarray, "4 4"], size: float, intrinsics: Float[np.ndarray, "3 3"],
+    pose: Float[np.ndarray, "4 4"],
+    size: float,
+    intrinsics: Float[np.ndarray, "3 3"],
     camera_from_ego: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "4 2"]:  # fmt: skip
+) -> Float[np.ndarray, "4 2"]:
     """Return the pixels of a marker's corners, in the order of `ImageMarkers`; what lies behind the camera is zeros.
 
     Args:

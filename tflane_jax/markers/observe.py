@@ -103,17 +103,16 @@ def observe(
         before = None if previous is None else _pose_of(previous, entry.marker_id)
         out.marker_id[slot], out.pose[slot], out.score[slot] = entry.marker_id, pose, detected.score[row]
         out.residual[slot] = (
-            first_residual if before is None or now_from_previous is None
+            first_residual
+            if before is None or now_from_previous is None
             else pose_residual(entry, pose, now_from_previous @ before)
-        )  # fmt: skip
+        )
         out.valid[slot] = True
         lanes_dropped += _fill_lanes(out, slot, entry, pose, range_)
     return Observed(out, looked.unknown, looked.stale, max(len(known) - markers, 0), lanes_dropped)
 
 
-def pose_residual(
-    entry: StoredMarker, pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]
-) -> float:
+def pose_residual(entry: StoredMarker, pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> float:
     """Return how far apart two poses of a marker in one frame put its lane points: their mean distance in the ground
     plane, metres; that of the marker itself where it has no lanes."""
     points = entry.lanes.reshape(-1, 3) if entry.lanes.size else np.zeros((1, 3))

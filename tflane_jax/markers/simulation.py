@@ -78,9 +78,7 @@ class MarkerSimulationConfig:
 
 
 # A simulation without noise, in which every visible marker is detected.
-PERFECT = MarkerSimulationConfig(
-    forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0.0, jump=0.0, detection_sigma=1e9
-)
+PERFECT = MarkerSimulationConfig(forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0.0, jump=0.0, detection_sigma=1e9)
 
 
 @dataclass(frozen=True)
@@ -189,7 +187,10 @@ def _draws(seed: int, frame: int, marker_id: Int[np.ndarray, " m"], wanted: Bool
 
 
 def _perturbed(
-    true: Float[np.ndarray, "m 4 4"], distance: Float[np.ndarray, " m"], jump: Bool[np.ndarray, " m"], drawn: _Draws,
+    true: Float[np.ndarray, "m 4 4"],
+    distance: Float[np.ndarray, " m"],
+    jump: Bool[np.ndarray, " m"],
+    drawn: _Draws,
     config: MarkerSimulationConfig,
 ) -> Float[np.ndarray, "m 4 4"]:
     """Return the poses with the errors of section IV-A: the marker moves along x, jumps, and turns about itself."""
@@ -225,6 +226,4 @@ def _hidden(log: Log, moment: KeyFrame, ego_from_marker: Float[np.ndarray, "m 4 
     blocks = log.map.buildings
     stand = relative_pose(moment.global_from_ego, yaw_pose(blocks[:, 0], blocks[:, 1], blocks[:, 4]))
     buildings = np.column_stack([stand[:, :2, 3], blocks[:, 2:4], pose_yaw(stand)]).reshape(-1, 5)
-    return hidden_points(
-        ego_from_marker[:, :2, 3], boxes, buildings, target_height=ego_from_marker[:, 2, 3]
-    )
+    return hidden_points(ego_from_marker[:, :2, 3], boxes, buildings, target_height=ego_from_marker[:, 2, 3])

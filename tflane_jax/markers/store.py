@@ -118,18 +118,21 @@ def look_up(
     stale = [e is not None and today is not None and e.outdated(today, max_age_days) for e in entries]
     lookup = Lookup(
         tuple(None if old else entry for entry, old in zip(entries, stale, strict=True)),
-        unknown=sum(entry is None for entry in entries), stale=sum(stale),
-    )  # fmt: skip
+        unknown=sum(entry is None for entry in entries),
+        stale=sum(stale),
+    )
     if lookup.unknown:
         warnings.warn(
             f"markers were seen that {store.source} does not hold: they give no prior; add them to the store",
-            UnknownMarkerWarning, stacklevel=2,
-        )  # fmt: skip
+            UnknownMarkerWarning,
+            stacklevel=2,
+        )
     if lookup.stale:
         warnings.warn(
             f"markers were seen whose entries in {store.source} are out of date: they give no prior; survey them again",
-            StaleMarkerWarning, stacklevel=2,
-        )  # fmt: skip
+            StaleMarkerWarning,
+            stacklevel=2,
+        )
     return lookup
 
 
@@ -178,10 +181,12 @@ def _local_graph(
             parts = _clip_to_circle(lane.centerline, centre, radius)
             pieces += [(number, part, i == 0, i == len(parts) - 1) for i, part in enumerate(parts)]
     whole = [lanes[number].centerline for number, *_ in pieces]
-    ends = np.array([last and np.array_equal(p[-1], line[-1])
-                     for (_, p, _, last), line in zip(pieces, whole, strict=True)], bool)  # fmt: skip
-    starts = np.array([first and np.array_equal(p[0], line[0])
-                       for (_, p, first, _), line in zip(pieces, whole, strict=True)], bool)  # fmt: skip
+    ends = np.array(
+        [last and np.array_equal(p[-1], line[-1]) for (_, p, _, last), line in zip(pieces, whole, strict=True)], bool
+    )
+    starts = np.array(
+        [first and np.array_equal(p[0], line[0]) for (_, p, first, _), line in zip(pieces, whole, strict=True)], bool
+    )
     follows = np.array([[b in lanes[a].successors for b, *_ in pieces] for a, *_ in pieces], bool)
     joined = follows.reshape(len(pieces), len(pieces)) & ends[:, None] & starts
     lines = resample_lines([p for _, p, *_ in pieces], points)
@@ -280,9 +285,10 @@ def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -
     pose = pose * np.array([[1.0, 1.0, 1.0, unit]] * 3 + [[1.0] * 4])
     rotation = pose[:3, :3]
     if not (
-        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0.0
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(rotation) > 0.0
         and np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
-    ):  # fmt: skip
+    ):
         raise UserError(
             f"{where}: global_from_marker is no pose: expected a rotation and a translation over the row 0 0 0 1"
         )

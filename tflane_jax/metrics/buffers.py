@@ -90,9 +90,7 @@ def _without_repetitions(lines: Float[np.ndarray, "l n 2"]) -> Float[np.ndarray,
     return np.take_along_axis(lines, order[..., None], 1)
 
 
-def _any_pieces_touch(
-    a: Float[np.ndarray, "k s 4 2"], b: Float[np.ndarray, "k t 4 2"]
-) -> Bool[np.ndarray, " k"]:
+def _any_pieces_touch(a: Float[np.ndarray, "k s 4 2"], b: Float[np.ndarray, "k t 4 2"]) -> Bool[np.ndarray, " k"]:
     """Return for each k whether one of a's pieces touches one of b's."""
     low_a, high_a, low_b, high_b = a.min(2), a.max(2), b.min(2), b.max(2)
     # Comparisons with NaN are false, so absent pieces drop out here.

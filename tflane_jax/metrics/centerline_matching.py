@@ -56,9 +56,7 @@ def nearest_lanes(
     return nearest_truth(distance)
 
 
-def iou_distance(
-    a: Float[np.ndarray, "t 2 2"], b: Float[np.ndarray, "u 2 2"]
-) -> Float[np.ndarray, "t u"]:
+def iou_distance(a: Float[np.ndarray, "t 2 2"], b: Float[np.ndarray, "u 2 2"]) -> Float[np.ndarray, "t u"]:
     """Return 1 - IoU of all pairs of boxes (corners, no +1 pixel convention); 1 where both have no area."""
     a, b = np.asarray(a, np.float64)[:, None], np.asarray(b, np.float64)[None]
     shared = np.minimum(a[..., 1, :], b[..., 1, :]) - np.maximum(a[..., 0, :], b[..., 0, :])

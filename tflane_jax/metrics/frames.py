@@ -105,9 +105,7 @@ def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None
     )
 
 
-def detections_from_prediction(
-    prediction: LanePrediction, elements: ElementPrediction | None = None
-) -> LaneDetections:
+def detections_from_prediction(prediction: LanePrediction, elements: ElementPrediction | None = None) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
     No score threshold; a traffic element is of the attribute that its query finds likeliest.

@@ -129,9 +129,7 @@ class LaneSegmentMetrics:
         lanes = self._lanes.compute()
         scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
         precision = {
-            name: [
-                average_precision_11(scores[members], row[members], int(self._true_areas[category])) for row in hits
-            ]
+            name: [average_precision_11(scores[members], row[members], int(self._true_areas[category])) for row in hits]
             for name, category in (("crossing", CROSSING), ("boundary", BOUNDARY))
             for members in [categories == category]
         }
@@ -188,12 +186,16 @@ def nearest_segments(
         truth: G centerlines, left lines, right lines.
         detected: P of each.
     """
-    true, found = ([PaddedLines.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
-                   for side, three in (("truth", truth), ("detections", detected)))  # fmt: skip
+    true, found = (
+        [PaddedLines.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
+        for side, three in (("truth", truth), ("detections", detected))
+    )
     for side, three in (("truth", true), ("detections", found)):
         if len({len(lines) for lines in three}) > 1:
-            raise UserError(f"{side}: {', '.join(f'{len(x)} {n}' for x, n in zip(three, _NAMES, strict=True))}"
-                            ", expected as many of each")  # fmt: skip
+            raise UserError(
+                f"{side}: {', '.join(f'{len(x)} {n}' for x, n in zip(three, _NAMES, strict=True))}"
+                ", expected as many of each"
+            )
     relax = relaxation(true[0].points)
     # Nothing beyond the largest threshold is matched, and half the centerlines' distance is a part of the whole.
     true_centers, centers = true[0].points, found[0].points

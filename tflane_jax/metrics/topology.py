@@ -29,9 +29,7 @@ def matchings(
     return np.where(confidence_levels(scores, taken), taken, -1)
 
 
-def confidence_levels(
-    scores: Float[np.ndarray, " p"], taken: Int[np.ndarray, " p"]
-) -> Bool[np.ndarray, "levels p"]:
+def confidence_levels(scores: Float[np.ndarray, " p"], taken: Int[np.ndarray, " p"]) -> Bool[np.ndarray, "levels p"]:
     """Return which matches take part at each of the ten confidence cut-offs of the v1.0 topology score."""
     n = len(scores)
     if n == 0:

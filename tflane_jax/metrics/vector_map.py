@@ -105,10 +105,12 @@ class VectorMapMetrics:
           program prints it under its tables (0 if there is none). `mAP` is their mean only if no class is missing.
         """
         scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
-        precision = np.array([
-            [average_precision_area(scores[members], row[members], int(count)) for row in hits]
-            for members, count in zip(classes == np.arange(len(CLASSES))[:, None], self._truths, strict=True)
-        ])  # fmt: skip
+        precision = np.array(
+            [
+                [average_precision_area(scores[members], row[members], int(count)) for row in hits]
+                for members, count in zip(classes == np.arange(len(CLASSES))[:, None], self._truths, strict=True)
+            ]
+        )
         present = self._truths > 0
         at_threshold = precision.sum(0) / max(present.sum(), 1)
         return (

@@ -138,9 +138,17 @@ class BevEncoder(nn.Module):
             if config.temporal_value == "initial":
                 looked_at = jnp.where(history.valid, initial, queries)
             queries = layer(config, name=f"layer_{i}")(
-                queries, position, (previous, looked_at), cells, tokens, reference, visible, shapes, deterministic,
+                queries,
+                position,
+                (previous, looked_at),
+                cells,
+                tokens,
+                reference,
+                visible,
+                shapes,
+                deterministic,
                 None if fuse is None else partial(fuse, i, cell_points(config.grid)),
-            )  # fmt: skip
+            )
         return queries
 
 
@@ -172,9 +180,13 @@ class BevEncoderLayer(nn.Module):
             return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change.astype(jnp.float32))
 
         temporal = TemporalSelfAttention(
-            config.dim, config.heads, config.temporal_points, config.value_projections, config.dtype,
+            config.dim,
+            config.heads,
+            config.temporal_points,
+            config.value_projections,
+            config.dtype,
             name="temporal_attention",
-        )  # fmt: skip
+        )
         queries = add(queries, temporal(queries + position, *frames, (grid.rows, grid.columns), cells), "temporal")
         spatial = SpatialCrossAttention(
             config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"

@@ -108,10 +108,12 @@ class ElementDecoder(nn.Module):
         tokens = jnp.where(valid[:, None], tokens, 0.0)
 
         level = self.param("level", nn.initializers.normal(1.0), (config.levels, config.dim))
-        position = jnp.concatenate([
-            image_sine_encoding(mask, config.dim // 2, offset=-0.5).reshape(-1, config.dim) + level[i][None]
-            for i, mask in enumerate(masks)
-        ])  # fmt: skip
+        position = jnp.concatenate(
+            [
+                image_sine_encoding(mask, config.dim // 2, offset=-0.5).reshape(-1, config.dim) + level[i][None]
+                for i, mask in enumerate(masks)
+            ]
+        )
         cells = jnp.concatenate([cell_centres(shape, ratio) for shape, ratio in zip(shapes, ratios, strict=True)])
         around = cells[:, None, None] * ratios[None, None]  # (T, 1, L, 2): the same spot on every level
         for i in range(config.encoder_layers):

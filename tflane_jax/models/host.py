@@ -163,9 +163,11 @@ def decode_lanes(
     noised = NoisedQueries(config, noise, name="noised")(lanes)
     starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
     decode = nn.vmap(
-        type(host).decode_queries, in_axes=(0, None, None, None, None),  # pyright: ignore[reportArgumentType]
-        variable_axes={"params": None, "intermediates": 0}, split_rngs={"params": False, "dropout": True},
-    )  # fmt: skip
+        type(host).decode_queries,
+        in_axes=(0, None, None, None, None),  # pyright: ignore[reportArgumentType]
+        variable_axes={"params": None, "intermediates": 0},
+        split_rngs={"params": False, "dropout": True},
+    )
     every = decode(host, starts, bev, elements, priors, deterministic)
     host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], every.lanes))
     return jax.tree.map(lambda leaf: leaf[0], every)

@@ -71,9 +71,7 @@ class LaneDecoderLayer(nn.Module):
         if adjacency is None:
             block = FeedForward(TransformerConfig(config.heads, config.hidden, config.dropout), name="feed_forward")
             return add("feed_forward", queries, block(queries, deterministic=deterministic))
-        graph = SceneGraphFeedForward(
-            config.dim, config.hidden, config.edge_weight, config.dropout, name="scene_graph"
-        )
+        graph = SceneGraphFeedForward(config.dim, config.hidden, config.edge_weight, config.dropout, name="scene_graph")
         queries = graph(queries, adjacency, elements, deterministic=deterministic)
         return nn.LayerNorm(epsilon=1e-5, name="scene_graph_norm")(queries)
 
@@ -211,9 +209,7 @@ def directions(points: Float[Array, "*b p 2"]) -> Float[Array, "*b p 2"]:
     return step / jnp.sqrt((step**2).sum(-1, keepdims=True) + 1e-6)
 
 
-def attention_reference(
-    reference: Float[Array, "q p 3"], config: LaneDecoderConfig
-) -> Float[Array, "q r 2"]:
+def attention_reference(reference: Float[Array, "q p 3"], config: LaneDecoderConfig) -> Float[Array, "q r 2"]:
     """Return where the heads look: one common point ("fixed"), or points spread along the lane, one for each head."""
     if config.refine == "fixed":
         return reference[:, :1, :2]

@@ -74,7 +74,10 @@ class MarkerFusionConfig:
 
 
 SMALL_MARKER_FUSION = MarkerFusionConfig(
-    memory=MarkerMemoryConfig(lanes=32), width=64, norm="query", reach=4.0,
+    memory=MarkerMemoryConfig(lanes=32),
+    width=64,
+    norm="query",
+    reach=4.0,
     lines=PolylineEncoderConfig(
         dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
     ),

@@ -51,7 +51,10 @@ class SdMapModuleConfig:
 
 SMALL_SD_MAP = SdMapModuleConfig(
     # A road is some 7 m to each side of its line, and the line a few metres off.
-    lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0), width=64, norm="query", reach=10.0,
+    lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0),
+    width=64,
+    norm="query",
+    reach=10.0,
 )
 
 # Points on a line of the map that stands for an absent one.

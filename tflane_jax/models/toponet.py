@@ -168,9 +168,7 @@ class TopoNet(Host):
         features = TemporalEncoder(traffic.module, dim, name="temporal_encoder")(tokens)
         mask = SpatialMask.from_validity(self.config.decoder.queries, tokens.valid)
 
-        def enhance(
-            layer: int, queries: Float[Array, "q c"], position: Float[Array, "q c"]
-        ) -> Float[Array, "q c"]:
+        def enhance(layer: int, queries: Float[Array, "q c"], position: Float[Array, "q c"]) -> Float[Array, "q c"]:
             if layer > 0 and traffic.insert == "before_decoder":
                 return queries
             spatial = SpatialEncoder(traffic.module, dim, name=f"spatial_encoder_{layer}")

@@ -52,9 +52,7 @@ def draw_lane_attention(
     colours = np.tile(to_rgba(style.LINK), (len(query), 1))
     colours[:, 3] = np.clip(strength, 0.0, 1.0)
     ax.add_collection(
-        LineCollection(
-            list(np.stack([here, there], 1)), colors=colours, linewidths=0.5 + 2.5 * strength, zorder=5.5
-        )
+        LineCollection(list(np.stack([here, there], 1)), colors=colours, linewidths=0.5 + 2.5 * strength, zorder=5.5)
     )
     ax.scatter(here[:, 0], here[:, 1], s=8, c=style.PREDICTION, linewidths=0, zorder=5.6)
 
@@ -82,9 +80,7 @@ def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"], *, title: str 
     ax.set_ylabel("road user", fontsize=8)
 
 
-def draw_spatial_mask(
-    ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: str = "spatial mask $M_s$"
-) -> None:
+def draw_spatial_mask(ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: str = "spatial mask $M_s$") -> None:
     """Draw M_s, (L+T, L+T), as the four quadrants L->L, L->T, T->L, T->T; row attends to column where light.
 
     Args:
@@ -101,9 +97,15 @@ def draw_spatial_mask(
     for row, first in zip(middle, "LT", strict=True):
         for column, second in zip(middle, "LT", strict=True):
             ax.text(
-                column, row, f"{first}→{second}", ha="center", va="center", fontsize=9, color="black",
+                column,
+                row,
+                f"{first}→{second}",
+                ha="center",
+                va="center",
+                fontsize=9,
+                color="black",
                 bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5},
-            )  # fmt: skip
+            )
     ax.set_aspect("equal")
 
 

@@ -105,9 +105,7 @@ def draw_hidden(ax: Axes, hidden: Bool[Array, "h w"], ground: PerceptionRange = 
     if not dark.any():
         return
     shade = np.ma.masked_where(~dark, np.ones(dark.shape))
-    ax.imshow(
-        shade, extent=_extent(ground), origin="lower", cmap=ListedColormap(["black"]), alpha=0.45, zorder=0.8
-    )
+    ax.imshow(shade, extent=_extent(ground), origin="lower", cmap=ListedColormap(["black"]), alpha=0.45, zorder=0.8)
     filled = ax.contourf(
         dark.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"], extent=_extent(ground), origin="lower"
     )
@@ -167,24 +165,27 @@ def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
     boxes = box_corners(position[each, last, :2], yaw[each, last], size[:, :2])
     filled = colours.copy()
     filled[:, 3] = np.where(occluded[each, last], 0.0, 0.55)
-    ax.add_collection(
-        PolyCollection(list(boxes), facecolors=filled, edgecolors=colours, linewidths=0.9, zorder=4.1)
-    )
+    ax.add_collection(PolyCollection(list(boxes), facecolors=filled, edgecolors=colours, linewidths=0.9, zorder=4.1))
 
 
 def draw_elements(ax: Axes, elements: TrafficElements) -> None:
     """Draw traffic lights (round, in the colour that they show) and signs (square)."""
-    position, category, attribute = _rows(
-        elements.valid, elements.position, elements.category, elements.attribute
-    )
+    position, category, attribute = _rows(elements.valid, elements.position, elements.category, elements.attribute)
     for kind, marker in ((1, "o"), (2, "s")):
         mine = category == kind
-        colours = [style.LIGHT.get(int(a), style.OTHER_ELEMENT) if kind == 1 else style.OTHER_ELEMENT
-                   for a in attribute[mine]]  # fmt: skip
+        colours = [
+            style.LIGHT.get(int(a), style.OTHER_ELEMENT) if kind == 1 else style.OTHER_ELEMENT for a in attribute[mine]
+        ]
         ax.scatter(
-            position[mine, 0], position[mine, 1], c=colours, marker=marker, s=22, edgecolors="black",
-            linewidths=0.6, zorder=5.0,
-        )  # fmt: skip
+            position[mine, 0],
+            position[mine, 1],
+            c=colours,
+            marker=marker,
+            s=22,
+            edgecolors="black",
+            linewidths=0.6,
+            zorder=5.0,
+        )
 
 
 def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
@@ -192,9 +193,7 @@ def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
     from matplotlib.collections import PolyCollection
 
     body = box_corners(np.zeros((1, 2)), np.zeros(1), np.asarray([size]))
-    ax.add_collection(
-        PolyCollection(list(body), facecolors=style.EGO, edgecolors="black", linewidths=0.6, zorder=6.0)
-    )
+    ax.add_collection(PolyCollection(list(body), facecolors=style.EGO, edgecolors="black", linewidths=0.6, zorder=6.0))
     nose = np.asarray([[[1.6, 0.0], [0.2, 0.7], [0.2, -0.7]]])
     ax.add_collection(PolyCollection(list(nose), facecolors=style.ROAD, zorder=6.1))
 
@@ -231,9 +230,7 @@ def box_corners(
     return _turned(corners, yaw) + centre[:, None]
 
 
-def _turned(
-    shapes: Float[np.ndarray, "#k n 2"], angle: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, "k n 2"]:
+def _turned(shapes: Float[np.ndarray, "#k n 2"], angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k n 2"]:
     """Return each shape turned about the origin by its angle, counter-clockwise."""
     along = np.stack([np.cos(angle), np.sin(angle)], -1)[:, None]
     across = np.stack([-np.sin(angle), np.cos(angle)], -1)[:, None]

@@ -24,9 +24,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ATTRIBUTES = (
-    "?", "red", "green", "yellow", "straight", "left", "right", "no left", "no right", "U-turn", "no U-turn",
-    "slight left", "slight right",
-)  # fmt: skip
+    "?",
+    "red",
+    "green",
+    "yellow",
+    "straight",
+    "left",
+    "right",
+    "no left",
+    "no right",
+    "U-turn",
+    "no U-turn",
+    "slight left",
+    "slight right",
+)
 """Short names of OpenLane-V2's attributes of traffic elements, by number."""
 
 _PANEL = 3.4  # inches
@@ -149,9 +160,10 @@ def draw_projected(ax: Axes, views: CameraViews, number: int, lines: Float[np.nd
     dense = resample_lines(list(np.asarray(lines, np.float64)), _POINTS)
     width, height = np.asarray(views.size)[number]
     pixels, depth, _ = project(
-        dense.reshape(-1, 3), np.asarray(views.intrinsics, np.float64)[number],
+        dense.reshape(-1, 3),
+        np.asarray(views.intrinsics, np.float64)[number],
         np.asarray(views.camera_from_ego, np.float64)[number],
-    )  # fmt: skip
+    )
     pixels, depth = pixels.reshape(*dense.shape[:2], 2), depth.reshape(dense.shape[:2])
     margin = 0.1 * max(width, height)
     shown = (depth > _NEAR) & ((pixels > -margin) & (pixels < [width + margin, height + margin])).all(-1)
@@ -176,9 +188,14 @@ def draw_boxes(
 
 
 def _draw_above(
-    ax: Axes, example: Example, lanes: LanePrediction | None, title: str, threshold: float, ground: PerceptionRange,
+    ax: Axes,
+    example: Example,
+    lanes: LanePrediction | None,
+    title: str,
+    threshold: float,
+    ground: PerceptionRange,
     view: PerceptionRange,
-) -> None:  # fmt: skip
+) -> None:
     if lanes is None:
         layers = ("hidden", "areas", "lanes", "traffic", "elements")
         draw_scene(ax, example, layers=layers, ground=ground, view=view, title=title)

@@ -35,9 +35,7 @@ def new_figure(
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise UserError(
-            "pictures need matplotlib: install the extra with `pip install 'tflane_jax[plot]'`"
-        ) from error
+        raise UserError("pictures need matplotlib: install the extra with `pip install 'tflane_jax[plot]'`") from error
 
     class NotebookFigure(Figure):
         """A figure that shows itself at the end of a notebook cell, as pyplot's do."""

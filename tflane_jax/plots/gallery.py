@@ -78,9 +78,13 @@ def save_examples(
         for ax in unused:
             ax.set_axis_off()
         draw_scene(
-            truth, example, layers=("hidden", "areas", "lanes", "elements"), ground=ground, view=view,
+            truth,
+            example,
+            layers=("hidden", "areas", "lanes", "elements"),
+            ground=ground,
+            view=view,
             title=f"{title}: truth",
-        )  # fmt: skip
+        )
         draw_scene(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
         )
@@ -112,9 +116,13 @@ def show_dataset(
     for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
         example, info = dataset.example(index), dataset.info(index)
         draw_scene(
-            truth, example, layers=("hidden", "areas", "lanes", "elements"), ground=ground, view=view,
+            truth,
+            example,
+            layers=("hidden", "areas", "lanes", "elements"),
+            ground=ground,
+            view=view,
             title=f"{index}: {info.scene[:16]}, truth",
-        )  # fmt: skip
+        )
         draw_scene(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
         )

@@ -68,9 +68,7 @@ def _row(quantity: str, values: ArrayLike) -> dict[str, Any]:
     return {"quantity": quantity, "mean": mean, "least": least, "most": most, "capacity": None, "full": None}
 
 
-def _mean_of(
-    values: Shaped[Array, "b *n"], valid: Bool[Array, "b *n"]
-) -> Float[np.ndarray, " b"]:
+def _mean_of(values: Shaped[Array, "b *n"], valid: Bool[Array, "b *n"]) -> Float[np.ndarray, " b"]:
     """Return each example's mean over its valid entries, NaN where it has none."""
     axes = tuple(range(1, valid.ndim))
     number = valid.sum(axes)

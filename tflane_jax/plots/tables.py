@@ -14,9 +14,7 @@ import numpy as np
 Row = Mapping[str, Any]
 
 
-def format_table(
-    rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str = "", digits: int = 3
-) -> str:
+def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str = "", digits: int = 3) -> str:
     """Return the rows as an aligned Markdown table, numbers to the right.
 
     Args:
@@ -39,9 +37,14 @@ def format_table(
 
 
 def save_table(
-    stem: Path, rows: Sequence[Row], meta: Mapping[str, Any], *,
-    columns: Sequence[str] | None = None, title: str = "", digits: int = 3,
-) -> tuple[Path, Path]:  # fmt: skip
+    stem: Path,
+    rows: Sequence[Row],
+    meta: Mapping[str, Any],
+    *,
+    columns: Sequence[str] | None = None,
+    title: str = "",
+    digits: int = 3,
+) -> tuple[Path, Path]:
     """Write `<stem>.md` and `<stem>.json` ({"meta": ..., "rows": [...]}), each all or nothing, and return
     both. `columns` are those of the Markdown table; the JSON file has them all.
 
@@ -55,8 +58,7 @@ def save_table(
 
 def _line(cells: Iterable[str], widths: list[int], right: list[bool]) -> str:
     placed = (
-        cell.rjust(width) if r else cell.ljust(width)
-        for cell, width, r in zip(cells, widths, right, strict=True)
+        cell.rjust(width) if r else cell.ljust(width) for cell, width, r in zip(cells, widths, right, strict=True)
     )
     return "| " + " | ".join(placed) + " |"
 

@@ -103,9 +103,12 @@ def guidance(observed: MarkerLanes, exponent: float = 1.0) -> MarkerGuidance:
     strongest = observed.frame_confidence
     share = observed.confidence / jnp.where(strongest > 0, strongest, 1.0)
     return MarkerGuidance(
-        points=jnp.asarray(observed.points), weight=_power(share, exponent), gate=jnp.asarray(strongest),
-        successor=jnp.asarray(observed.successor), valid=jnp.asarray(observed.valid),
-    )  # fmt: skip
+        points=jnp.asarray(observed.points),
+        weight=_power(share, exponent),
+        gate=jnp.asarray(strongest),
+        successor=jnp.asarray(observed.successor),
+        valid=jnp.asarray(observed.valid),
+    )
 
 
 def remember(
@@ -159,9 +162,12 @@ def _union(
     slot, lane = chosen // lanes, chosen % lanes
     together = slot[:, None] == slot[None, :]
     return MarkerGuidance(
-        points=points[chosen], weight=weight[chosen], gate=gate, valid=used[chosen],
+        points=points[chosen],
+        weight=weight[chosen],
+        gate=gate,
+        valid=used[chosen],
         successor=bank.successor[slot[:, None], lane[:, None], lane[None, :]] & together,
-    )  # fmt: skip
+    )
 
 
 def _push(newest: Array, slots: Array) -> Array:

@@ -54,8 +54,16 @@ class Example:
 
     def validate(self) -> None:
         """Validate every part; raise AssertionError naming the first field that does not fit."""
-        parts = (self.traffic_flow, self.markers, self.sd_map, self.lanes, self.segments, self.areas,
-                 self.traffic_elements, self.cameras)  # fmt: skip
+        parts = (
+            self.traffic_flow,
+            self.markers,
+            self.sd_map,
+            self.lanes,
+            self.segments,
+            self.areas,
+            self.traffic_elements,
+            self.cameras,
+        )
         for part in parts:
             if part is not None:
                 part.validate()

@@ -64,10 +64,13 @@ class TrafficFlow:
         """Return a traffic flow with room for `capacity` instances and none valid."""
         flag = np.zeros((capacity, frames), bool)
         return cls(
-            position=np.zeros((capacity, frames, 3), np.float32), yaw=np.zeros((capacity, frames), np.float32),
-            size=np.zeros((capacity, 3), np.float32), category=np.zeros(capacity, np.int32),
-            occluded=flag, valid=flag.copy(),
-        )  # fmt: skip
+            position=np.zeros((capacity, frames, 3), np.float32),
+            yaw=np.zeros((capacity, frames), np.float32),
+            size=np.zeros((capacity, 3), np.float32),
+            category=np.zeros(capacity, np.int32),
+            occluded=flag,
+            valid=flag.copy(),
+        )
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""
@@ -108,11 +111,13 @@ class MarkerObservations:
         return cls(
             marker_id=np.zeros(capacity, np.int32),
             pose=np.tile(np.eye(4, dtype=np.float32), (capacity, 1, 1)),
-            score=np.zeros(capacity, np.float32), residual=np.zeros(capacity, np.float32),
+            score=np.zeros(capacity, np.float32),
+            residual=np.zeros(capacity, np.float32),
             lanes=np.zeros((capacity, lanes, points, 3), np.float32),
-            lane_valid=np.zeros((capacity, lanes), bool), successor=np.zeros((capacity, lanes, lanes), bool),
+            lane_valid=np.zeros((capacity, lanes), bool),
+            successor=np.zeros((capacity, lanes, lanes), bool),
             valid=np.zeros(capacity, bool),
-        )  # fmt: skip
+        )
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""

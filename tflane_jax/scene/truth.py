@@ -60,11 +60,16 @@ class LaneGraph:
         label = np.zeros(capacity, np.int32)
         flag = np.zeros(capacity, bool)
         return cls(
-            points=line, left=line.copy(), right=line.copy(),
-            left_type=label, right_type=label.copy(),
-            is_connector=flag, visibility=np.zeros(capacity, np.float32),
-            successor=np.zeros((capacity, capacity), bool), valid=flag.copy(),
-        )  # fmt: skip
+            points=line,
+            left=line.copy(),
+            right=line.copy(),
+            left_type=label,
+            right_type=label.copy(),
+            is_connector=flag,
+            visibility=np.zeros(capacity, np.float32),
+            successor=np.zeros((capacity, capacity), bool),
+            valid=flag.copy(),
+        )
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""
@@ -126,10 +131,13 @@ class TrafficElements:
         """Return a set with room for `capacity` elements and none valid."""
         label = np.zeros(capacity, np.int32)
         return cls(
-            position=np.zeros((capacity, 3), np.float32), box=np.zeros((capacity, 2, 2), np.float32),
-            category=label, attribute=label.copy(), lane=np.zeros((lanes, capacity), bool),
+            position=np.zeros((capacity, 3), np.float32),
+            box=np.zeros((capacity, 2, 2), np.float32),
+            category=label,
+            attribute=label.copy(),
+            lane=np.zeros((lanes, capacity), bool),
             valid=np.zeros(capacity, bool),
-        )  # fmt: skip
+        )
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""

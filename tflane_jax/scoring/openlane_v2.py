@@ -147,8 +147,10 @@ def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
     lanes = _truth(record, where, SEGMENT)
     points, categories = read_areas(record, where)
     if flavour == "LaneSegNet":
-        points = [_long_sides(line) if c == CROSSING and len(line) == 5 else line
-                  for line, c in zip(points, categories, strict=True)]  # fmt: skip
+        points = [
+            _long_sides(line) if c == CROSSING and len(line) == 5 else line
+            for line, c in zip(points, categories, strict=True)
+        ]
     center, left, right = (
         [_with_points(line, _LINE_POINTS) for line in lines]
         for lines in (lanes.points, *(read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))

@@ -111,11 +111,17 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
         raise UserError("the ground truth has no frames")
     problems = []
     for what, remedy, lost in (
-        ("missing from the predictions", "predict every frame; a frame without lanes is an empty list",
-         truth.keys() - predictions.keys()),
-        ("predicted, but not in the ground truth", "score against the split that was predicted",
-         predictions.keys() - truth.keys()),
-    ):  # fmt: skip
+        (
+            "missing from the predictions",
+            "predict every frame; a frame without lanes is an empty list",
+            truth.keys() - predictions.keys(),
+        ),
+        (
+            "predicted, but not in the ground truth",
+            "score against the split that was predicted",
+            predictions.keys() - truth.keys(),
+        ),
+    ):
         if lost:
             shown = ", ".join(sorted(map(str, lost))[:3])
             more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""

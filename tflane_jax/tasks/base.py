@@ -109,5 +109,3 @@ class System(Protocol):
 def spread(size: int, count: int) -> list[int]:
     """Return `count` indices spread evenly over `size` (all of them if there are fewer)."""
     return np.unique(np.linspace(0, size - 1, min(count, size)).round().astype(int)).tolist()
-
-

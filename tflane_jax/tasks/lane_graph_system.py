@@ -41,16 +41,29 @@ class LaneGraphSystem:
     """See `tasks.base.System`."""
 
     columns: tuple[str, ...] = (
-        "lanes of", "seed", "OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt", "DET_l@1.0", "DET_l@2.0", "DET_l@3.0",
-        "lanes", "frames",
-    )  # fmt: skip
+        "lanes of",
+        "seed",
+        "OLS",
+        "DET_l",
+        "DET_t",
+        "TOP_ll",
+        "TOP_lt",
+        "DET_l@1.0",
+        "DET_l@2.0",
+        "DET_l@3.0",
+        "lanes",
+        "frames",
+    )
     compared: tuple[str, ...] = (
-        "all/OLS", "all/DET_t", "all/TOP_lt",
+        "all/OLS",
+        "all/DET_t",
+        "all/TOP_lt",
         *(
-            f"{group}/{name}" for name in ("DET_l", "TOP_ll", "recall")
+            f"{group}/{name}"
+            for name in ("DET_l", "TOP_ll", "recall")
             for group in ("all", "occluded", "clear", *Sightings.groups)
         ),
-    )  # fmt: skip
+    )
     errors: tuple[str, ...] = ()
 
     def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example | Streamed:
@@ -149,9 +162,13 @@ class LaneGraphSystem:
             name: predict_examples(model.task, model.params, dataset, indices)[1] for name, model in models.items()
         }
         return save_examples(
-            path, examples, lanes, titles=titles(dataset, indices),
-            ground=source.example.ground, view=source.example.range,
-        )  # fmt: skip
+            path,
+            examples,
+            lanes,
+            titles=titles(dataset, indices),
+            ground=source.example.ground,
+            view=source.example.range,
+        )
 
 
 def open_dataset(source: LaneGraphSource, *, progress: bool = True) -> Dataset:
@@ -188,7 +205,7 @@ def predict_examples(
     """
     examples = stack_examples([dataset.example(index) for index in indices])
     if task.clip == 1:
-        (_, answer), = predictions(task, params, examples, len(indices))  # fmt: skip
+        ((_, answer),) = predictions(task, params, examples, len(indices))
     else:
         every = [_streamed(task, params, dataset, index) for index in indices]
         answer = jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)

@@ -139,10 +139,16 @@ class LaneCurveSystem:
     def quoted(self) -> list[dict[str, str]]:
         """Return Table 1 of the paper."""
         return [
-            {"model": name, "all/Accuracy": f"{accuracy:.1f}", "all/FP": f"{fp:.1f}", "all/FN": f"{fn:.1f}",
-             "fps": str(fps), "source": "quoted: GTN paper, TuSimple test, its GPU"}
+            {
+                "model": name,
+                "all/Accuracy": f"{accuracy:.1f}",
+                "all/FP": f"{fp:.1f}",
+                "all/FN": f"{fn:.1f}",
+                "fps": str(fps),
+                "source": "quoted: GTN paper, TuSimple test, its GPU",
+            }
             for name, fps, accuracy, fp, fn in _TABLE_1
-        ]  # fmt: skip
+        ]
 
     def draw_comparison(
         self, models: Mapping[str, Model], source: LaneCurveSource, data: LabelledImages, path: Path
@@ -181,7 +187,7 @@ def name_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> str:
 
 def predict(task: Any, params: Params, examples: RoadImage) -> LaneCurvePrediction:
     """Return the predictions for stacked images, numpy."""
-    (_, answer), = predictions(task, params, examples, len(examples.image))  # fmt: skip
+    ((_, answer),) = predictions(task, params, examples, len(examples.image))
     return answer
 
 

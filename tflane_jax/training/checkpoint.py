@@ -219,9 +219,7 @@ def _plain_shapes(state: TrainState) -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def _with_keys(state: TrainState, template: TrainState) -> TrainState:
-    return jax.tree.map(
-        lambda leaf, like: jax.random.wrap_key_data(leaf) if _is_key(like) else leaf, state, template
-    )
+    return jax.tree.map(lambda leaf, like: jax.random.wrap_key_data(leaf) if _is_key(like) else leaf, state, template)
 
 
 def _first_difference(tree: dict[str, Any], expected: dict[str, Any]) -> str | None:

@@ -107,10 +107,20 @@ class TrainingResult:
 
 
 def train(
-    task: Task, arrays: Any, folder: Path, *, config: TrainingConfig, optim: OptimConfig,
-    resolved: dict[str, Any], resolved_text: str = "", start: Start = "new",
-    prepare: Prepare | None = None, evaluate: Evaluate | None = None, draw: Draw | None = None, progress: bool = True,
-) -> TrainingResult:  # fmt: skip
+    task: Task,
+    arrays: Any,
+    folder: Path,
+    *,
+    config: TrainingConfig,
+    optim: OptimConfig,
+    resolved: dict[str, Any],
+    resolved_text: str = "",
+    start: Start = "new",
+    prepare: Prepare | None = None,
+    evaluate: Evaluate | None = None,
+    draw: Draw | None = None,
+    progress: bool = True,
+) -> TrainingResult:
     """Train a task and leave everything about the run in `folder`.
 
     Args:
@@ -140,8 +150,10 @@ def train(
         # Run folder
         # =============================================================================================================
         if start == "resume" and (saved := read_config(folder)) != resolved:
-            raise UserError(f"{folder} was started with another configuration ({_difference(saved, resolved)}): "
-                            "resume it as it is, or start another run")  # fmt: skip
+            raise UserError(
+                f"{folder} was started with another configuration ({_difference(saved, resolved)}): "
+                "resume it as it is, or start another run"
+            )
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
         # =============================================================================================================

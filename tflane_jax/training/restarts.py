@@ -161,9 +161,12 @@ def with_cycle(opt_state: Any, cycle: Cycle) -> Any:
 
 
 def adapt(
-    config: RestartsConfig, opt_state: Any, memories: Sequence[Memory], evaluations: Sequence[Mapping[str, float]],
+    config: RestartsConfig,
+    opt_state: Any,
+    memories: Sequence[Memory],
+    evaluations: Sequence[Mapping[str, float]],
     steps: int,
-) -> tuple[Any, list[Memory], dict[str, list[Any]]]:  # fmt: skip
+) -> tuple[Any, list[Memory], dict[str, list[Any]]]:
     """Judge the cycle of every seed by its evaluation and change those that are to be changed.
 
     Args:
@@ -183,17 +186,24 @@ def adapt(
     assert adaptive is not None
     for evaluation in evaluations:
         if adaptive.metric not in evaluation:
-            raise UserError(f"optim.restarts.adaptive.metric is {adaptive.metric}, which the evaluation does not give: "
-                            f"choose one of {', '.join(sorted(evaluation))}")  # fmt: skip
+            raise UserError(
+                f"optim.restarts.adaptive.metric is {adaptive.metric}, which the evaluation does not give: "
+                f"choose one of {', '.join(sorted(evaluation))}"
+            )
     cycle: Any = jax.device_get(cycle_of(opt_state))
     count, start, length, number = (np.atleast_1d(v) for v in (cycle.count, cycle.start, cycle.length, cycle.number))
     judged = [
         judge(
-            adaptive, memory, evaluation[adaptive.metric],
-            number=int(number[i]), elapsed=int(count[i] - start[i]), length=int(length[i]), left=int(steps - count[i]),
+            adaptive,
+            memory,
+            evaluation[adaptive.metric],
+            number=int(number[i]),
+            elapsed=int(count[i] - start[i]),
+            length=int(length[i]),
+            left=int(steps - count[i]),
         )
         for i, (memory, evaluation) in enumerate(zip(memories, evaluations, strict=True))
-    ]  # fmt: skip
+    ]
     memories, verdicts = [memory for memory, _ in judged], np.array([verdict for _, verdict in judged])
     for verdict, change in (
         ("extend", extended_cycle(cycle, adaptive.extend, steps)),

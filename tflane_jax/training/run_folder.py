@@ -1,11 +1,11 @@
 """The folder of a run: who may write into it, and what lies where.
 
-    config.json, config.txt   resolved configuration: to load again, to read
-    provenance.json           git hash, versions, device, command of every start
-    metrics.jsonl             records; tensorboard/ holds the same
-    checkpoints/              see training.checkpoint
-    curves.png, pictures/     drawn at every evaluation
-    evaluations/              tables of `tflane eval`
+config.json, config.txt   resolved configuration: to load again, to read
+provenance.json           git hash, versions, device, command of every start
+metrics.jsonl             records; tensorboard/ holds the same
+checkpoints/              see training.checkpoint
+curves.png, pictures/     drawn at every evaluation
+evaluations/              tables of `tflane eval`
 """
 
 from __future__ import annotations
@@ -21,8 +21,19 @@ from typing import Any, Literal
 from tflane_jax.errors import UserError
 
 Start = Literal["new", "resume", "overwrite"]
-_CONTENT = ("config.json", "config.txt", "provenance.json", "metrics.jsonl", "metrics.jsonl.tmp", "tensorboard",
-            "checkpoints", "curves.png", "pictures", "evaluations", "run.lock")  # fmt: skip
+_CONTENT = (
+    "config.json",
+    "config.txt",
+    "provenance.json",
+    "metrics.jsonl",
+    "metrics.jsonl.tmp",
+    "tensorboard",
+    "checkpoints",
+    "curves.png",
+    "pictures",
+    "evaluations",
+    "run.lock",
+)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -77,8 +88,10 @@ def check_start(folder: Path, start: Start) -> None:
     """Raise UserError where the folder is not what `start` says; see `claimed`. Nothing is written."""
     holds_run = (folder / "config.json").exists()
     if start == "new" and holds_run:
-        raise UserError(f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
-                        "or choose another folder with --out")  # fmt: skip
+        raise UserError(
+            f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
+            "or choose another folder with --out"
+        )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
     if not holds_run and folder.is_dir() and (other := {p.name for p in folder.iterdir()} - set(_CONTENT)):

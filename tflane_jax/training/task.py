@@ -21,9 +21,7 @@ class Task(Protocol):
         """Return fresh parameters for examples shaped like `example`."""
         ...
 
-    def loss(
-        self, params: Params, batch: Any, key: jax.Array
-    ) -> tuple[Float[Array, ""], dict[str, Any]]:
+    def loss(self, params: Params, batch: Any, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
         """Return the loss of a batch (leading axis on every leaf) and named terms to report; `key` is for dropout.
 
         A task with running statistics puts their new values among the terms, as the entry `STATISTICS`.

@@ -79,16 +79,22 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
     network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
     density = 0.8 + 0.4 * config.severity
     traffic = simulate_traffic(
-        _stream(scene_id, Stream.TRAFFIC), network,
+        _stream(scene_id, Stream.TRAFFIC),
+        network,
         replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre),
-        frames=frames, rate_hz=config.rate_hz,
-    )  # fmt: skip
+        frames=frames,
+        rate_hz=config.rate_hz,
+    )
     global_from_ego = yaw_pose(*traffic.ego.T)
     actors = _in_ego_frames(traffic)
     tracks = track(
-        _stream(scene_id, Stream.TRACKER), actors, global_from_ego, network.map.buildings,
-        config.tracker.with_noise(0.7 + 0.6 * config.severity), rate_hz=config.rate_hz,
-    )  # fmt: skip
+        _stream(scene_id, Stream.TRACKER),
+        actors,
+        global_from_ego,
+        network.map.buildings,
+        config.tracker.with_noise(0.7 + 0.6 * config.severity),
+        rate_hz=config.rate_hz,
+    )
     weather, paint_wear = np.clip(config.severity * _stream(scene_id, Stream.CONDITIONS).uniform(0.4, 1.6, 2), 0.0, 1.0)
     attribute = element_states(network, traffic.signals, np.arange(frames) / config.rate_hz)
     timestamps = np.round(np.arange(frames) * (1e9 / config.rate_hz)).astype(np.int64)

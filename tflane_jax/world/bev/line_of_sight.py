@@ -61,9 +61,7 @@ def _occluders(boxes: np.ndarray, buildings: np.ndarray) -> Float[np.ndarray, "o
     base, height = boxes[:, 6:7], boxes[:, 5:6]
     low_high = np.concatenate([base, base + height], -1)
     unlimited = np.broadcast_to([-np.inf, np.inf], (len(buildings), 2))
-    return np.concatenate(
-        [np.concatenate([boxes[:, :5], low_high], -1), np.concatenate([buildings, unlimited], -1)]
-    )
+    return np.concatenate([np.concatenate([boxes[:, :5], low_high], -1), np.concatenate([buildings, unlimited], -1)])
 
 
 def _pairs_in_angle(points: np.ndarray, occluders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,8 +108,11 @@ def _ray_meets_box(target: np.ndarray, box: np.ndarray, sensor_height: float) ->
     """Return, pair by pair, whether the open segment from sensor to target crosses the box (slab test)."""
     cos, sin = np.cos(box[:, 4]), np.sin(box[:, 4])
     starts = (-(cos * box[:, 0] + sin * box[:, 1]), sin * box[:, 0] - cos * box[:, 1], sensor_height)
-    steps = (cos * target[:, 0] + sin * target[:, 1], cos * target[:, 1] - sin * target[:, 0],
-             target[:, 2] - sensor_height)  # fmt: skip
+    steps = (
+        cos * target[:, 0] + sin * target[:, 1],
+        cos * target[:, 1] - sin * target[:, 0],
+        target[:, 2] - sensor_height,
+    )
     slabs = ((-box[:, 2] / 2, box[:, 2] / 2), (-box[:, 3] / 2, box[:, 3] / 2), (box[:, 5], box[:, 6]))
     enter, leave = np.zeros(len(box)), np.ones(len(box))
     for start, step, (low, high) in zip(starts, steps, slabs, strict=True):

@@ -58,9 +58,13 @@ def sample_map(vector_map: VectorMap) -> MapSamples:
     edges = [np.zeros((0, 3)), *(sample_at(line, _stations(line)[0]) for line in vector_map.road_boundaries)]
     crossings = [np.zeros((0, 3)), *map(_fill, vector_map.crossings)]
     return MapSamples(
-        paint=np.concatenate(points), paint_line=np.concatenate(number), paint_along=np.concatenate(along),
-        lines=len(lines), edge=np.concatenate(edges), crossing=np.concatenate(crossings),
-    )  # fmt: skip
+        paint=np.concatenate(points),
+        paint_line=np.concatenate(number),
+        paint_along=np.concatenate(along),
+        lines=len(lines),
+        edge=np.concatenate(edges),
+        crossing=np.concatenate(crossings),
+    )
 
 
 def painted_lines(vector_map: VectorMap) -> list[tuple[np.ndarray, int]]:

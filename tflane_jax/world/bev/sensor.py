@@ -248,9 +248,7 @@ def _margin(range_: PerceptionRange, metres: float) -> PerceptionRange:
     return PerceptionRange((x0 - metres, x1 + metres), (y0 - metres, y1 + metres), range_.z)
 
 
-def _soften(
-    crisp: np.ndarray, lattice: _Lattice, severity: float, far_blur: float
-) -> Float[np.ndarray, "c h w"]:
+def _soften(crisp: np.ndarray, lattice: _Lattice, severity: float, far_blur: float) -> Float[np.ndarray, "c h w"]:
     near = _smooth(crisp)
     far = _smooth(_smooth(_smooth(near)))
     share = np.clip(far_blur * severity * lattice.range / _FAR, 0.0, 1.0)

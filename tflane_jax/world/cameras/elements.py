@@ -154,9 +154,12 @@ def element_boxes(
 
 
 def unhidden(
-    elements: Sequence[MapElement], ego_from_global: Float[np.ndarray, "4 4"], camera: FrontCamera,
-    boxes: Float[np.ndarray, "b 7"], own: int,
-) -> Bool[np.ndarray, " e"]:  # fmt: skip
+    elements: Sequence[MapElement],
+    ego_from_global: Float[np.ndarray, "4 4"],
+    camera: FrontCamera,
+    boxes: Float[np.ndarray, "b 7"],
+    own: int,
+) -> Bool[np.ndarray, " e"]:
     """Return which elements the camera sees for the most part.
 
     Args:
@@ -172,9 +175,13 @@ def unhidden(
     x, y, length, width, yaw, low, high = boxes.T
     occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
     hidden = hidden_points(
-        points.reshape(-1, 3)[:, :2] - eye[:2], occluders, np.zeros((0, 5)), sensor_height=float(eye[2]),
-        target_height=points[..., 2].ravel(), exclude=np.repeat(own + np.arange(len(corners)), len(share)),
-    )  # fmt: skip
+        points.reshape(-1, 3)[:, :2] - eye[:2],
+        occluders,
+        np.zeros((0, 5)),
+        sensor_height=float(eye[2]),
+        target_height=points[..., 2].ravel(),
+        exclude=np.repeat(own + np.arange(len(corners)), len(share)),
+    )
     return hidden.reshape(len(corners), -1).mean(-1) <= 1.0 - _SEEN
 
 

@@ -54,9 +54,16 @@ class Ground:
 
 
 def draw_ground(
-    rng: np.random.Generator, vector_map: VectorMap, paint: Paint, window: Window, *, dirt: float, wet: float,
-    urban: bool, levels: int = 6,
-) -> Ground:  # fmt: skip
+    rng: np.random.Generator,
+    vector_map: VectorMap,
+    paint: Paint,
+    window: Window,
+    *,
+    dirt: float,
+    wet: float,
+    urban: bool,
+    levels: int = 6,
+) -> Ground:
     """Draw a window of the ground.
 
     Args:
@@ -215,9 +222,12 @@ def _narrowed(
 
 
 def sample_ground(
-    ground: Ground, x: Float[np.ndarray, "h w"], y: Float[np.ndarray, "h w"], across: Float[np.ndarray, " h"],
+    ground: Ground,
+    x: Float[np.ndarray, "h w"],
+    y: Float[np.ndarray, "h w"],
+    across: Float[np.ndarray, " h"],
     along: Float[np.ndarray, " h"],
-) -> Float[np.ndarray, "h w 3"]:  # fmt: skip
+) -> Float[np.ndarray, "h w 3"]:
     """Return the ground's colours (0 to 255, float32) at global places seen by the pixels of image rows.
 
     Args:
@@ -239,8 +249,12 @@ def sample_ground(
         part = slice(rows[0], rows[-1] + 1)
         scale = np.float32(1.0 / (window.texel * 2**number))
         seen = cv2.remap(
-            texels, x[part] * scale - np.float32(0.5), y[part] * scale - np.float32(0.5), cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=ground.beyond,
-        )  # fmt: skip
+            texels,
+            x[part] * scale - np.float32(0.5),
+            y[part] * scale - np.float32(0.5),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=ground.beyond,
+        )
         result[part] += weight[part, None, None] * seen
     return result

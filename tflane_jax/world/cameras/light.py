@@ -64,9 +64,13 @@ def draw_panorama(rng: np.random.Generator, weather: Weather, columns: int) -> U
     sky = sky + cover * (np.minimum(1.12 * weather.horizon + 0.03, 1.0) - sky)
     if weather.direct > 0.1:
         direction = np.stack(
-            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation),
-             np.broadcast_to(np.sin(elevation), (rows, columns))], -1,
-        )  # fmt: skip
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+                np.broadcast_to(np.sin(elevation), (rows, columns)),
+            ],
+            -1,
+        )
         away = np.arccos(np.clip(direction @ weather.sun, -1.0, 1.0))[..., None]
         sky = sky + np.array([1.0, 0.94, 0.8]) * (0.5 * np.exp(-away / 0.2) + 1.2 * (away < 0.02))
     for distance, tallest, colour in ((4000.0, 0.05, (0.36, 0.41, 0.43)), (500.0, 0.035, (0.19, 0.24, 0.15))):
@@ -129,10 +133,17 @@ def look(camera: FrontCamera) -> View:
     depth = np.median(camera.ground_depth(u, v[first:, 0], FAR), -1)
     focal = float(camera.intrinsics[0, 0])
     return View(
-        camera, azimuth, elevation, first, np.where(seen, x, 0.0), np.where(seen, y, 0.0),
-        np.where(seen, distance, np.float32(FAR)), np.where(seen, 255, 0).astype(np.uint8),
-        depth / focal, depth**2 / (focal * float(eye[2])),
-    )  # fmt: skip
+        camera,
+        azimuth,
+        elevation,
+        first,
+        np.where(seen, x, 0.0),
+        np.where(seen, y, 0.0),
+        np.where(seen, distance, np.float32(FAR)),
+        np.where(seen, 255, 0).astype(np.uint8),
+        depth / focal,
+        depth**2 / (focal * float(eye[2])),
+    )
 
 
 def show_sky(view: View, panorama: UInt8[np.ndarray, "k l 3"], yaw: float) -> UInt8[np.ndarray, "H W 3"]:
@@ -152,9 +163,13 @@ def show_sky(view: View, panorama: UInt8[np.ndarray, "k l 3"], yaw: float) -> UI
 
 
 def light_ground(
-    colour: Float[np.ndarray, "h w 3"], view: View, weather: Weather, sunny: Float[np.ndarray, "h w"],
-    open_sky: Float[np.ndarray, "h w"], lamps: Float[np.ndarray, "h w"],
-) -> None:  # fmt: skip
+    colour: Float[np.ndarray, "h w 3"],
+    view: View,
+    weather: Weather,
+    sunny: Float[np.ndarray, "h w"],
+    open_sky: Float[np.ndarray, "h w"],
+    lamps: Float[np.ndarray, "h w"],
+) -> None:
     """Turn the ground's own colours into lit and hazy ones, in place.
 
     Args:

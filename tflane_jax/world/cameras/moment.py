@@ -67,9 +67,15 @@ def _grounds(stage: Stage, log: Log, place: Float[np.ndarray, "2"], config: Came
     if config.scale <= LARGE:
         return [stage.ground]
     fine = draw_ground(
-        log_stream(log, Stream.GROUND), log.map, stage.paint, window_around(place[None], NEAR_REACH, _NEAR_TEXEL),
-        dirt=stage.weather.dirt, wet=stage.weather.rain, urban=stage.scenery.urban, levels=3,
-    )  # fmt: skip
+        log_stream(log, Stream.GROUND),
+        log.map,
+        stage.paint,
+        window_around(place[None], NEAR_REACH, _NEAR_TEXEL),
+        dirt=stage.weather.dirt,
+        wet=stage.weather.rain,
+        urban=stage.scenery.urban,
+        levels=3,
+    )
     return [stage.ground, fine]
 
 
@@ -110,11 +116,14 @@ def _local_bodies(stage: Stage, log: Log, frame: int, number: int) -> Bodies:
         actors = log.actors
         solids, boxes = zip(
             *road_user(
-                int(actors.category[number]), actors.size[number], stage.looks[number], stage.weather.night,
+                int(actors.category[number]),
+                actors.size[number],
+                stage.looks[number],
+                stage.weather.night,
                 pace=step / _STEPS,
             ),
             strict=True,
-        )  # fmt: skip
+        )
         stage.users[number, step] = pack(solids, boxes)
     return stage.users[number, step]
 

@@ -129,9 +129,11 @@ def _pieces(total: float, kind: LineType) -> tuple[Float[np.ndarray, " k"], Floa
 
 
 def _quads(
-    ends: Float[np.ndarray, "2 n 2"], normal: Float[np.ndarray, "n 2"], width: Float[np.ndarray, " n"],
+    ends: Float[np.ndarray, "2 n 2"],
+    normal: Float[np.ndarray, "n 2"],
+    width: Float[np.ndarray, " n"],
     colour: Float[np.ndarray, "n 3"],
-) -> Paint:  # fmt: skip
+) -> Paint:
     """Return pieces of lines: `ends` of their middle lines, unit normals, and widths."""
     side = 0.5 * width[:, None] * normal
     corners = np.stack([ends[0] - side, ends[1] - side, ends[1] + side, ends[0] + side], 1)

@@ -17,9 +17,12 @@ _COARSE, _FINE, _LOOKS, _MOST = 4, 32, 300_000, 4_000_000
 
 
 def paint_picture(
-    image: UInt8[np.ndarray, "h w 3"], corners: Float[np.ndarray, "4 3"], picture: Float[np.ndarray, "r c"],
-    camera: FrontCamera, tones: Float[np.ndarray, "2 3"],
-) -> None:  # fmt: skip
+    image: UInt8[np.ndarray, "h w 3"],
+    corners: Float[np.ndarray, "4 3"],
+    picture: Float[np.ndarray, "r c"],
+    camera: FrontCamera,
+    tones: Float[np.ndarray, "2 3"],
+) -> None:
     """Draw a picture in perspective, in place; one that reaches nearer than `NEAR` is left out.
 
     Args:

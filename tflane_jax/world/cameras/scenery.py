@@ -18,9 +18,15 @@ from tflane_jax.world.roads.area import road_rings
 from tflane_jax.world.roads.curves import arc_length, points_at, right_of
 
 _WALLS: tuple[Colour, ...] = (
-    (0.62, 0.56, 0.48), (0.55, 0.36, 0.28), (0.7, 0.68, 0.63), (0.48, 0.5, 0.52), (0.72, 0.62, 0.45),
-    (0.42, 0.32, 0.28), (0.6, 0.62, 0.58), (0.78, 0.75, 0.7),
-)  # fmt: skip
+    (0.62, 0.56, 0.48),
+    (0.55, 0.36, 0.28),
+    (0.7, 0.68, 0.63),
+    (0.48, 0.5, 0.52),
+    (0.72, 0.62, 0.45),
+    (0.42, 0.32, 0.28),
+    (0.6, 0.62, 0.58),
+    (0.78, 0.75, 0.7),
+)
 _PANE: Colour = (0.17, 0.21, 0.26)
 _LIT: Colour = (0.95, 0.78, 0.45)
 _BARK: Colour = (0.22, 0.17, 0.12)
@@ -220,8 +226,14 @@ def _trees(
             owners.append(np.full(9, len(trunks) - 1))
     bodies = pack(trunks, boxes)
     leaves = Bodies(
-        bodies.boxes, bodies.corners, bodies.stops, bodies.colours, bodies.light, bodies.owner,
-        np.concatenate([np.zeros((0, 4)), *blobs]), np.concatenate([np.zeros((0, 3)), *colours]),
+        bodies.boxes,
+        bodies.corners,
+        bodies.stops,
+        bodies.colours,
+        bodies.light,
+        bodies.owner,
+        np.concatenate([np.zeros((0, 4)), *blobs]),
+        np.concatenate([np.zeros((0, 3)), *colours]),
         np.concatenate([np.zeros(0, int), *owners]),
-    )  # fmt: skip
+    )
     return leaves, np.array(crowns).reshape(-1, 4)

@@ -134,9 +134,7 @@ def _cached_view(pixels: tuple[int, int, int], intrinsics: bytes, pose: bytes) -
 
 def _view(camera: FrontCamera, factor: int) -> View:
     """Return what the pixels of an enlarged camera look at; the last few small cameras are remembered."""
-    arguments = (
-        (camera.width, camera.height, factor), camera.intrinsics.tobytes(), camera.camera_from_ego.tobytes()
-    )  # fmt: skip
+    arguments = ((camera.width, camera.height, factor), camera.intrinsics.tobytes(), camera.camera_from_ego.tobytes())
     if camera.width * camera.height > _FEW_PIXELS:
         return _cached_view.__wrapped__(*arguments)
     return _cached_view(*arguments)

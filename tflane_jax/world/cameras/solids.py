@@ -70,9 +70,17 @@ class Bodies:
         corners[:, :2] = _turned(self.corners[:, :2], pose[np.repeat(self.owner, _counts(self.stops))])
         blobs[:, :2] = _turned(self.blobs[:, :2], pose[self.blob_owner])
         return Bodies(
-            boxes, corners, self.stops, self.colours, self.light, self.owner, blobs, self.blob_colours, self.blob_owner,
+            boxes,
+            corners,
+            self.stops,
+            self.colours,
+            self.light,
+            self.owner,
+            blobs,
+            self.blob_colours,
+            self.blob_owner,
             self.pictures,
-        )  # fmt: skip
+        )
 
     def chosen(self, keep: Bool[np.ndarray, " b"]) -> Bodies:
         """Return some of the bodies."""
@@ -81,11 +89,17 @@ class Bodies:
         counts = _counts(self.stops)
         place = np.cumsum(kept) - 1
         return Bodies(
-            self.boxes[keep], self.corners[np.repeat(kept, counts)], np.cumsum(counts[kept]), self.colours[kept],
-            self.light[kept], number[self.owner[kept]], self.blobs[blob], self.blob_colours[blob],
+            self.boxes[keep],
+            self.corners[np.repeat(kept, counts)],
+            np.cumsum(counts[kept]),
+            self.colours[kept],
+            self.light[kept],
+            number[self.owner[kept]],
+            self.blobs[blob],
+            self.blob_colours[blob],
             number[self.blob_owner[blob]],
             {int(place[polygon]): picture for polygon, picture in self.pictures.items() if kept[polygon]},
-        )  # fmt: skip
+        )
 
 
 def pack(solids: Sequence[Solid], boxes: Sequence[Box] | Float[np.ndarray, "b 7"]) -> Bodies:
@@ -99,8 +113,10 @@ def pack(solids: Sequence[Solid], boxes: Sequence[Box] | Float[np.ndarray, "b 7"
         colours=np.array([colour for solid in solids for colour in solid.colours], np.float64).reshape(-1, 3),
         light=np.array([light for solid in solids for light in solid.light], np.float64),
         owner=np.repeat(np.arange(len(counts)), counts),
-        blobs=np.zeros((0, 4)), blob_colours=np.zeros((0, 3)), blob_owner=np.zeros(0, int),
-    )  # fmt: skip
+        blobs=np.zeros((0, 4)),
+        blob_colours=np.zeros((0, 3)),
+        blob_owner=np.zeros(0, int),
+    )
 
 
 def join(groups: Sequence[Bodies]) -> Bodies:
@@ -127,9 +143,12 @@ def join(groups: Sequence[Bodies]) -> Bodies:
 
 
 def draw_bodies(
-    image: UInt8[np.ndarray, "h w 3"], bodies: Bodies, camera: FrontCamera, weather: Weather,
+    image: UInt8[np.ndarray, "h w 3"],
+    bodies: Bodies,
+    camera: FrontCamera,
+    weather: Weather,
     edges: Literal["smooth", "hard"] = "smooth",
-) -> None:  # fmt: skip
+) -> None:
     """Draw bodies given in the ego frame; `weather.sun` points in the ego frame as well.
 
     Hard edges are faster, and enough where several pixels are averaged afterwards.
@@ -176,9 +195,11 @@ def draw_bodies(
 
 
 def _far_to_near(
-    boxes: Float[np.ndarray, "b 7"], eye: Float[np.ndarray, "3"], low: Float[np.ndarray, "b 2"],
+    boxes: Float[np.ndarray, "b 7"],
+    eye: Float[np.ndarray, "3"],
+    low: Float[np.ndarray, "b 2"],
     high: Float[np.ndarray, "b 2"],
-) -> list[int]:  # fmt: skip
+) -> list[int]:
     """Return an order in which no body is drawn after one that hides it.
 
     Args:
@@ -250,17 +271,26 @@ def _with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
     corners = (bodies.blobs[:, None, :3] + reach * ring).reshape(-1, 3)
     stops = len(bodies.corners) + _OUTLINE * np.arange(1, count + 1)
     return Bodies(
-        bodies.boxes, np.concatenate([bodies.corners, corners]), np.concatenate([bodies.stops, stops]),
-        np.concatenate([bodies.colours, bodies.blob_colours]), np.concatenate([bodies.light, np.zeros(count)]),
-        np.concatenate([bodies.owner, bodies.blob_owner]), bodies.blobs[:0], bodies.blob_colours[:0],
-        bodies.blob_owner[:0], bodies.pictures,
-    )  # fmt: skip
+        bodies.boxes,
+        np.concatenate([bodies.corners, corners]),
+        np.concatenate([bodies.stops, stops]),
+        np.concatenate([bodies.colours, bodies.blob_colours]),
+        np.concatenate([bodies.light, np.zeros(count)]),
+        np.concatenate([bodies.owner, bodies.blob_owner]),
+        bodies.blobs[:0],
+        bodies.blob_colours[:0],
+        bodies.blob_owner[:0],
+        bodies.pictures,
+    )
 
 
 def _lit(
-    colours: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "k 3"], light: Float[np.ndarray, " k"],
-    place: Float[np.ndarray, "k 3"], weather: Weather,
-) -> Float[np.ndarray, "k 3"]:  # fmt: skip
+    colours: Float[np.ndarray, "k 3"],
+    normal: Float[np.ndarray, "k 3"],
+    light: Float[np.ndarray, " k"],
+    place: Float[np.ndarray, "k 3"],
+    weather: Weather,
+) -> Float[np.ndarray, "k 3"]:
     """Return display colours 0 to 255 of surfaces in the light and haze of the weather, with the ego's headlights."""
     unit = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
     distance = np.linalg.norm(place[:, :2], axis=-1)

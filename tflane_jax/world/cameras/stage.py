@@ -95,9 +95,14 @@ def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
     scenery = draw_scenery(log_stream(log, Stream.SCENERY), log.map, weather.night)
     places = np.stack([keyframe.global_from_ego[:2, 3] for keyframe in log.keyframes])
     ground = draw_ground(
-        log_stream(log, Stream.GROUND), log.map, paint, window_around(places, _REACH, _TEXEL),
-        dirt=weather.dirt, wet=weather.rain, urban=scenery.urban,
-    )  # fmt: skip
+        log_stream(log, Stream.GROUND),
+        log.map,
+        paint,
+        window_around(places, _REACH, _TEXEL),
+        dirt=weather.dirt,
+        wet=weather.rain,
+        urban=scenery.urban,
+    )
     low, shade, lamps = _static_light(places, scenery, weather)
     masts = mast_bodies(log.map.elements, log.map.road_boundaries)
     return Stage(

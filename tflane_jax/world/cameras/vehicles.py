@@ -11,12 +11,23 @@ from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import GLASS, PAINTS, RUBBER, Colour, box, frustum, inset, panel, wheels
 
 _TRAILERS: tuple[Colour, ...] = (
-    (0.88, 0.88, 0.87), (0.78, 0.79, 0.76), (0.2, 0.3, 0.5), (0.55, 0.2, 0.15), (0.3, 0.42, 0.34), (0.8, 0.62, 0.2),
-)  # fmt: skip
+    (0.88, 0.88, 0.87),
+    (0.78, 0.79, 0.76),
+    (0.2, 0.3, 0.5),
+    (0.55, 0.2, 0.15),
+    (0.3, 0.42, 0.34),
+    (0.8, 0.62, 0.2),
+)
 _CLOTHES: tuple[Colour, ...] = (
-    (0.12, 0.13, 0.18), (0.6, 0.12, 0.1), (0.15, 0.3, 0.55), (0.75, 0.73, 0.68), (0.3, 0.33, 0.3), (0.85, 0.6, 0.15),
-    (0.2, 0.45, 0.3), (0.45, 0.3, 0.4),
-)  # fmt: skip
+    (0.12, 0.13, 0.18),
+    (0.6, 0.12, 0.1),
+    (0.15, 0.3, 0.55),
+    (0.75, 0.73, 0.68),
+    (0.3, 0.33, 0.3),
+    (0.85, 0.6, 0.15),
+    (0.2, 0.45, 0.3),
+    (0.45, 0.3, 0.4),
+)
 _SKIN: tuple[Colour, ...] = ((0.85, 0.66, 0.54), (0.55, 0.38, 0.28), (0.75, 0.55, 0.42))
 _WINDOW: Colour = (0.13, 0.16, 0.19)
 _UNDER: Colour = (0.04, 0.04, 0.05)
@@ -84,9 +95,12 @@ def _car(solid: Solid, length: float, width: float, height: float, look: np.ndar
             panel(solid, x, (low, high), (0.0, sill), rear, RUBBER)
     _ends(solid, x0, x1, half, sill, nose, paint, night, look)
     cabin = frustum(
-        solid, (x0 + boot + 0.05, x1 - bonnet, belt), (x0 + boot + (0.5, 0.3, 0.1)[kind], x1 - bonnet - 0.62, height),
-        (half * 0.9, half * 0.7), {"all": paint},
-    )  # fmt: skip
+        solid,
+        (x0 + boot + 0.05, x1 - bonnet, belt),
+        (x0 + boot + (0.5, 0.3, 0.1)[kind], x1 - bonnet - 0.62, height),
+        (half * 0.9, half * 0.7),
+        {"all": paint},
+    )
     for side in ("left", "right"):
         middle = 0.5 if kind < 2 else 0.62
         first, second = (0.06, middle - 0.02), (middle + 0.02, 0.94)
@@ -98,9 +112,16 @@ def _car(solid: Solid, length: float, width: float, height: float, look: np.ndar
 
 
 def _ends(
-    solid: Solid, x0: float, x1: float, half: float, sill: float, nose: float, paint: Colour, night: float,
+    solid: Solid,
+    x0: float,
+    x1: float,
+    half: float,
+    sill: float,
+    nose: float,
+    paint: Colour,
+    night: float,
     look: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """Add bumpers, plates and lamps."""
     rise = nose - sill
     dark = _shaded(paint, 0.5)
@@ -202,8 +223,14 @@ def _two_wheeler(solid: Solid, length: float, height: float, look: np.ndarray, n
     shoulder = height - 0.3
     frustum(solid, (-0.28, 0.05, seat), (-0.1, 0.18, shoulder), (0.17, 0.22), {"all": coat})
     for side in (-1.0, 1.0):
-        box(solid, np.array([0.3 * (handle + 0.2), 0.24 * side]), 0.0, (handle + 0.05, 0.09),
-            (shoulder - 0.25, shoulder - 0.12), coat)  # fmt: skip
+        box(
+            solid,
+            np.array([0.3 * (handle + 0.2), 0.24 * side]),
+            0.0,
+            (handle + 0.05, 0.09),
+            (shoulder - 0.25, shoulder - 0.12),
+            coat,
+        )
     _head(solid, 0.08, shoulder + 0.02, height, look, helmet=True)
 
 

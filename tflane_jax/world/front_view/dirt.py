@@ -44,9 +44,13 @@ def _window(s: np.ndarray, start: float, length: float) -> np.ndarray:
 
 
 def draw_stains(
-    rng: np.random.Generator, colour: Float[np.ndarray, "3 h w"], camera: FrontCamera, road: Highway, ground: Ground,
+    rng: np.random.Generator,
+    colour: Float[np.ndarray, "3 h w"],
+    camera: FrontCamera,
+    road: Highway,
+    ground: Ground,
     dirt: float,
-) -> None:  # fmt: skip
+) -> None:
     """Draw patches, joints, cracks and arrows into the ground's colours."""
     import cv2
 

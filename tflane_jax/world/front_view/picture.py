@@ -18,9 +18,14 @@ from tflane_jax.world.render.weather import Weather
 
 
 def light_ground(
-    colour: Float[np.ndarray, "3 h w"], traffic: FrontTraffic, roadside: Roadside, road: Highway, camera: FrontCamera,
-    ground: Ground, weather: Weather,
-) -> None:  # fmt: skip
+    colour: Float[np.ndarray, "3 h w"],
+    traffic: FrontTraffic,
+    roadside: Roadside,
+    road: Highway,
+    camera: FrontCamera,
+    ground: Ground,
+    weather: Weather,
+) -> None:
     """Turn the ground's own colours into lit and hazy ones, in place."""
     light, open_sky = _shadows(traffic, roadside, road, camera, ground, weather)
     light *= weather.direct

@@ -171,11 +171,18 @@ def draw_highway(rng: np.random.Generator, config: HighwayConfig, wear: float) -
         *_paint_oncoming(rng, axis, -gap, width, oncoming, two_way, wear),
     ]
     return Highway(
-        axis=axis, ego_offset=ego_offset, lane_width=width, lines=lines, present=present, paint=tuple(paint),
-        lanes=width * (np.arange(count) + 0.5), oncoming=-gap - width * (np.arange(oncoming) + 0.5),
-        left=(left, -inner - 0.3), right=(right, right_edge + 0.2),
+        axis=axis,
+        ego_offset=ego_offset,
+        lane_width=width,
+        lines=lines,
+        present=present,
+        paint=tuple(paint),
+        lanes=width * (np.arange(count) + 0.5),
+        oncoming=-gap - width * (np.arange(oncoming) + 0.5),
+        left=(left, -inner - 0.3),
+        right=(right, right_edge + 0.2),
         edges=np.array([far, -inner if two_way else min(inner - gap, -inner), -inner, right_edge]),
-    )  # fmt: skip
+    )
 
 
 def _sway(rng: np.random.Generator, config: HighwayConfig, width: float) -> float:

@@ -76,8 +76,12 @@ def _wall(road: Highway, offset: float, hand: float, height: float, colour) -> l
     for s0, s1 in pairwise(_CUTS.tolist()):
         solid = Solid(max(0.5 * (s0 + s1), abs(offset - road.ego_offset)))
         solid.add(_sheet(road, s0, s1, offset, hand, (0.0, height)), colour)
-        top = np.concatenate([road.at(np.array([s0, s1]), np.full(2, offset)),
-                              road.at(np.array([s1, s0]), np.full(2, offset + 0.3 * hand))])  # fmt: skip
+        top = np.concatenate(
+            [
+                road.at(np.array([s0, s1]), np.full(2, offset)),
+                road.at(np.array([s1, s0]), np.full(2, offset + 0.3 * hand)),
+            ]
+        )
         top = lift(top, height)
         solid.add(top if hand < 0 else top[::-1], colour)
         solids.append(solid)

@@ -95,9 +95,12 @@ def _texture(rng: np.random.Generator, ground: Ground, dirt: float) -> Float[np.
         seen = strength * np.clip(8.0 * along / ground.length - 1.0, 0.0, 1.0).astype(np.float32)
         near = slice(int(np.argmax(seen > 0.0)), None)
         values = cv2.remap(
-            tile, ground.offset[near] * np.float32(1.0 / across) + shift[0],
-            ground.s[near] * np.float32(1.0 / along) + shift[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP,
-        )  # fmt: skip
+            tile,
+            ground.offset[near] * np.float32(1.0 / across) + shift[0],
+            ground.s[near] * np.float32(1.0 / along) + shift[1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_WRAP,
+        )
         values *= seen[near, None]
         factor[near] += values
     return factor

@@ -75,9 +75,12 @@ def draw_traffic(rng: np.random.Generator, road: Highway, config: FrontTrafficCo
     s, ours = table[:, 0] + 0.5 * drivers.size[:, 0], table[:, 2] > 0.0
     _, heading = road.axis.at(s)
     return FrontTraffic(
-        xy=road.at(s, table[:, 1] - drivers.offset), yaw=heading + np.where(ours, 0.0, np.pi), size=drivers.size,
-        category=category, look=rng.random((len(table), 4)),
-    )  # fmt: skip
+        xy=road.at(s, table[:, 1] - drivers.offset),
+        yaw=heading + np.where(ours, 0.0, np.pi),
+        size=drivers.size,
+        category=category,
+        look=rng.random((len(table), 4)),
+    )
 
 
 def ground_shadows(

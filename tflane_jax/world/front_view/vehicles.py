@@ -10,8 +10,12 @@ from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import GLASS, PAINTS, RUBBER, Colour, frustum, panel, wheels
 
 _TRAILERS: tuple[Colour, ...] = (
-    (0.9, 0.9, 0.9), (0.8, 0.8, 0.78), (0.2, 0.3, 0.55), (0.6, 0.2, 0.15), (0.35, 0.4, 0.36),
-)  # fmt: skip
+    (0.9, 0.9, 0.9),
+    (0.8, 0.8, 0.78),
+    (0.2, 0.3, 0.55),
+    (0.6, 0.2, 0.15),
+    (0.35, 0.4, 0.36),
+)
 _DETAILED = 90.0
 
 
@@ -43,8 +47,15 @@ def _tyres(solid: Solid, places: tuple[float, ...], half: float, radius: float, 
             panel(solid, x, (low, high), (0.0, radius), rear, RUBBER)
 
 
-def _lights(solid: Solid, x: tuple[float, float], half: float, z: float, size: tuple[float, float], night: float,
-            brake: bool = False) -> None:  # fmt: skip
+def _lights(
+    solid: Solid,
+    x: tuple[float, float],
+    half: float,
+    z: float,
+    size: tuple[float, float],
+    night: float,
+    brake: bool = False,
+) -> None:
     """Add lamps at the rear (x[0]) and at the front (x[1])."""
     w, h = size
     shine = max(0.9 * min(1.0, 2.0 * night), 0.9 * brake)

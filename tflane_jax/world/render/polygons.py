@@ -64,9 +64,12 @@ def draw_solids(
     size = [camera.width, camera.height]
     visible = facing & (((high > 0.0) & (low < size)).all(-1) | (nearest <= NEAR)) & (farthest > NEAR)
     colours = shade(
-        np.concatenate([solid.colours for solid in ordered]), normal,
-        np.concatenate([solid.light for solid in ordered]), a, weather,
-    ).tolist()  # fmt: skip
+        np.concatenate([solid.colours for solid in ordered]),
+        normal,
+        np.concatenate([solid.light for solid in ordered]),
+        a,
+        weather,
+    ).tolist()
     fixed = fixed_point(pixels)
     for number in np.flatnonzero(visible):
         part = slice(starts[number], stops[number])

@@ -10,18 +10,30 @@ from tflane_jax.world.render.polygons import Solid
 
 Colour = tuple[float, float, float]
 PAINTS: tuple[Colour, ...] = (
-    (0.92, 0.92, 0.92), (0.9, 0.9, 0.88), (0.62, 0.64, 0.66), (0.42, 0.44, 0.46), (0.08, 0.08, 0.09),
-    (0.13, 0.13, 0.15), (0.55, 0.08, 0.07), (0.1, 0.16, 0.4), (0.25, 0.36, 0.5), (0.5, 0.42, 0.3), (0.1, 0.25, 0.16),
-)  # fmt: skip
+    (0.92, 0.92, 0.92),
+    (0.9, 0.9, 0.88),
+    (0.62, 0.64, 0.66),
+    (0.42, 0.44, 0.46),
+    (0.08, 0.08, 0.09),
+    (0.13, 0.13, 0.15),
+    (0.55, 0.08, 0.07),
+    (0.1, 0.16, 0.4),
+    (0.25, 0.36, 0.5),
+    (0.5, 0.42, 0.3),
+    (0.1, 0.25, 0.16),
+)
 GLASS: Colour = (0.1, 0.12, 0.14)
 RUBBER: Colour = (0.06, 0.06, 0.06)
 _HUB: Colour = (0.45, 0.45, 0.47)
 
 
 def frustum(
-    solid: Solid, low: tuple[float, float, float], high: tuple[float, float, float], half: tuple[float, float],
+    solid: Solid,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    half: tuple[float, float],
     colours: dict[str, Colour],
-) -> dict[str, np.ndarray]:  # fmt: skip
+) -> dict[str, np.ndarray]:
     """Add the faces of a body that tapers from (x0, x1, z) at its bottom to (x0, x1, z) at its top.
 
     Args:
@@ -63,9 +75,14 @@ def insets(
 
 
 def panel(
-    solid: Solid, x: float, y: tuple[float, float], z: tuple[float, float], rear: bool, colour: Colour,
+    solid: Solid,
+    x: float,
+    y: tuple[float, float],
+    z: tuple[float, float],
+    rear: bool,
+    colour: Colour,
     light: float = 0.0,
-) -> None:  # fmt: skip
+) -> None:
     """Add an upright rectangle that faces backwards or forwards."""
     (y0, y1), (z0, z1) = y, z
     corners = [(x, y1, z0), (x, y0, z0), (x, y0, z1), (x, y1, z1)]

@@ -134,14 +134,21 @@ def draw_weather(rng: np.random.Generator, config: FrontWeatherConfig, severity:
     some = rng.random(5).tolist()
     dim = 0.85 + 0.3 * some[3]
     return Weather(
-        kind=kind, sun=sun, direct=direct, ambient=ambient * (1.0 if kind is not Sky.NIGHT else 0.5 + some[4]),
-        zenith=np.asarray(zenith) * dim, horizon=np.clip(np.asarray(horizon) * dim, 0.0, 1.0),
-        cloud=cloud * some[2], visibility={Sky.FOG: fog, Sky.RAIN: rain}.get(kind, clear),
-        rain=float(kind is Sky.RAIN) * (0.4 + 0.6 * some[0]), night={Sky.NIGHT: 1.0, Sky.DUSK: 0.4}.get(kind, 0.0),
-        wear=config.wear * severity * some[1], dirt=severity * (0.3 + 0.7 * some[0]),
+        kind=kind,
+        sun=sun,
+        direct=direct,
+        ambient=ambient * (1.0 if kind is not Sky.NIGHT else 0.5 + some[4]),
+        zenith=np.asarray(zenith) * dim,
+        horizon=np.clip(np.asarray(horizon) * dim, 0.0, 1.0),
+        cloud=cloud * some[2],
+        visibility={Sky.FOG: fog, Sky.RAIN: rain}.get(kind, clear),
+        rain=float(kind is Sky.RAIN) * (0.4 + 0.6 * some[0]),
+        night={Sky.NIGHT: 1.0, Sky.DUSK: 0.4}.get(kind, 0.0),
+        wear=config.wear * severity * some[1],
+        dirt=severity * (0.3 + 0.7 * some[0]),
         exposure=(1.0 + severity * config.exposure * deviation[0]) * (1.4 if kind is Sky.NIGHT else 1.0),
         contrast=1.0 + severity * config.contrast * deviation[1],
         tint=1.0 + severity * config.tint * np.array(deviation[2:]),
         noise=config.noise * severity * some[3] * (2.0 if kind is Sky.NIGHT else 1.0),
         blur=config.blur * severity * some[4],
-    )  # fmt: skip
+    )

@@ -41,9 +41,7 @@ def grid_with(stations: Sequence[float], spacing: float) -> Float[np.ndarray, " 
     """Return increasing stations at most `spacing` apart that hold every given one exactly."""
     stops = np.unique(np.asarray(stations, np.float64))
     stops = stops[np.concatenate([[True], np.diff(stops) > 1e-6])]
-    pieces = [
-        np.linspace(a, b, int(np.ceil((b - a) / spacing)), endpoint=False) for a, b in pairwise(stops)
-    ]
+    pieces = [np.linspace(a, b, int(np.ceil((b - a) / spacing)), endpoint=False) for a, b in pairwise(stops)]
     return np.concatenate([*pieces, stops[-1:]])
 
 

@@ -35,20 +35,22 @@ class _Mouth:
 
     def approach(self) -> Approach:
         return Approach(
-            self.arm.heading, self.incoming.exits, self.outgoing.entries, self.arm.minor, self.arm.no_left,
-            self.arm.style.speed, self.incoming.kerb_line[-1], self.outgoing.kerb_line[0],
-        )  # fmt: skip
+            self.arm.heading,
+            self.incoming.exits,
+            self.outgoing.entries,
+            self.arm.minor,
+            self.arm.no_left,
+            self.arm.style.speed,
+            self.incoming.kerb_line[-1],
+            self.outgoing.kerb_line[0],
+        )
 
 
-def lay_out_junctions(
-    rng: np.random.Generator, plan: JunctionsPlan, network: LaneNetwork, config: RoadConfig
-) -> Site:
+def lay_out_junctions(rng: np.random.Generator, plan: JunctionsPlan, network: LaneNetwork, config: RoadConfig) -> Site:
     """Lay out intersections and their streets: add lanes to `network` and return the lines."""
     arms = [_sorted(j, plan, i) for i, j in enumerate(plan.junctions)]
     ring = None if plan.ring is None else _ring(plan)
-    distances = [
-        _stop_distances(junction, around, ring) for junction, around in zip(plan.junctions, arms, strict=True)
-    ]
+    distances = [_stop_distances(junction, around, ring) for junction, around in zip(plan.junctions, arms, strict=True)]
     link = _build_link(plan, arms, distances, network, config)
     site = Site([] if link is None else [link], [])
     mouths: list[list[_Mouth]] = []
@@ -105,9 +107,7 @@ def _ring(plan: JunctionsPlan) -> Ring:
     return Ring(radius, width, gutter, _RING_HALF_ANGLE, speed=6.5)
 
 
-def _stop_distances(
-    junction: JunctionPlan, around: Sequence[ArmPlan], ring: Ring | None
-) -> Float[np.ndarray, " arms"]:
+def _stop_distances(junction: JunctionPlan, around: Sequence[ArmPlan], ring: Ring | None) -> Float[np.ndarray, " arms"]:
     if ring is not None:
         return np.array([ring.stop_distance(a.crossing) for a in around])
     return intersections.stop_distances([a.arm for a in around], junction.corner_radius)
@@ -124,18 +124,26 @@ def _build_link(
     if plan.link is None:
         return None
     first, second = (
-        float(next(d for a, d in zip(arms[i], distances[i], strict=True) if _is_link(a, plan, i)))
-        for i in range(2)
+        float(next(d for a, d in zip(arms[i], distances[i], strict=True) if _is_link(a, plan, i))) for i in range(2)
     )
     style = plan.link.style
     return build_street(
         StreetPlan(
-            origin=plan.link.origin, heading=plan.link.heading, start=first, stop=plan.distance - second,
-            forward=style.forward, backward=style.backward, speed=style.speed, ego=(0.0, plan.distance),
-            stops_at_start=True, stops_at_end=True,
+            origin=plan.link.origin,
+            heading=plan.link.heading,
+            start=first,
+            stop=plan.distance - second,
+            forward=style.forward,
+            backward=style.backward,
+            speed=style.speed,
+            ego=(0.0, plan.distance),
+            stops_at_start=True,
+            stops_at_end=True,
         ),
-        network, config.solid_before_stop, config.vertex_spacing,
-    )  # fmt: skip
+        network,
+        config.solid_before_stop,
+        config.vertex_spacing,
+    )
 
 
 def _lay_intersection(
@@ -152,9 +160,13 @@ def _lay_intersection(
     approaches = [m.approach() for m in mouths]
     movements = plan_movements(approaches)
     ids = lay_connectors(
-        movements, approaches, network, config.comfortable_lateral_acceleration, config.vertex_spacing,
+        movements,
+        approaches,
+        network,
+        config.comfortable_lateral_acceleration,
+        config.vertex_spacing,
         corner_radius=junction.corner_radius,
-    )  # fmt: skip
+    )
     # Lights make sense only where there is traffic to hold back.
     used = sorted({p for p, a in zip(phases(approaches), approaches, strict=True) if a.incoming})
     signalised = junction.signalised and len(used) > 1
@@ -165,15 +177,17 @@ def _lay_intersection(
     site.elements += signs(approaches, movements, [m.arm.style.median > 0 for m in mouths])
 
 
-def _lay_roundabout(
-    ring: Ring, approaches: Sequence[Approach], network: LaneNetwork, config: RoadConfig
-) -> None:
+def _lay_roundabout(ring: Ring, approaches: Sequence[Approach], network: LaneNetwork, config: RoadConfig) -> None:
     planned = roundabouts.lay_ring(ring, approaches, network, config.vertex_spacing)
     movements = [movement for movement, _ in planned]
     ids = lay_connectors(
-        movements, approaches, network, config.comfortable_lateral_acceleration, config.vertex_spacing,
+        movements,
+        approaches,
+        network,
+        config.comfortable_lateral_acceleration,
+        config.vertex_spacing,
         corner_radius=None,
-    )  # fmt: skip
+    )
     for connector, (_, circulating) in zip(ids, planned, strict=True):
         if circulating is not None:
             network.let_pass(connector, {circulating})
@@ -184,10 +198,7 @@ def _ring_corners(
 ) -> list[Float[np.ndarray, "n 2"]]:
     arms = [a.arm for a in around]
     pairs = [(i, (i + 1) % len(arms)) for i in range(len(arms))]
-    return [
-        roundabouts.kerb_corner(ring, arms[i], arms[j], float(distances[i]), float(distances[j]))
-        for i, j in pairs
-    ]
+    return [roundabouts.kerb_corner(ring, arms[i], arms[j], float(distances[i]), float(distances[j])) for i, j in pairs]
 
 
 def _has_median(street: Street) -> bool:

@@ -113,10 +113,16 @@ class LaneNetwork:
             lines[1, :, :2], lines[2, :, :2] = draft.left, draft.right
             lines[0] = 0.5 * (lines[1] + lines[2])
             out[segment] = LaneSegment(
-                id=segment, centerline=lines[0], left=lines[1], right=lines[2],
-                left_type=draft.left_type, right_type=draft.right_type, is_intersection=draft.is_intersection,
-                successors=tuple(draft.successors), vehicle=draft.vehicle,
-            )  # fmt: skip
+                id=segment,
+                centerline=lines[0],
+                left=lines[1],
+                right=lines[2],
+                left_type=draft.left_type,
+                right_type=draft.right_type,
+                is_intersection=draft.is_intersection,
+                successors=tuple(draft.successors),
+                vehicle=draft.vehicle,
+            )
         return out
 
     def routes(self, shortest: float) -> tuple[tuple[int, ...], ...]:

@@ -98,9 +98,7 @@ def _plan_two(rng: np.random.Generator, heading: float, config: RoadConfig) -> J
     distance = draw(rng, (65.0, 95.0))
     centers = [along(np.zeros(2), heading, d) for d in (-0.5 * distance, 0.5 * distance)]
     junctions = []
-    for center, outward, style in zip(
-        centers, (heading + np.pi, heading), (main.reversed(), main), strict=True
-    ):
+    for center, outward, style in zip(centers, (heading + np.pi, heading), (main.reversed(), main), strict=True):
         arms = [_arm(rng, center, outward, style, config, minor=False)]
         side = _draw_side(rng, 1, config, one_way=0.0)
         hand = float(np.copysign(np.pi / 2, rng.uniform(-1, 1)))
@@ -137,9 +135,7 @@ def _draw_main(rng: np.random.Generator, lanes: int, config: RoadConfig) -> Stre
     )
 
 
-def _draw_side(
-    rng: np.random.Generator, lanes: int, config: RoadConfig, one_way: float | None = None
-) -> StreetStyle:
+def _draw_side(rng: np.random.Generator, lanes: int, config: RoadConfig, one_way: float | None = None) -> StreetStyle:
     one_way = config.one_way if one_way is None else one_way
     ways = (lanes, lanes)
     if chance(rng, one_way):
@@ -161,14 +157,17 @@ def _arm(
     if chance(rng, 0.6):
         bend = np.deg2rad(draw(rng, (-40.0, 40.0)))
     return ArmPlan(
-        origin=centred(center, heading, style), heading=heading, style=style, crossing=crossing, minor=minor,
-        no_left=chance(rng, config.turn_restriction), bend=(bend, draw(rng, config.bend_radius)),
-    )  # fmt: skip
+        origin=centred(center, heading, style),
+        heading=heading,
+        style=style,
+        crossing=crossing,
+        minor=minor,
+        no_left=chance(rng, config.turn_restriction),
+        bend=(bend, draw(rng, config.bend_radius)),
+    )
 
 
-def _with_pockets(
-    rng: np.random.Generator, arm: ArmPlan, left: float, right: float, config: RoadConfig
-) -> ArmPlan:
+def _with_pockets(rng: np.random.Generator, arm: ArmPlan, left: float, right: float, config: RoadConfig) -> ArmPlan:
     """Give the incoming side of an arm turning lanes to the left and to the right with these probabilities."""
     pockets: list[Place] = []
     if chance(rng, left) and not arm.no_left:
@@ -202,4 +201,3 @@ def seen_from_end(link: ArmPlan, distance: float) -> ArmPlan:
     """
     origin = along(link.origin, link.heading, distance)
     return replace(link, origin=origin, heading=link.heading + np.pi, style=link.style.reversed())
-

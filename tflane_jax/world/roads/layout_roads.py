@@ -67,8 +67,9 @@ def _plan_plain(rng: np.random.Generator, config: RoadConfig) -> RoadPlan:
     median = None
     if lanes + backward > 2 and chance(rng, config.median):
         median = config.wide_median if chance(rng, 0.4) else config.narrow_median
-    style = draw_style(rng, config, (max(lanes, 2 if not backward else 1), backward), speed=config.urban_speed,
-                       median=median)  # fmt: skip
+    style = draw_style(
+        rng, config, (max(lanes, 2 if not backward else 1), backward), speed=config.urban_speed, median=median
+    )
     street = _through(style, _winding(rng, config, config.bend_radius), rng, config)
     crossing = None
     if chance(rng, config.mid_block_crossing):
@@ -83,9 +84,13 @@ def _plan_changing(rng: np.random.Generator, kind: SceneKind, config: RoadConfig
     backward = 0 if chance(rng, config.one_way) else lanes
     median = config.wide_median if backward and chance(rng, 0.5) else None
     style = draw_style(
-        rng, config, (lanes, backward), median=median, strips=0.0,
+        rng,
+        config,
+        (lanes, backward),
+        median=median,
+        strips=0.0,
         speed=config.fast_speed if fast else config.urban_speed,
-    )  # fmt: skip
+    )
     place = Place.RIGHT if chance(rng, 0.6) else left_pocket(style)
     taper = draw(rng, config.fast_taper if fast else config.taper)
     half = config.reach + _BEYOND
@@ -102,9 +107,7 @@ def _plan_changing(rng: np.random.Generator, kind: SceneKind, config: RoadConfig
 def _plan_ramp(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) -> RoadPlan:
     lanes = int(rng.integers(2, 4))
     backward = 0 if chance(rng, 0.5) else lanes
-    style = draw_style(
-        rng, config, (lanes, backward), speed=config.fast_speed, median=config.narrow_median, strips=0.0
-    )
+    style = draw_style(rng, config, (lanes, backward), speed=config.fast_speed, median=config.narrow_median, strips=0.0)
     taper = draw(rng, config.fast_taper)
     enters = kind is SceneKind.ON_RAMP
     # The lane beside the road lies around the middle of the map; the ramp runs off towards its border.
@@ -117,9 +120,11 @@ def _plan_ramp(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) ->
     style = replace(style, forward=replace(style.forward, extras=(extra,)))
     street = _through(style, _winding(rng, config, config.fast_bend_radius), rng, config)
     ramp = RampPlan(
-        enters, turn=np.deg2rad(draw(rng, (22.0, 50.0))), radius=draw(rng, (60.0, 110.0)),
+        enters,
+        turn=np.deg2rad(draw(rng, (22.0, 50.0))),
+        radius=draw(rng, (60.0, 110.0)),
         speed=draw(rng, config.ramp_speed),
-    )  # fmt: skip
+    )
     return RoadPlan(street, style, ramp=ramp, urban=False)
 
 
@@ -133,10 +138,16 @@ def _through(
 ) -> StreetPlan:
     heading, half = draw(rng, (-np.pi, np.pi)), config.reach + _BEYOND
     return StreetPlan(
-        origin=centred(np.zeros(2), heading, style), heading=heading, start=-half, stop=half,
-        forward=style.forward, backward=style.backward, speed=style.speed,
-        ego=(-config.ego_reach, config.ego_reach), bends=bends,
-    )  # fmt: skip
+        origin=centred(np.zeros(2), heading, style),
+        heading=heading,
+        start=-half,
+        stop=half,
+        forward=style.forward,
+        backward=style.backward,
+        speed=style.speed,
+        ego=(-config.ego_reach, config.ego_reach),
+        bends=bends,
+    )
 
 
 def _winding(

@@ -69,17 +69,27 @@ class ArmPlan:
         """Its shape as the intersection sees it."""
         style = self.style
         return Arm(
-            self.origin, self.heading, style.backward.kerb_before_junction(), float(style.forward.kerb(0.0)),
+            self.origin,
+            self.heading,
+            style.backward.kerb_before_junction(),
+            float(style.forward.kerb(0.0)),
             self.crossing,
-        )  # fmt: skip
+        )
 
     def street(self, stop_distance: float, config: RoadConfig) -> StreetPlan:
         """Return the plan of the street once the intersection has told where it ends."""
         return StreetPlan(
-            origin=self.origin, heading=self.heading, start=stop_distance, stop=config.reach,
-            forward=self.style.forward, backward=self.style.backward, speed=self.style.speed,
-            ego=(0.0, config.ego_reach), bends=bend_knots(stop_distance + 6.0, *self.bend), stops_at_start=True,
-        )  # fmt: skip
+            origin=self.origin,
+            heading=self.heading,
+            start=stop_distance,
+            stop=config.reach,
+            forward=self.style.forward,
+            backward=self.style.backward,
+            speed=self.style.speed,
+            ego=(0.0, config.ego_reach),
+            bends=bend_knots(stop_distance + 6.0, *self.bend),
+            stops_at_start=True,
+        )
 
 
 def bend_knots(start: float, turn: float, radius: float) -> tuple[tuple[float, float], ...]:
@@ -129,11 +139,15 @@ def draw_style(
     parked = [chance(rng, strips * config.parking) for _ in range(2)]
     sides = [
         SidePlan(
-            lanes=n, lane_width=lane_width, inner=0.5 * width, bike=bike if n else 0.0,
-            parking=parking if n and p else 0.0, gutter=gutter,
+            lanes=n,
+            lane_width=lane_width,
+            inner=0.5 * width,
+            bike=bike if n else 0.0,
+            parking=parking if n and p else 0.0,
+            gutter=gutter,
         )
         for n, p in zip(lanes, parked, strict=True)
-    ]  # fmt: skip
+    ]
     return StreetStyle(sides[0], sides[1], width, draw(rng, speed))
 
 

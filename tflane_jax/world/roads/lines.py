@@ -11,9 +11,7 @@ from tflane_jax.world.roads.layout_junctions import JunctionsPlan
 from tflane_jax.world.roads.streets import Street
 
 
-def road_lines(
-    streets: Sequence[Street], plan: JunctionsPlan | None = None
-) -> tuple[Float[np.ndarray, "n 2"], ...]:
+def road_lines(streets: Sequence[Street], plan: JunctionsPlan | None = None) -> tuple[Float[np.ndarray, "n 2"], ...]:
     """Return one line for each street, midway between its kerbs (in the median where it has one), metres.
 
     Lines of streets that meet at an intersection all end in its middle, and at a roundabout on its lane, which is a

@@ -96,10 +96,12 @@ def _approach_lanes(segments: dict[int, LaneSegment]) -> list[int]:
         for j in onward if segments[i].vehicle else ():
             entries[j] = entries.get(j, 0) + 1
     return [
-        i for i, onward in open_.items()
-        if segments[i].vehicle and not segments[i].is_intersection
+        i
+        for i, onward in open_.items()
+        if segments[i].vehicle
+        and not segments[i].is_intersection
         and (len(onward) > 1 or any(segments[j].is_intersection or entries[j] > 1 for j in onward))
-    ]  # fmt: skip
+    ]
 
 
 def _exit_lanes(segments: dict[int, LaneSegment]) -> list[int]:

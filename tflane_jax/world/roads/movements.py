@@ -208,10 +208,18 @@ def lay_connectors(
     speeds = _connector_speeds(center, heading, movements, approaches, lateral_acceleration)
     ids = []
     for k, m in enumerate(movements):
-        connector = network.add(Draft(
-            left[k], right[k], LineType.NONE, LineType.NONE, float(speeds[k]),
-            vehicle=m.source.vehicle, is_intersection=True, ego=m.source.vehicle,
-        ))  # fmt: skip
+        connector = network.add(
+            Draft(
+                left[k],
+                right[k],
+                LineType.NONE,
+                LineType.NONE,
+                float(speeds[k]),
+                vehicle=m.source.vehicle,
+                is_intersection=True,
+                ego=m.source.vehicle,
+            )
+        )
         network.connect(m.source.segment, connector)
         network.connect(connector, m.sink.segment)
         ids.append(connector)

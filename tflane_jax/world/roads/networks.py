@@ -73,9 +73,12 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
     boxes = roadside.buildings(rng, site, config.building_setback, density)
     return RoadNetwork(
         map=VectorMap(
-            segments=network.segments(), crossings=_on_plane(site.crossings),
-            road_boundaries=_on_plane([*site.kerbs, *site.islands]), elements=tuple(site.elements),
-            buildings=boxes, roads=_on_plane(road_lines(site.streets, plan)),
+            segments=network.segments(),
+            crossings=_on_plane(site.crossings),
+            road_boundaries=_on_plane([*site.kerbs, *site.islands]),
+            elements=tuple(site.elements),
+            buildings=boxes,
+            roads=_on_plane(road_lines(site.streets, plan)),
         ),
         speed_limit={i: d.speed for i, d in network.drafts.items()},
         yield_to={i: tuple(sorted(others)) for i, others in network.yield_to.items()},
@@ -85,7 +88,7 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         parking=roadside.parking_slots(site),
         ego_routes=network.routes(_SHORTEST_ROUTE),
         kind=kind,
-    )  # fmt: skip
+    )
 
 
 def _on_plane(lines: Sequence[Float[np.ndarray, "n 2"]]) -> tuple[np.ndarray, ...]:

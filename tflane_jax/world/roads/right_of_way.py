@@ -69,9 +69,7 @@ def set_priorities(
     meet = conflicts(ids, movements, network)
     phase = phases(approaches)
     order = {THROUGH: 0, RIGHT: 1, LEFT: 2}
-    ranks = [
-        (0 if signalised else approaches[m.arm].minor, order[m.turn], m.arm) for m in movements
-    ]
+    ranks = [(0 if signalised else approaches[m.arm].minor, order[m.turn], m.arm) for m in movements]
     for a, connector in enumerate(ids):
         before = {
             ids[b]

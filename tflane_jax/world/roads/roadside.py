@@ -51,9 +51,7 @@ def _side_slots(side: Side, site: Site) -> Float[np.ndarray, "p 3"]:
     return np.concatenate([xy, np.remainder(heading + np.pi, 2 * np.pi)[:, None] - np.pi], -1)[keep]
 
 
-def buildings(
-    rng: np.random.Generator, site: Site, setback: Range, density: float
-) -> Float[np.ndarray, "b 5"]:
+def buildings(rng: np.random.Generator, site: Site, setback: Range, density: float) -> Float[np.ndarray, "b 5"]:
     """Return x, y, length, width and yaw of blocks that stand along the kerbs and nowhere near the road.
 
     Args:

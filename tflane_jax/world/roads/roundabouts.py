@@ -116,7 +116,15 @@ def _vehicle(lanes: tuple[LaneEnd, ...]) -> list[LaneEnd]:
 def _arc(ring: Ring, start: float, stop: float, network: LaneNetwork, spacing: float) -> int:
     angle = np.linspace(start, stop, max(int(np.ceil(ring.radius * (stop - start) / spacing)), 2) + 1)
     spoke = direction(angle)
-    return network.add(Draft(
-        (ring.radius - 0.5 * ring.width) * spoke, (ring.radius + 0.5 * ring.width) * spoke,
-        LineType.SOLID, LineType.NONE, ring.speed, vehicle=True, is_intersection=True, ego=True,
-    ))  # fmt: skip
+    return network.add(
+        Draft(
+            (ring.radius - 0.5 * ring.width) * spoke,
+            (ring.radius + 0.5 * ring.width) * spoke,
+            LineType.SOLID,
+            LineType.NONE,
+            ring.speed,
+            vehicle=True,
+            is_intersection=True,
+            ego=True,
+        )
+    )

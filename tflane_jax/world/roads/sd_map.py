@@ -106,9 +106,7 @@ def pack_lines(
         range_: where lines are cut; a line that leaves it and comes back is several pieces.
     """
     pieces = [
-        (piece, label)
-        for line, label in zip(lines, category, strict=True)
-        for piece in clip_to_range(line, range_)
+        (piece, label) for line, label in zip(lines, category, strict=True) for piece in clip_to_range(line, range_)
     ]
     sd_map = SdMap.empty(capacity, points)
     if not pieces:

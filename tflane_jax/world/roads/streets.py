@@ -107,9 +107,7 @@ def build_street(plan: StreetPlan, network: LaneNetwork, solid_before_stop: floa
     return Street(
         plan,
         _build_side(forward, onward, cuts_f, (low, high), solid_f, plan.speed, network),
-        _build_side(
-            backward, line.backward(), cuts_b, (length - high, length - low), solid_b, plan.speed, network
-        ),
+        _build_side(backward, line.backward(), cuts_b, (length - high, length - low), solid_b, plan.speed, network),
     )
 
 
@@ -172,18 +170,24 @@ def _build_side(
     rows: list[dict[int, int]] = []  # section -> column -> segment id
     for a, b in pairwise(at.tolist()):
         middle = 0.5 * float(t[a] + t[b])
-        present = [
-            i for i, c in enumerate(columns) if c.extra is None or c.extra.start < middle < c.extra.stop
-        ]
+        present = [i for i, c in enumerate(columns) if c.extra is None or c.extra.start < middle < c.extra.stop]
         order = sorted(present, key=lambda i: _rank(i, columns[i].extra))
         row = {}
         for place, i in enumerate(order):
             left_type = _divider(columns, order, place - 1, middle, solid)
             right_type = _divider(columns, order, place, middle, solid)
-            row[i] = network.add(Draft(
-                columns[i].left[a : b + 1], columns[i].right[a : b + 1], left_type, right_type, speed,
-                vehicle=True, is_intersection=False, ego=ego[0] <= middle <= ego[1],
-            ))  # fmt: skip
+            row[i] = network.add(
+                Draft(
+                    columns[i].left[a : b + 1],
+                    columns[i].right[a : b + 1],
+                    left_type,
+                    right_type,
+                    speed,
+                    vehicle=True,
+                    is_intersection=False,
+                    ego=ego[0] <= middle <= ego[1],
+                )
+            )
         rows.append(row)
     _connect_sections(plan, rows, t[at], network)
 
@@ -191,9 +195,13 @@ def _build_side(
     if plan.bike:
         edge = plan.outer + shift + taken[Place.RIGHT]
         left, right = line.offset(edge), line.offset(edge + plan.bike)
-        bikes.append(network.add(Draft(
-            left, right, LineType.SOLID, LineType.SOLID, speed, vehicle=False, is_intersection=False, ego=False
-        )))  # fmt: skip
+        bikes.append(
+            network.add(
+                Draft(
+                    left, right, LineType.SOLID, LineType.SOLID, speed, vehicle=False, is_intersection=False, ego=False
+                )
+            )
+        )
 
     def ends(row: dict[int, int]) -> list[tuple[int, int]]:
         order = sorted(row, key=lambda i: _rank(i, columns[i].extra))
@@ -224,9 +232,7 @@ def _pocket(extra: ExtraLane | None) -> int:
     return 1 if extra.place is Place.RIGHT else -1
 
 
-def _divider(
-    columns: Sequence[_Column], order: Sequence[int], place: int, middle: float, solid: float
-) -> LineType:
+def _divider(columns: Sequence[_Column], order: Sequence[int], place: int, middle: float, solid: float) -> LineType:
     """Return the marking between the columns at `place` and `place + 1` of a section."""
     if place < 0 or place + 1 >= len(order):
         return LineType.SOLID

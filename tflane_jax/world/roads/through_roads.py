@@ -68,9 +68,7 @@ def _mid_block_crossing(road: Street, station: float, width: float) -> Float[np.
     return np.stack([a0, a1, b1, b0, a0])
 
 
-def _add_ramp(
-    road: Street, plan: RoadPlan, ramp: RampPlan, network: LaneNetwork, config: RoadConfig
-) -> Site:
+def _add_ramp(road: Street, plan: RoadPlan, ramp: RampPlan, network: LaneNetwork, config: RoadConfig) -> Site:
     """Lay out the ramp at the first extra lane of the forward side, and the kerbs of both."""
     side = road.forward
     extra, (first, last) = side.plan.extras[0], side.extra_segments[0]
@@ -89,12 +87,20 @@ def _add_ramp(
     bends = ((0.0, 0.0), (easing, peak), (easing + arc, peak), (2 * easing + arc, 0.0))
     branch = build_street(
         StreetPlan(
-            origin=join, heading=float(line.heading[at]) + (np.pi if ramp.enters else 0.0),
-            start=0.0, stop=config.reach, forward=bare if ramp.enters else lane,
-            backward=lane if ramp.enters else bare, speed=ramp.speed, ego=(0.0, ego), bends=bends,
+            origin=join,
+            heading=float(line.heading[at]) + (np.pi if ramp.enters else 0.0),
+            start=0.0,
+            stop=config.reach,
+            forward=bare if ramp.enters else lane,
+            backward=lane if ramp.enters else bare,
+            speed=ramp.speed,
+            ego=(0.0, ego),
+            bends=bends,
         ),
-        network, config.solid_before_stop, config.vertex_spacing,
-    )  # fmt: skip
+        network,
+        config.solid_before_stop,
+        config.vertex_spacing,
+    )
     if ramp.enters:
         slip = branch.backward.exits[0].segment
         network.weld(slip, first, keep=first)

@@ -19,9 +19,7 @@ NO_LEFT_TURN, NO_RIGHT_TURN, NO_U_TURN = 7, 8, 10
 _LIGHT_HEIGHT, _SIGN_HEIGHT = 5.5, 2.5
 
 
-def traffic_lights(
-    approaches: Sequence[Approach], green: int, beyond: float
-) -> list[MapElement]:
+def traffic_lights(approaches: Sequence[Approach], green: int, beyond: float) -> list[MapElement]:
     """Return one light for each incoming vehicle lane, hanging over the far side of the intersection.
 
     Args:

@@ -42,9 +42,7 @@ class Routes:
         """Return the ways of some trips."""
         return Routes(self.segment[rows], self.start[rows], self.length[rows], self.distance[rows])
 
-    def place(
-        self, distance: Float[np.ndarray, "n *b"]
-    ) -> tuple[Int[np.ndarray, "n *b"], Float[np.ndarray, "n *b"]]:
+    def place(self, distance: Float[np.ndarray, "n *b"]) -> tuple[Int[np.ndarray, "n *b"], Float[np.ndarray, "n *b"]]:
         """Return the segments and the stations on them of distances along each way."""
         n = len(self.start)
         extra = (1,) * (distance.ndim - 1)

@@ -130,9 +130,7 @@ def _speed_ahead(convoy: Convoy, at: Footing, table: LaneTable) -> Float[np.ndar
     return np.minimum(here, np.sqrt(square.min(1)))
 
 
-def _leader(
-    convoy: Convoy, at: Footing, table: LaneTable
-) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
+def _leader(convoy: Convoy, at: Footing, table: LaneTable) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
     """Return gap to and speed of the nearest vehicle in each one's way.
 
     A vehicle is in the way if its tail, middle or front lies on a segment ahead, or on one that runs so closely beside
@@ -199,9 +197,7 @@ def _occupied_crossing(
     return np.where(stoppable, gap, np.inf).min(1, initial=np.inf)
 
 
-def _stop_line(
-    convoy: Convoy, at: Footing, table: LaneTable, red: Bool[np.ndarray, " s"]
-) -> Float[np.ndarray, " a"]:
+def _stop_line(convoy: Convoy, at: Footing, table: LaneTable, red: Bool[np.ndarray, " s"]) -> Float[np.ndarray, " a"]:
     """Return the distance to the line before which each driver must wait; inf where they may go.
 
     They wait for a red light, for priority traffic that is near, for the junction to be cleared of crossing traffic,

@@ -113,20 +113,34 @@ def build_lane_table(network: RoadNetwork) -> LaneTable:
 
     successors = tuple(tuple(index[j] for j in segment.successors if j in index) for segment in segments)
     vehicle = np.array([segment.vehicle for segment in segments], bool)
-    beside, beside_station, crosses, clear_after = _conflicts(
-        xy, heading, own_station, owner, successors, vehicle
-    )
+    beside, beside_station, crosses, clear_after = _conflicts(xy, heading, own_station, owner, successors, vehicle)
     yields, merges_into = _priorities(network, segments, index)
     _share_exits(segments, successors, length, yields, crosses, clear_after)
     signals = [network.signal_phase.get(segment.id, (-1, -1)) for segment in segments]
     intersection, phase = np.array(signals, np.int64).reshape(-1, 2).T
     return LaneTable(
-        ids=ids, successors=successors, vehicle=vehicle, length=length, speed_at_start=speed[first],
-        turn=np.abs(heading[first + count - 1] - heading[first]), station=station,
-        axis=station[owner] + own_station, xy=xy, heading=heading, speed=speed, first_vertex=first, step=step,
-        beside=beside, beside_station=beside_station, crosses=crosses, clear_after=clear_after, yields=yields,
-        merges_into=merges_into, intersection=intersection, phase=phase,
-    )  # fmt: skip
+        ids=ids,
+        successors=successors,
+        vehicle=vehicle,
+        length=length,
+        speed_at_start=speed[first],
+        turn=np.abs(heading[first + count - 1] - heading[first]),
+        station=station,
+        axis=station[owner] + own_station,
+        xy=xy,
+        heading=heading,
+        speed=speed,
+        first_vertex=first,
+        step=step,
+        beside=beside,
+        beside_station=beside_station,
+        crosses=crosses,
+        clear_after=clear_after,
+        yields=yields,
+        merges_into=merges_into,
+        intersection=intersection,
+        phase=phase,
+    )
 
 
 def _sample(
@@ -149,9 +163,11 @@ def _sample(
 
 
 def _headings(
-    xy: Float[np.ndarray, "v 2"], owner: Int[np.ndarray, " v"], first: Int[np.ndarray, " s"],
+    xy: Float[np.ndarray, "v 2"],
+    owner: Int[np.ndarray, " v"],
+    first: Int[np.ndarray, " s"],
     count: Int[np.ndarray, " s"],
-) -> Float[np.ndarray, " v"]:  # fmt: skip
+) -> Float[np.ndarray, " v"]:
     """Return the direction at each vertex, continuous along a segment: the mean of the chords that meet there."""
     chord = np.arctan2(*np.diff(xy, axis=0).T[::-1])
     inner = owner[1:] == owner[:-1]
@@ -174,9 +190,12 @@ def _headings(
 
 
 def _comfortable_speed(
-    heading: Float[np.ndarray, " v"], s: Float[np.ndarray, " v"], owner: Int[np.ndarray, " v"],
-    step: Float[np.ndarray, " s"], limit: Float[np.ndarray, " s"],
-) -> Float[np.ndarray, " v"]:  # fmt: skip
+    heading: Float[np.ndarray, " v"],
+    s: Float[np.ndarray, " v"],
+    owner: Int[np.ndarray, " v"],
+    step: Float[np.ndarray, " s"],
+    limit: Float[np.ndarray, " s"],
+) -> Float[np.ndarray, " v"]:
     """Return the speed that keeps lateral acceleration and the braking for curves ahead comfortable."""
     turn = np.abs(np.diff(heading)) * (owner[1:] == owner[:-1])
     sharpest = np.maximum(np.concatenate([[0.0], turn]), np.concatenate([turn, [0.0]])) / step[owner]
@@ -190,11 +209,13 @@ def _comfortable_speed(
 
 
 def _conflicts(
-    xy: Float[np.ndarray, "v 2"], heading: Float[np.ndarray, " v"], s: Float[np.ndarray, " v"],
-    owner: Int[np.ndarray, " v"], successors: tuple[tuple[int, ...], ...], vehicle: Bool[np.ndarray, " s"],
-) -> tuple[
-    Int[np.ndarray, "v q"], Float[np.ndarray, "v q"], Bool[np.ndarray, "s s"], Float[np.ndarray, "s s"]
-]:  # fmt: skip
+    xy: Float[np.ndarray, "v 2"],
+    heading: Float[np.ndarray, " v"],
+    s: Float[np.ndarray, " v"],
+    owner: Int[np.ndarray, " v"],
+    successors: tuple[tuple[int, ...], ...],
+    vehicle: Bool[np.ndarray, " s"],
+) -> tuple[Int[np.ndarray, "v q"], Float[np.ndarray, "v q"], Bool[np.ndarray, "s s"], Float[np.ndarray, "s s"]]:
     """Return `beside`, `beside_station`, `crosses` and `clear_after` of `LaneTable`."""
     count = len(vehicle)
     follows = np.zeros((count, count), bool)
@@ -248,9 +269,13 @@ def _priorities(
 
 
 def _share_exits(
-    segments: list[LaneSegment], successors: tuple[tuple[int, ...], ...], length: Float[np.ndarray, " s"],
-    yields: Bool[np.ndarray, "s s"], crosses: Bool[np.ndarray, "s s"], clear_after: Float[np.ndarray, "s s"],
-) -> None:  # fmt: skip
+    segments: list[LaneSegment],
+    successors: tuple[tuple[int, ...], ...],
+    length: Float[np.ndarray, " s"],
+    yields: Bool[np.ndarray, "s s"],
+    crosses: Bool[np.ndarray, "s s"],
+    clear_after: Float[np.ndarray, "s s"],
+) -> None:
     """Let connectors that lead into one lane exclude each other, except that priority traffic does not stop."""
     into: dict[int, list[int]] = {}
     for i, following in enumerate(successors):

@@ -154,6 +154,12 @@ def draw_crossers(
     length = np.hypot(*step.T)
     pace = 1.0 + 0.7 * pace
     return Crossers(
-        start=first, ahead=step / np.maximum(length, 1e-9)[:, None], length=length, crossing=crossing,
-        forward=onward, pace=pace, progress=-pace * when * (stop - start), side=1.6 * (side - 0.5),
-    )  # fmt: skip
+        start=first,
+        ahead=step / np.maximum(length, 1e-9)[:, None],
+        length=length,
+        crossing=crossing,
+        forward=onward,
+        pace=pace,
+        progress=-pace * when * (stop - start),
+        side=1.6 * (side - 0.5),
+    )

@@ -32,9 +32,14 @@ class Rollout:
     """
 
     def __init__(
-        self, table: LaneTable, signals: Signals, trips: Trips, crossers: Crossers, places: CrossingPlaces,
+        self,
+        table: LaneTable,
+        signals: Signals,
+        trips: Trips,
+        crossers: Crossers,
+        places: CrossingPlaces,
         crossings: int,
-    ):  # fmt: skip
+    ):
         self.table, self.signals, self.trips = table, signals, trips
         self.crossers, self.places, self.crossings = crossers, places, crossings
         count = len(trips.enters)
@@ -47,8 +52,9 @@ class Rollout:
         trips, routes = self.trips, self.trips.routes
         early = np.flatnonzero(trips.enters < time)
         entry = routes.segment[early, 0]
-        wanted = np.minimum(self.table.speed_at_start[entry] * trips.drivers.eagerness[early],
-                            trips.drivers.top_speed[early])  # fmt: skip
+        wanted = np.minimum(
+            self.table.speed_at_start[entry] * trips.drivers.eagerness[early], trips.drivers.top_speed[early]
+        )
         at = (time - trips.enters[early]) * _PACE * wanted
         segment, station = routes.take(early).place(at)
         speed = np.minimum(wanted, self.table.speed[self.table.vertex(segment, station)])
@@ -83,10 +89,15 @@ class Rollout:
         rows = np.flatnonzero(self.active)
         drivers = self.trips.drivers
         convoy = Convoy(
-            self.trips.routes.take(rows), 0.5 * drivers.size[rows, 0], drivers.eagerness[rows],
-            drivers.top_speed[rows], drivers.acceleration[rows], drivers.headway[rows],
-            self.position[rows], self.speed[rows],
-        )  # fmt: skip
+            self.trips.routes.take(rows),
+            0.5 * drivers.size[rows, 0],
+            drivers.eagerness[rows],
+            drivers.top_speed[rows],
+            drivers.acceleration[rows],
+            drivers.headway[rows],
+            self.position[rows],
+            self.speed[rows],
+        )
         positions, progress = [], []
         tau = np.arange(substeps) * (dt / substeps)
         for step in range(steps):

@@ -80,9 +80,7 @@ def turn_green(signals: Signals, intersection: int, phase: int, time: float) -> 
     return Signals(signals.green, offset)
 
 
-def element_states(
-    network: RoadNetwork, signals: Signals, times: Float[np.ndarray, " f"]
-) -> Int[np.ndarray, "f e"]:
+def element_states(network: RoadNetwork, signals: Signals, times: Float[np.ndarray, " f"]) -> Int[np.ndarray, "f e"]:
     """Return the attribute of each of the map's elements at each time: a light shows red, yellow or green as its
     signals are, every other element what it always shows."""
     state = np.tile(np.array([element.attribute for element in network.map.elements], int), (len(times), 1))

@@ -42,8 +42,11 @@ class TrafficConfig:
 
     vehicles_per_metre: float = 0.032
     category_share: tuple[tuple[RoadUser, float], ...] = (
-        (RoadUser.CAR, 0.79), (RoadUser.TRUCK, 0.1), (RoadUser.BUS, 0.05), (RoadUser.MOTORCYCLE, 0.06)
-    )  # fmt: skip
+        (RoadUser.CAR, 0.79),
+        (RoadUser.TRUCK, 0.1),
+        (RoadUser.BUS, 0.05),
+        (RoadUser.MOTORCYCLE, 0.06),
+    )
     bicycles_per_metre: float = 0.012
     parked_share: float = 0.55
     pedestrians_per_metre: float = 0.015
@@ -90,14 +93,17 @@ def simulate_traffic(
     signals = _signals_for_ego(rng, table, way, config.green_wave)
     # The oldest trips still on the road when the simulation starts entered as long ago as a slow drive takes.
     trips = draw_trips(
-        rng, table, way, start=start - 40.0, stop=stop + 5.0,
-        vehicles_per_metre=config.vehicles_per_metre, bicycles_per_metre=config.bicycles_per_metre,
+        rng,
+        table,
+        way,
+        start=start - 40.0,
+        stop=stop + 5.0,
+        vehicles_per_metre=config.vehicles_per_metre,
+        bicycles_per_metre=config.bicycles_per_metre,
         category_share=config.category_share,
-    )  # fmt: skip
-    trips.drivers.top_speed[0] = config.ego_top_speed
-    crossers = draw_crossers(
-        rng, network.walk_across, start=start, stop=stop, per_minute=config.crossers_per_minute
     )
+    trips.drivers.top_speed[0] = config.ego_top_speed
+    crossers = draw_crossers(rng, network.walk_across, start=start, stop=stop, per_minute=config.crossers_per_minute)
     places = crossing_places(network.walk_across, table)
     road = Rollout(table, signals, trips, crossers, places, len(network.walk_across))
     road.place_early_trips(start)

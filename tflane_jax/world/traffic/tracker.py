@@ -61,9 +61,18 @@ class TrackerConfig:
     def perfect(cls) -> TrackerConfig:
         """Return a tracker that reports the truth."""
         return cls(
-            range=np.inf, falloff=0.0, view_needed=0.0, drop=0.0, position_noise=0.0, position_noise_growth=0.0,
-            yaw_noise=0.0, size_noise=0.0, velocity_noise=0.0, coast=0, switch_rate=0.0,
-        )  # fmt: skip
+            range=np.inf,
+            falloff=0.0,
+            view_needed=0.0,
+            drop=0.0,
+            position_noise=0.0,
+            position_noise_growth=0.0,
+            yaw_noise=0.0,
+            size_noise=0.0,
+            velocity_noise=0.0,
+            coast=0,
+            switch_rate=0.0,
+        )
 
     def with_noise(self, scale: float) -> TrackerConfig:
         """Return the tracker with noise and misses scaled."""
@@ -146,10 +155,12 @@ def visible_share(
         dx, dy = (0.5 * size[:, None, :2] * _PROBES).transpose(2, 0, 1)
         points = np.stack([at[:, :1] + cos * dx - sin * dy, at[:, 1:2] + sin * dx + cos * dy], -1)
         hidden = hidden_points(
-            points.reshape(-1, 2), boxes, blocks,
+            points.reshape(-1, 2),
+            boxes,
+            blocks,
             target_height=np.repeat(base + 0.6 * size[:, 2], len(_PROBES)),
             exclude=np.repeat(np.arange(len(k)), len(_PROBES)),
-        )  # fmt: skip
+        )
         share[row, k] = 1.0 - hidden.reshape(len(k), -1).mean(1)
     if len(looks) == frames:
         return share
@@ -163,9 +174,14 @@ def visible_share(
 
 
 def _detections(
-    rng: np.random.Generator, actors: Tracks, global_from_ego: np.ndarray, buildings: np.ndarray,
-    distance: Float[np.ndarray, "f k"], config: TrackerConfig, rate_hz: float,
-) -> Bool[np.ndarray, "f k"]:  # fmt: skip
+    rng: np.random.Generator,
+    actors: Tracks,
+    global_from_ego: np.ndarray,
+    buildings: np.ndarray,
+    distance: Float[np.ndarray, "f k"],
+    config: TrackerConfig,
+    rate_hz: float,
+) -> Bool[np.ndarray, "f k"]:
     """Draw in which frames each actor is detected."""
     if config.falloff > 0.0:
         chance = np.clip(1.0 - (distance - config.range) / config.falloff, 0.0, 1.0)
@@ -200,10 +216,14 @@ def _velocity(actors: Tracks, global_from_ego: Float[np.ndarray, "f 4 4"]) -> Fl
 
 
 def _coast(
-    seen: Float[np.ndarray, "f k 3"], yaw: Float[np.ndarray, "f k"], velocity: Float[np.ndarray, "f k 2"],
-    origin: Int[np.ndarray, " m"], frame: Int[np.ndarray, " m"], k: Int[np.ndarray, " m"],
+    seen: Float[np.ndarray, "f k 3"],
+    yaw: Float[np.ndarray, "f k"],
+    velocity: Float[np.ndarray, "f k 2"],
+    origin: Int[np.ndarray, " m"],
+    frame: Int[np.ndarray, " m"],
+    k: Int[np.ndarray, " m"],
     global_from_ego: Float[np.ndarray, "f 4 4"],
-) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:  # fmt: skip
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
     """Return boxes at M (frame, actor) pairs that go on from the frame `origin` at constant velocity and heading."""
     start = transform_points(global_from_ego[origin], seen[origin, k][:, None])[:, 0]
     start[:, :2] += velocity[origin, k] * (frame - origin)[:, None]
@@ -249,9 +269,13 @@ def _switch(
 
 
 def _table(
-    identity: Int[np.ndarray, "f k"], position: Float[np.ndarray, "f k 3"], yaw: Float[np.ndarray, "f k"],
-    coasting: Bool[np.ndarray, "f k"], actors: Tracks, size_noise: Float[np.ndarray, "i 3"],
-) -> Tracks:  # fmt: skip
+    identity: Int[np.ndarray, "f k"],
+    position: Float[np.ndarray, "f k 3"],
+    yaw: Float[np.ndarray, "f k"],
+    coasting: Bool[np.ndarray, "f k"],
+    actors: Tracks,
+    size_noise: Float[np.ndarray, "i 3"],
+) -> Tracks:
     """Return the reports with a row for each identity."""
     frames, count = len(identity), len(size_noise)
     frame, k = np.nonzero(identity >= 0)
@@ -264,9 +288,14 @@ def _table(
     row, first = np.unique(row, return_index=True)
     size = actors.size[k[first]] * size_noise[row]
     return Tracks(
-        position=out_position, yaw=out_yaw, size=size, category=actors.category[k[first]], occluded=occluded,
-        valid=valid, uuid=np.array([f"track-{i:03d}" for i in row], dtype="<U16"),
-    )  # fmt: skip
+        position=out_position,
+        yaw=out_yaw,
+        size=size,
+        category=actors.category[k[first]],
+        occluded=occluded,
+        valid=valid,
+        uuid=np.array([f"track-{i:03d}" for i in row], dtype="<U16"),
+    )
 
 
 def wrap_angle(angle: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:

@@ -26,7 +26,7 @@ from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import LstrConfig
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
@@ -73,7 +73,7 @@ def training(config: LstrConfig, batch: int) -> Compiled:
     """Return a whole update step from bytes: normalisation, loss, gradient, clipping, AdamW, average, guard."""
     pixels = np.random.default_rng(0).integers(0, 256, (batch, HEIGHT, WIDTH, 3), np.uint8)
     data = jax.device_put(RoadImage(pixels, np.ones(pixels.shape[:3], bool), lines(batch)))
-    task, optim = LaneCurveTask(config), OptimConfig(warmup_steps=0)
+    task, optim = LaneShapeTask(config), OptimConfig(warmup_steps=0)
     state = init_state(task, make_optimizer(optim, 1000), jax.random.key(0), jax.tree.map(lambda leaf: leaf[0], data))
     began = time.perf_counter()
     step = make_update_step(task, optim, 1000).lower(state, data).compile()

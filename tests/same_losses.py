@@ -1,4 +1,4 @@
-"""Train every shipped configuration for a few steps in two checkouts, on this machine, and compare all numbers bit by bit.
+"""Train every shipped configuration for a few steps in two checkouts on this machine; compare all numbers bit by bit.
 
     python -m tests.same_losses ../before                      # 50 steps of every configuration: hours on one core
     python -m tests.same_losses ../before tf_lane camera.toponet --steps 20

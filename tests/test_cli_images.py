@@ -18,7 +18,7 @@ CONFIG = """
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.lstr import LstrConfig
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
@@ -26,7 +26,7 @@ from tflane_jax.training.schedule import OptimConfig
 def get_config():
     backbone = ResNetConfig((1, 1), (4, 8), (2, 2), stem_channels=4)
     return RunConfig(
-        task=LaneCurveTask(LstrConfig(backbone, 8, decoder_layers=1, shrink=4)),
+        task=LaneShapeTask(LstrConfig(backbone, 8, decoder_layers=1, shrink=4)),
         data=FrontViewData(train=6, val=2, test=3),
         optim=OptimConfig(warmup_steps=1),
         training=TrainingConfig(steps=4, batch_size=2, log_every=1, eval_every=2, best_metric="all/Accuracy"),

@@ -31,15 +31,15 @@ from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.simulate import WorldConfig
 
 Split = Literal["train", "val", "test"]
 LaneGraphSource = ProceduralConfig | Argoverse2Config | OpenLaneV2Config
-LaneCurveSource = FrontViewConfig | TuSimpleConfig
-Source = LaneGraphSource | LaneCurveSource
+LaneShapeSource = FrontViewConfig | TuSimpleConfig
+Source = LaneGraphSource | LaneShapeSource
 T = TypeVar("T")
 
 
@@ -191,7 +191,7 @@ class RunConfig:
         weights: file of published PyTorch weights; `tflane predict` and `eval` take the configuration with them.
     """
 
-    task: LaneGraphTask | LaneCurveTask = LaneGraphTask()
+    task: LaneGraphTask | LaneShapeTask = LaneGraphTask()
     data: WorldData | LogData | OpenLaneV2Data | FrontViewData | TuSimpleData = WorldData()
     optim: OptimConfig = OptimConfig()
     training: TrainingConfig = TrainingConfig()

@@ -21,14 +21,14 @@ from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.task import Params
 
 PLATFORMS = ("cpu", "cuda")
 Answer = dict[str, Float[Array, "b q c"]]
 
 
-def image_program(task: LaneCurveTask, params: Params) -> Callable[[UInt8[Array, "b h w 3"]], Answer]:
+def image_program(task: LaneShapeTask, params: Params) -> Callable[[UInt8[Array, "b h w 3"]], Answer]:
     """Return the model as a function of RGB images alone, with its weights inside."""
 
     def predict(images: UInt8[Array, "b h w 3"]) -> Answer:
@@ -44,7 +44,7 @@ def image_program(task: LaneCurveTask, params: Params) -> Callable[[UInt8[Array,
 
 
 def export_model(
-    task: LaneCurveTask, params: Params, path: Path, *, height: int, width: int, platforms: Sequence[str] = PLATFORMS
+    task: LaneShapeTask, params: Params, path: Path, *, height: int, width: int, platforms: Sequence[str] = PLATFORMS
 ) -> Path:
     """Write the model for images of one size and batches of any size; return the path.
 

@@ -49,7 +49,7 @@ def get_config() -> RunConfig:
             LaneGraphLossConfig(successor_weight=20.0),
         ),
         data=WorldData(train=600, val=20, test=75, example=ExampleConfig(range=TRUTH, sensor=None, cameras=RIG)),
-        optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),
+        optim=OptimConfig(lr=2e-3, warmup_steps=100, optimizer="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=3000, batch_size=4, eval_every=1000, checkpoint_every=500),
     )
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from tflane_jax.config import RunConfig, TuSimpleData
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.lstr import LstrConfig
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
@@ -23,7 +23,7 @@ def get_config() -> RunConfig:
     """Return the published network and recipe; the checkpoint's stem norm is frozen."""
     data = Path(os.environ.get("TFLANE_SHARED", "../shared")) / "data"
     return RunConfig(
-        task=LaneCurveTask(LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))),
+        task=LaneShapeTask(LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))),
         data=TuSimpleData(data / "tusimple" / "LaneDetection", train="all", val="all", test="all"),
         optim=OptimConfig(lr=1e-4, warmup_steps=0, weight_decay=0.0, clip_norm=float("inf")),
         training=TrainingConfig(steps=500_000, batch_size=16, eval_every=5000, best_metric="all/Accuracy"),

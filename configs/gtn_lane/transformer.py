@@ -11,9 +11,9 @@ from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
-from tflane_jax.losses.lane_shape import LaneCurveLossConfig
+from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
@@ -34,7 +34,7 @@ def get_config() -> RunConfig:
     )
     augmentation = AugmentationConfig(geometry=0.8, rotation=0.03, crop=0.95)
     return RunConfig(
-        task=LaneCurveTask(model, LaneCurveLossConfig(least_depth=0.02)),
+        task=LaneShapeTask(model, LaneShapeLossConfig(least_depth=0.02)),
         data=FrontViewData(train=6000, val=100, test=400, augmentation=augmentation),
         optim=OptimConfig(lr=1e-3, warmup_steps=100, weight_decay=1e-4, b2=0.99, clip_norm=5.0, ema_decay=0.99),
         training=TrainingConfig(steps=4000, batch_size=4, eval_every=1000, best_metric="all/Accuracy"),

@@ -34,7 +34,7 @@ def get_config() -> RunConfig:
     return RunConfig(
         task=LaneGraphTask(TopoNetConfig(denoising=DenoisingConfig()), LaneGraphLossConfig(successor_weight=20.0)),
         data=WorldData(train=1000, val=15, test=100, world=WORLD, example=EXAMPLE),
-        optim=OptimConfig(lr=2e-3, warmup_steps=100, matrices="muon", b2=0.99, clip_norm=5.0),
+        optim=OptimConfig(lr=2e-3, warmup_steps=100, optimizer="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=2500, batch_size=4, eval_every=2500),
     )
 

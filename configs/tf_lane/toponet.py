@@ -34,5 +34,5 @@ def ablations() -> dict[str, RunConfig]:
     """Return faster ways to train, none of them from the papers (docs/cameras.md, "Small models")."""
     plain = get_config()
     model = replace(plain.task.model, denoising=DenoisingConfig())
-    muon = replace(plain, optim=replace(plain.optim, lr=2e-3, matrices="muon"))
+    muon = replace(plain, optim=replace(plain.optim, lr=2e-3, optimizer="muon"))
     return {"muon": muon, "denoising": replace(muon, task=replace(plain.task, model=model))}

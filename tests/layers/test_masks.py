@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.layers.masks import SpatialMask, key_mask, pair_mask, reach_mask
+from tflane_jax.layers.masks import SpatialMask, key_mask, pair_mask, radius_mask
 
 
 def random_bool(seed, *shape):
@@ -65,19 +65,19 @@ def test_no_quadrant_that_nobody_uses_is_built():
 
 @settings(deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.5, 20.0))
-def test_a_place_sees_the_lines_that_pass_within_reach(seed, reach):
+def test_a_place_sees_the_lines_that_pass_within_reach(seed, radius):
     rng = np.random.default_rng(seed)
     places, lines, valid = rng.uniform(-20, 20, (6, 2)), rng.uniform(-20, 20, (4, 5, 2)), np.arange(4) < 3
     expected = np.array(
         [[shapely.LineString(line).distance(shapely.Point(place)) for line in lines] for place in places]
     )
-    clear = np.abs(expected - reach) > 1e-3
+    clear = np.abs(expected - radius) > 1e-3
     lines[3] = np.nan
-    mask = np.asarray(reach_mask(jnp.asarray(places, jnp.float32), jnp.asarray(lines, jnp.float32), valid, reach))
-    np.testing.assert_array_equal(mask[clear], ((expected <= reach) & valid)[clear])
+    mask = np.asarray(radius_mask(jnp.asarray(places, jnp.float32), jnp.asarray(lines, jnp.float32), valid, radius))
+    np.testing.assert_array_equal(mask[clear], ((expected <= radius) & valid)[clear])
 
 
 def test_a_line_without_length_is_a_point():
-    mask = reach_mask(jnp.array([[3.0, 0.0], [3.1, 0.0]]), jnp.zeros((1, 2, 2)), jnp.ones(1, bool), 3.05)
+    mask = radius_mask(jnp.array([[3.0, 0.0], [3.1, 0.0]]), jnp.zeros((1, 2, 2)), jnp.ones(1, bool), 3.05)
     np.testing.assert_array_equal(mask, [[True], [False]])
-    assert reach_mask(jnp.zeros((2, 2)), jnp.zeros((0, 2, 2)), jnp.ones(0, bool), 1.0).shape == (2, 0)
+    assert radius_mask(jnp.zeros((2, 2)), jnp.zeros((0, 2, 2)), jnp.ones(0, bool), 1.0).shape == (2, 0)

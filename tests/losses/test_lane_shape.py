@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from tflane_jax.losses.lane_shape import LaneCurveLossConfig, cell_loss, lane_curve_loss, lane_curve_targets
-from tflane_jax.scene import LaneCurvePrediction, LaneLines
+from tflane_jax.losses.lane_shape import LaneShapeLossConfig, cell_loss, lane_shape_loss, lane_shape_targets
+from tflane_jax.scene import LaneLines, LaneShapePrediction
 
 LINES, POINTS, QUERIES, LAYERS = 4, 9, 7, 2
 
@@ -27,14 +27,14 @@ def predictions(seed=1, batch=2):
     rng = np.random.default_rng(seed)
     logits = rng.normal(size=(batch, LAYERS, QUERIES, 2))
     curves = rng.normal([0.4, 0.9, 0.0, 0.2, 0.0, 0.5, 0.0, 0.0], 0.1, (batch, LAYERS, QUERIES, 8))
-    return LaneCurvePrediction(jnp.asarray(logits, jnp.float32), jnp.asarray(curves, jnp.float32))
+    return LaneShapePrediction(jnp.asarray(logits, jnp.float32), jnp.asarray(curves, jnp.float32))
 
 
 def value_and_gradient(prediction, truth):
-    config = LaneCurveLossConfig()
+    config = LaneShapeLossConfig()
 
     def loss(prediction, truth):
-        return lane_curve_loss(prediction, lane_curve_targets(truth, shared_horizon=config.shared_horizon), config)
+        return lane_shape_loss(prediction, lane_shape_targets(truth, shared_horizon=config.shared_horizon), config)
 
     (value, terms), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(prediction, truth)
     return value, terms, gradient
@@ -82,10 +82,10 @@ def test_the_order_of_lines_and_queries_does_not_matter():
 
 
 def test_gradient_is_that_of_finite_differences():
-    targets = lane_curve_targets(lines())
-    config = LaneCurveLossConfig(least_depth=1e-2)
+    targets = lane_shape_targets(lines())
+    config = LaneShapeLossConfig(least_depth=1e-2)
     check_grads(
-        lambda p: lane_curve_loss(p, targets, config)[0], (predictions(),), 1, ["rev"], eps=1e-3, atol=2e-2, rtol=2e-2
+        lambda p: lane_shape_loss(p, targets, config)[0], (predictions(),), 1, ["rev"], eps=1e-3, atol=2e-2, rtol=2e-2
     )
 
 
@@ -93,21 +93,21 @@ def test_a_perfect_prediction_costs_nothing_but_doubt():
     truth = lines(batch=1, count=2)
     slopes = [(truth.points[0, i, -1] - truth.points[0, i, 0])[0] / 0.55 for i in range(2)]
     curves = np.zeros((1, 1, QUERIES, 8), np.float32)
-    targets = lane_curve_targets(truth)
+    targets = lane_shape_targets(truth)
     for i in range(2):
         u, v = truth.points[0, i, 0]
         # u + slope (V - v) = slope V - (slope v - u)
         curves[0, 0, i] = [*targets.extent[0, i], 0, -1, 0, 0, slopes[i], slopes[i] * v - u]
     logits = np.tile(np.array([9.0, -9.0], np.float32), (1, 1, QUERIES, 1))
     logits[0, 0, :2] *= -1
-    value, terms, _ = value_and_gradient(LaneCurvePrediction(jnp.asarray(logits), jnp.asarray(curves)), truth)
+    value, terms, _ = value_and_gradient(LaneShapePrediction(jnp.asarray(logits), jnp.asarray(curves)), truth)
     assert float(value) < 1e-4
     assert float(terms["matching/lanes"]) == 2
 
 
 def test_lines_share_the_highest_row_where_asked():
     truth = lines()
-    shared, own = (lane_curve_targets(truth, shared_horizon=flag).extent for flag in (True, False))
+    shared, own = (lane_shape_targets(truth, shared_horizon=flag).extent for flag in (True, False))
     assert (np.ptp(shared[:, :3, 0], axis=1) == 0).all()
     np.testing.assert_array_equal(shared[:, :3, 0].min(1), own[:, :3, 0].min(1))
     assert not np.array_equal(shared, own)
@@ -118,7 +118,7 @@ def test_cells_are_those_with_a_point():
     points[0, 0] = [[0.1, 0.1], [0.6, 0.3], [1.2, 0.6]]  # the last lies outside
     points[0, 1] = np.nan
     truth = LaneLines(points, np.ones((1, 2, 3), bool), np.array([[True, False]]))
-    targets = jax.tree.map(lambda leaf: leaf[0], lane_curve_targets(truth))
+    targets = jax.tree.map(lambda leaf: leaf[0], lane_shape_targets(truth))
     taken = np.zeros((2, 4))
     taken[0, 0] = taken[0, 2] = 1
     logits = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)

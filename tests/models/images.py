@@ -7,7 +7,7 @@ from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 
 HEIGHT, WIDTH = 40, 64
 ROWS = np.linspace(160, 710, 12) / 720
@@ -21,7 +21,7 @@ def tiny_model(encoder=None, **changes):
 
 
 def tiny_task(encoder=None):
-    return LaneCurveTask(tiny_model(encoder))
+    return LaneShapeTask(tiny_model(encoder))
 
 
 def road_image(seed, lines=3, capacity=4):

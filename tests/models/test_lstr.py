@@ -23,9 +23,9 @@ from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
 from tflane_jax.losses.lane_shape import (
-    LaneCurveLossConfig,
-    LaneCurveTargets,
-    lane_curve_loss,
+    LaneShapeLossConfig,
+    LaneShapeTargets,
+    lane_shape_loss,
     lane_weights,
     matching_cost,
 )
@@ -33,7 +33,7 @@ from tflane_jax.matching import match
 from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig, normalise
-from tflane_jax.scene import LaneCurvePrediction, stack_examples
+from tflane_jax.scene import LaneShapePrediction, stack_examples
 
 PUBLISHED = LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))
 pytestmark = pytest.mark.golden
@@ -151,10 +151,10 @@ def test_published_weights_match_the_reference(path):
 def test_costs_assignments_and_losses_match_the_reference(path):
     case = load_module_case(path)
     weights = {name: case.meta["weight_dict"][f"loss_{name}"] for name in ("ce", "curves", "lowers")}
-    config = LaneCurveLossConfig(weights["ce"], weights["curves"], weights["lowers"], shared_horizon=False)
+    config = LaneShapeLossConfig(weights["ce"], weights["curves"], weights["lowers"], shared_horizon=False)
     targets = stacked_targets([case.inputs[f"targets.{b}"] for b in range(len(case.meta["counts"]))])
     layers = ("aux0", "main")
-    prediction = LaneCurvePrediction(
+    prediction = LaneShapePrediction(
         *(jnp.stack([case.inputs[f"{layer}.pred_{part}"] for layer in layers], 1) for part in ("logits", "curves"))
     )
     lane_weight = lane_weights(targets, targets.valid)
@@ -168,7 +168,7 @@ def test_costs_assignments_and_losses_match_the_reference(path):
             source = case.outputs[f"{layer}.match_src.{b}"][by_target]
             np.testing.assert_array_equal(assignment.query[b, i, :count], source)
 
-    total, terms = lane_curve_loss(prediction, targets, config)
+    total, terms = lane_shape_loss(prediction, targets, config)
     names = ("ce", "curves", "lowers", "uppers")
     scale = {name: case.meta["weight_dict"][f"loss_{name}"] for name in names}
     wanted = {name: scale[name] * case.outputs[f"loss_{name}"] for name in names}
@@ -189,7 +189,7 @@ def stacked_targets(images):
     columns, heights = (np.where(point_valid, x, 0) for x in (columns, heights))
     valid = ~np.isnan(rows[..., 0])
     extent = np.where(valid[..., None], rows[..., 1:3], 0)
-    return LaneCurveTargets(*map(jnp.asarray, (columns, heights, point_valid, extent, valid)))
+    return LaneShapeTargets(*map(jnp.asarray, (columns, heights, point_valid, extent, valid)))
 
 
 def test_every_published_tensor_is_accounted_for():
@@ -221,7 +221,7 @@ def test_the_ten_real_frames_give_the_originals_points():
     metrics = TuSimpleMetrics()
     for i in range(len(dataset)):
         ours = jax.tree.map(lambda leaf, i=i: leaf[i, -1], prediction)
-        theirs = LaneCurvePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
+        theirs = LaneShapePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
         truth = dataset.truth(i)
         found, expected = (row_lanes(one, truth.rows, height=720, width=1280) for one in (ours, theirs))
         np.testing.assert_array_equal(found.x == -2, expected.x == -2)

@@ -223,7 +223,7 @@ def test_a_fusion_that_begins_silent_leaves_the_host_as_it_was_trained():
 
 
 def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
-    guide, config = guide_frame(seeing(observed()), None, CONFIG)[0], replace(CONFIG, reach=1.0, norm="query")
+    guide, config = guide_frame(seeing(observed()), None, CONFIG)[0], replace(CONFIG, radius=1.0, norm="query")
     start = guide.points[int(np.argmax(guide.valid)), 0]
     mask = fusion_mask(guide, guide.valid, jnp.stack([start, start + 500.0]), config)
     np.testing.assert_array_equal(mask.any(1), [True, False])

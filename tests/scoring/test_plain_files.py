@@ -56,6 +56,7 @@ def write_npz(folder, **changes):
         "scores": three(detections.scores),
         "successor": three(detections.successor),
     }
+
     def slot(array, axes):
         return np.pad(
             three(array).astype(float),
@@ -66,6 +67,7 @@ def write_npz(folder, **changes):
             ],
             constant_values=np.nan,
         )
+
     valid = three([True] * len(truth.points) + [False])
     truths = name | {
         "points": slot(truth.points, 1),

@@ -10,10 +10,10 @@ import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
 from tests.parameters import random_params
-from tflane_jax.losses.lane_shape import LaneCurveLossConfig
+from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
-from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneCurveHeads, nearest, normalise, shrink
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneShapeHeads, nearest, normalise, shrink
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
@@ -152,9 +152,9 @@ def test_padding_is_sampled_at_the_first_pixel_of_a_cell():
 def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
     anchors, rng = (0.4, 0.9), np.random.default_rng(0)
     queries = jnp.asarray(rng.normal(size=(2, 3, 8)).astype(np.float32))
-    heads = LaneCurveHeads(8, anchors)
+    heads = LaneShapeHeads(8, anchors)
     variables = heads.init(jax.random.key(0), queries)
-    plain = LaneCurveHeads(8).apply(variables, queries)
+    plain = LaneShapeHeads(8).apply(variables, queries)
     anchored = heads.apply(variables, queries)
     np.testing.assert_array_equal(anchored.logits, plain.logits)
     # alpha of a typical road is 0.38, give or take 0.05.
@@ -166,9 +166,9 @@ def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
 
 @pytest.mark.parametrize("encoder", [None, GtnEncoderConfig(layers=1, hidden=16)])
 def test_cells_are_learned_beside_the_curves(encoder):
-    task = LaneCurveTask(tiny_model(encoder, cells=True))
-    silent = dataclasses.replace(task, losses=LaneCurveLossConfig(cell_weight=0.0))
-    without = LaneCurveTask(tiny_model(encoder))
+    task = LaneShapeTask(tiny_model(encoder, cells=True))
+    silent = dataclasses.replace(task, losses=LaneShapeLossConfig(cell_weight=0.0))
+    without = LaneShapeTask(tiny_model(encoder))
     params = random_params(task.init, road_image(0))
 
     @jax.jit
@@ -198,7 +198,7 @@ def test_shrunk_images_are_means_of_blocks_and_valid_where_all_of_a_block_is():
 @cache
 def curves_of(**options):
     """Return the curves that a network with some options predicts; parameters of one name have the same values."""
-    task = LaneCurveTask(tiny_model(**options))
+    task = LaneShapeTask(tiny_model(**options))
     return jax.jit(task.predict)(random_params(task.init, road_image(0)), road_image(0)).curves
 
 

@@ -84,7 +84,7 @@ def test_muon_makes_the_updates_of_matrices_orthogonal_and_leaves_the_rest_to_ad
     config = OptimConfig(lr=0.1, warmup_steps=0, weight_decay=0.0, clip_norm=np.inf)
     one, all_adam = (
         jax.jit(o.update)(grads, o.init(params), params)[0]
-        for o in (make_optimizer(replace(config, matrices=kind), 10) for kind in ("muon", "adam"))
+        for o in (make_optimizer(replace(config, optimizer=kind), 10) for kind in ("muon", "adam"))
     )
     found, expected = -np.asarray(one["kernel"]), left[:, :4] @ right.T
     # Newton's iterations leave singular values about one; root mean square 0.2 stands for sqrt(6) times that.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.commands.sources import lane_curve_source, lane_graph_source, source_name
-from tflane_jax.config import FrontViewData, LaneCurveSource, RunConfig, apply_overrides, load_config
+from tflane_jax.commands.sources import lane_graph_source, lane_shape_source, source_name
+from tflane_jax.config import FrontViewData, LaneShapeSource, RunConfig, apply_overrides, load_config
 from tflane_jax.datasets.argoverse2 import check_log, find_logs, load_log
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
@@ -21,7 +21,7 @@ from tflane_jax.plots import dataset_summary, format_table, save_camera_views, s
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks import spread, system_of
 from tflane_jax.tasks.lane_graph_system import open_dataset
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.lane_shape_system import open_images
 from tflane_jax.training.batches import prepared
 
@@ -31,9 +31,9 @@ _FAULTS = 50  # printed
 def show(options: argparse.Namespace) -> int:
     """Draw samples and print what they hold."""
     config = RunConfig() if options.config is None else load_config(options.config)
-    if isinstance(config.task, LaneCurveTask) or options.data in ("front-views", "tusimple"):
+    if isinstance(config.task, LaneShapeTask) or options.data in ("front-views", "tusimple"):
         config = _images(config)
-        return _show_images(lane_curve_source(config, options), config, options)
+        return _show_images(lane_shape_source(config, options), config, options)
     source = lane_graph_source(config, options)
     # Not from the cache: a few examples are made sooner than all of them.
     dataset = ProceduralDataset(source) if isinstance(source, ProceduralConfig) else open_dataset(source)
@@ -51,10 +51,10 @@ def show(options: argparse.Namespace) -> int:
 
 def _images(config: RunConfig) -> RunConfig:
     """Return a configuration whose data are images: a task needs no config file to have some shown."""
-    return config if isinstance(config.task, LaneCurveTask) else RunConfig(LaneCurveTask(), FrontViewData())
+    return config if isinstance(config.task, LaneShapeTask) else RunConfig(LaneShapeTask(), FrontViewData())
 
 
-def _show_images(source: LaneCurveSource, config: RunConfig, options: argparse.Namespace) -> int:
+def _show_images(source: LaneShapeSource, config: RunConfig, options: argparse.Namespace) -> int:
     from tflane_jax.plots.images import save_road_images
 
     dataset = open_images(source)

@@ -11,7 +11,7 @@ from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
 from tflane_jax.export import export_model, image_program, latencies, load_program
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
 HEIGHT, WIDTH = 360, 640
@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
     if rest:
         raise UserError(f"tflane export takes one run, {rest[0]} is too many")
     task = run.config.task
-    if not isinstance(task, LaneCurveTask):
+    if not isinstance(task, LaneShapeTask):
         raise UserError(f"{run.name} predicts lane graphs: tflane export takes models of lane lines in one image")
     path = export_model(task, run.params[0], options.out, height=HEIGHT, width=WIDTH)
 

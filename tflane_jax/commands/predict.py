@@ -7,7 +7,7 @@ import argparse
 from tflane_jax.commands import predict_images, predict_lanes
 from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -15,7 +15,7 @@ def run(options: argparse.Namespace) -> int:
     """Predict with the first seed and write everything into --out."""
     configure_jax()
     trained, photos = opened(options)
-    if not isinstance(trained.config.task, LaneCurveTask):
+    if not isinstance(trained.config.task, LaneShapeTask):
         if photos:
             raise UserError(f"{trained.name} does not read photos: leave {photos[0]} out")
         return predict_lanes.predict(trained, options)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from tflane_jax.commands.sources import lane_curve_source, make_folder
+from tflane_jax.commands.sources import lane_shape_source, make_folder
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import PhotoCamera, fit_photo, list_photos, read_image
 from tflane_jax.metrics import image_lanes
@@ -68,7 +68,7 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
 
 def predict_split(trained: Run, options: argparse.Namespace) -> int:
     """Find the lanes in images of a dataset, beside their truth."""
-    dataset = open_images(lane_curve_source(trained.config, options))
+    dataset = open_images(lane_shape_source(trained.config, options))
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
     indices = spread(len(dataset), options.count)

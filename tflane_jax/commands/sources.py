@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.config import LaneCurveSource, LaneGraphSource, RunConfig, Source, load_config
+from tflane_jax.config import LaneGraphSource, LaneShapeSource, RunConfig, Source, load_config
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.openlane_frames import subset_of
@@ -19,7 +19,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_graph_system import limit_instances
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
 
@@ -43,8 +43,8 @@ def limited_task(run: Run, options: argparse.Namespace) -> Any:
 
 def chosen_source(config: RunConfig, options: argparse.Namespace) -> Source:
     """Return the source that --split, --data, --root and --openlane name, of the kind that the task takes."""
-    if isinstance(config.task, LaneCurveTask):
-        return lane_curve_source(config, options)
+    if isinstance(config.task, LaneShapeTask):
+        return lane_shape_source(config, options)
     return lane_graph_source(config, options)
 
 
@@ -83,10 +83,10 @@ def lane_graph_source(config: RunConfig, options: argparse.Namespace) -> LaneGra
     return configured
 
 
-def lane_curve_source(config: RunConfig, options: argparse.Namespace) -> LaneCurveSource:
+def lane_shape_source(config: RunConfig, options: argparse.Namespace) -> LaneShapeSource:
     """Return the source of front-view images that is named."""
     configured = config.data.source(options.split)
-    if not isinstance(configured, LaneCurveSource):
+    if not isinstance(configured, LaneShapeSource):
         raise UserError("this configuration's data are no images, but its task wants some")
     if options.data is None and options.root is not None and not isinstance(configured, TuSimpleConfig):
         raise UserError("--root is TuSimple's folder: add --data tusimple")

@@ -7,14 +7,14 @@ from pathlib import Path
 from tflane_jax.convert.lstr import load_lstr
 from tflane_jax.convert.toponet import load_host
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.task import Params
 
 
-def load_weights(path: Path, task: LaneCurveTask | LaneGraphTask) -> tuple[Params, list[dict[str, str]]]:
+def load_weights(path: Path, task: LaneShapeTask | LaneGraphTask) -> tuple[Params, list[dict[str, str]]]:
     """Return a task's parameters from a checkpoint of its reference, and an account of the file's tensors.
 
     Raises:
         UserError: the file cannot be read, or its tensors are not exactly those of the model.
     """
-    return load_lstr(path, task.model) if isinstance(task, LaneCurveTask) else load_host(path, task.model)
+    return load_lstr(path, task.model) if isinstance(task, LaneShapeTask) else load_host(path, task.model)

@@ -212,14 +212,14 @@ class MultiHeadAttention(nn.Module):
         heads: number of heads.
         dropout: share of attention weights that training drops.
         out: channels out, None for `dim`.
-        silent: begin with a result of 0, for an attention that is added to what has been trained without it.
+        zero_init: begin with a result of 0, for an attention that is added to what has been trained without it.
     """
 
     dim: int
     heads: int
     dropout: float = 0.0
     out: int | None = None
-    silent: bool = False
+    zero_init: bool = False
 
     @nn.compact
     def __call__(
@@ -256,7 +256,7 @@ class MultiHeadAttention(nn.Module):
         else:
             heads = masked_attention(q, k, v, mask)
         attended = heads.swapaxes(0, 1).reshape(query.shape[0], self.dim)
-        init = nn.initializers.zeros if self.silent else nn.linear.default_kernel_init
+        init = nn.initializers.zeros if self.zero_init else nn.linear.default_kernel_init
         out = nn.Dense(self.out or self.dim, kernel_init=init, name="output")(attended)
         # The output's bias must not stand in for an attention over nothing.
         if key.shape[0] == 0:

@@ -17,15 +17,15 @@ def pair_mask(valid_queries: Bool[Array, " q"], valid_keys: Bool[Array, " k"]) -
     return valid_queries[:, None] & valid_keys[None, :]
 
 
-def reach_mask(
-    places: Float[Array, "q 2"], lines: Float[Array, "n p 2"], valid: Bool[Array, " n"], reach: float
+def radius_mask(
+    places: Float[Array, "q 2"], lines: Float[Array, "n p 2"], valid: Bool[Array, " n"], radius: float
 ) -> Bool[Array, "q n"]:
-    """Return the mask under which a query sees the valid lines that pass within `reach` of its place.
+    """Return the mask under which a query sees the valid lines that pass within `radius` of its place.
 
     Args:
-        places, lines: in one unit, that of `reach`; lines of at least two points. Invalid ones may hold anything.
+        places, lines: in one unit, that of `radius`; lines of at least two points. Invalid ones may hold anything.
         valid: of the lines.
-        reach: largest distance.
+        radius: largest distance.
     """
     lines = jnp.where(valid[:, None, None], lines, 0.0)
     start, step = lines[:, :-1], lines[:, 1:] - lines[:, :-1]
@@ -35,7 +35,7 @@ def reach_mask(
     square = sx**2 + sy**2
     share = jnp.clip((dx * sx + dy * sy) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
     distance = (dx - share * sx) ** 2 + (dy - share * sy) ** 2
-    return (distance.min(-1) <= reach**2) & valid[None, :]
+    return (distance.min(-1) <= radius**2) & valid[None, :]
 
 
 @struct.dataclass

@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.matching import Assignment, match
-from tflane_jax.scene import LaneCurvePrediction, LaneLines
+from tflane_jax.scene import LaneLines, LaneShapePrediction
 
 
 @dataclass(frozen=True)
-class LaneCurveLossConfig:
+class LaneShapeLossConfig:
     """Weights of matching costs and loss terms alike; the defaults are LSTR's.
 
     Attributes:
@@ -41,7 +41,7 @@ class LaneCurveLossConfig:
 
 
 @struct.dataclass
-class LaneCurveTargets:
+class LaneShapeTargets:
     """Lane lines as the loss wants them; leading axes as the lines have them.
 
     Attributes:
@@ -58,7 +58,7 @@ class LaneCurveTargets:
     valid: Bool[Array, "*b l"]
 
 
-def lane_curve_targets(lines: LaneLines, *, shared_horizon: bool = True) -> LaneCurveTargets:
+def lane_shape_targets(lines: LaneLines, *, shared_horizon: bool = True) -> LaneShapeTargets:
     """Return the targets of lane lines (any leading axes); what stands in padding does not matter."""
     point_valid = lines.point_valid & lines.valid[..., None]
     valid = point_valid.any(-1)
@@ -68,10 +68,10 @@ def lane_curve_targets(lines: LaneLines, *, shared_horizon: bool = True) -> Lane
     if shared_horizon:
         first = jnp.broadcast_to(first.min(-1, keepdims=True), first.shape)
     extent = jnp.where(valid[..., None], jnp.stack([first, last], -1), 0.0)
-    return LaneCurveTargets(columns, rows, point_valid, extent, valid)
+    return LaneShapeTargets(columns, rows, point_valid, extent, valid)
 
 
-def lane_weights(targets: LaneCurveTargets, counted: Bool[Array, "*b l"]) -> Float[Array, "*b l"]:
+def lane_weights(targets: LaneShapeTargets, counted: Bool[Array, "*b l"]) -> Float[Array, "*b l"]:
     """Return the weight of each lane of a batch: short lanes weigh more.
 
     w_l = sqrt(N / N_l) / max_i sqrt(N / N_i) = sqrt(min_i N_i / N_l), over the counted lanes of the whole batch.
@@ -82,7 +82,7 @@ def lane_weights(targets: LaneCurveTargets, counted: Bool[Array, "*b l"]) -> Flo
 
 
 def curve_errors(
-    curves: Float[Array, "*layers q 8"], targets: LaneCurveTargets, least_depth: float
+    curves: Float[Array, "*layers q 8"], targets: LaneShapeTargets, least_depth: float
 ) -> Float[Array, "*layers q l"]:
     """Return the sum over points of |u(v) - column| of every curve to every lane of one example."""
     # Rows without a point stand at 1, far from any horizon.
@@ -93,7 +93,7 @@ def curve_errors(
     return jnp.where(_lead(targets.point_valid, len(lead)), errors, 0.0).sum(-1)
 
 
-def cell_loss(logits: Float[Array, "h w"], targets: LaneCurveTargets) -> Float[Array, ""]:
+def cell_loss(logits: Float[Array, "h w"], targets: LaneShapeTargets) -> Float[Array, ""]:
     """Return the mean cross-entropy of one example's cells: does a point of a lane line lie in each?"""
     height, width = logits.shape
     inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1) & (targets.rows < 1)
@@ -105,10 +105,10 @@ def cell_loss(logits: Float[Array, "h w"], targets: LaneCurveTargets) -> Float[A
 
 
 def matching_cost(
-    prediction: LaneCurvePrediction,
-    targets: LaneCurveTargets,
+    prediction: LaneShapePrediction,
+    targets: LaneShapeTargets,
     weights: Float[Array, " l"],
-    config: LaneCurveLossConfig,
+    config: LaneShapeLossConfig,
 ) -> Float[Array, "layers q l"]:
     """Return d(l, h) of Eq. (3) for one example: the cost of giving each lane to each query."""
     is_lane = jax.nn.softmax(prediction.logits)[..., 1:]
@@ -117,8 +117,8 @@ def matching_cost(
     return -config.class_weight * is_lane + config.curve_weight * fit + config.extent_weight * extent
 
 
-def lane_curve_loss(
-    prediction: LaneCurvePrediction, targets: LaneCurveTargets, config: LaneCurveLossConfig
+def lane_shape_loss(
+    prediction: LaneShapePrediction, targets: LaneShapeTargets, config: LaneShapeLossConfig
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Return the loss of a batch, Eq. (4) summed over decoder layers, and its terms.
 
@@ -152,11 +152,11 @@ def lane_curve_loss(
 
 
 def _terms(
-    prediction: LaneCurvePrediction,
+    prediction: LaneShapePrediction,
     assignment: Assignment,
     weights: Float[Array, " l"],
-    targets: LaneCurveTargets,
-    config: LaneCurveLossConfig,
+    targets: LaneShapeTargets,
+    config: LaneShapeLossConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Return mean class loss, sum of curve errors and sum of extent errors of one layer of one example."""
     queries = prediction.logits.shape[0]

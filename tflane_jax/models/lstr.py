@@ -20,7 +20,7 @@ from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
-from tflane_jax.scene import LaneCurvePrediction
+from tflane_jax.scene import LaneShapePrediction
 
 # Of TuSimple images in [0, 1], blue, green, red: the order in which the published weights read them.
 MEAN_BGR = (0.40789654, 0.44719302, 0.47026115)
@@ -121,7 +121,7 @@ class Lstr(nn.Module):
     @nn.compact
     def __call__(
         self, image: Float[Array, "h w 3"], valid: Bool[Array, "h w"], *, train: bool = False
-    ) -> LaneCurvePrediction:
+    ) -> LaneShapePrediction:
         """Return predictions with a leading axis over decoder layers; the last one is the answer.
 
         Args:
@@ -151,10 +151,10 @@ class Lstr(nn.Module):
             layer = DecoderLayer(config.decoder, name=f"decoder_{i}")
             x = layer(x, memory, query, position, None, seen, deterministic=not train)
             outputs.append(norm(x))
-        return LaneCurveHeads(config.dim, config.anchors, name="heads")(jnp.stack(outputs))
+        return LaneShapeHeads(config.dim, config.anchors, name="heads")(jnp.stack(outputs))
 
 
-class LaneCurveHeads(nn.Module):
+class LaneShapeHeads(nn.Module):
     """Class, extent and curve of every query (GTN paper, Eq. 8).
 
     Attributes:
@@ -166,7 +166,7 @@ class LaneCurveHeads(nn.Module):
     anchors: tuple[float, float] | None = None
 
     @nn.compact
-    def __call__(self, queries: Float[Array, "layers q c"]) -> LaneCurvePrediction:
+    def __call__(self, queries: Float[Array, "layers q c"]) -> LaneShapePrediction:
         """Return the predictions of every layer."""
         logits = nn.Dense(2, name="class")(queries)
         specific = Mlp((self.dim, self.dim, 4), name="specific")(queries)  # alpha, beta, b'', b'''
@@ -176,7 +176,7 @@ class LaneCurveHeads(nn.Module):
         curves = jnp.concatenate([specific[..., :2], shared, specific[..., 2:]], -1)
         if self.anchors is not None:
             curves = _from_columns(_like(_TYPICAL, curves) + _like(_SPREAD, curves) * curves, self.anchors)
-        return LaneCurvePrediction(logits, curves)
+        return LaneShapePrediction(logits, curves)
 
 
 def _from_columns(curves: Float[Array, "*b 8"], anchors: tuple[float, float]) -> Float[Array, "*b 8"]:

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
-from tflane_jax.layers.masks import key_mask, reach_mask
+from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
@@ -52,7 +52,7 @@ class MarkerFusionConfig:
             they ask, F + c Attn(LayerNorm(F), ..), silent at first, so that a host can go on from where it is.
             BEVFormer's features are normalised already where a prior comes in; those of BEV evidence are not, and
             Eq. (3) as written is a shock to a host trained without it.
-        reach: a BEV cell looks only at lanes that pass within so many metres of it. None: at all of them, as Eq. (3) is
+        radius: a BEV cell attends only to lanes that pass within this many metres. None: to all, as Eq. (3) is
             written, and has to learn from their tokens which are near; that takes longer than a small model trains.
         query_position: add their positions to the BEV features where they look at the tokens. Eq. (3) writes none;
             SMERF does, and BEV features of a convolution do not know where they are.
@@ -68,7 +68,7 @@ class MarkerFusionConfig:
     heads: int = 4
     width: int | None = None
     norm: Literal["sum", "query"] = "sum"
-    reach: float | None = None
+    radius: float | None = None
     query_position: bool = True
     connectivity: bool = False
 
@@ -77,7 +77,7 @@ SMALL_MARKER_FUSION = MarkerFusionConfig(
     memory=MarkerMemoryConfig(lanes=32),
     width=64,
     norm="query",
-    reach=4.0,
+    radius=4.0,
     lines=PolylineEncoderConfig(
         dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
     ),
@@ -155,7 +155,7 @@ class MarkerFusion(nn.Module):
         norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
         query = norm(bev) if added else bev
         attention = MultiHeadAttention(
-            config.width or channels, config.heads, out=channels, silent=added, name="attention"
+            config.width or channels, config.heads, out=channels, zero_init=added, name="attention"
         )
         found = attention(query + position if config.query_position else query, tokens, tokens, mask)
         fused = bev + gate * found
@@ -176,9 +176,9 @@ def fusion_mask(
     guide: MarkerGuidance, valid: Bool[Array, " n"], cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
 ) -> Bool[Array, "#q n"]:
     """Return which BEV cell, centred at (x, y) in metres, may look at which token."""
-    if config.reach is None:
+    if config.radius is None:
         return key_mask(valid)
-    return reach_mask(jnp.asarray(cells), guide.points, valid, config.reach)
+    return radius_mask(jnp.asarray(cells), guide.points, valid, config.radius)
 
 
 def guide_frame(

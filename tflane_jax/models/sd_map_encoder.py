@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from tflane_jax.layers.attention import MultiHeadAttention
-from tflane_jax.layers.masks import key_mask, reach_mask
+from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
 from tflane_jax.scene import SdMap
@@ -35,7 +35,7 @@ class SdMapModuleConfig:
         prior: coordinates and labels.
         lines: from polylines to tokens.
         heads: of the attention to the tokens.
-        width, norm, reach: see `MarkerFusionConfig`; SMERF's are the defaults.
+        width, norm, radius: see `MarkerFusionConfig`; SMERF's are the defaults.
         absent: where no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias
             of the attention's output and normalises, as the published code does with an empty map beside a full one.
     """
@@ -45,7 +45,7 @@ class SdMapModuleConfig:
     heads: int = 4
     width: int | None = None
     norm: Literal["sum", "query"] = "sum"
-    reach: float | None = None
+    radius: float | None = None
     absent: Literal["nothing", "reference"] = "nothing"
 
 
@@ -54,7 +54,7 @@ SMALL_SD_MAP = SdMapModuleConfig(
     lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0),
     width=64,
     norm="query",
-    reach=10.0,
+    radius=10.0,
 )
 
 # Points on a line of the map that stands for an absent one.
@@ -108,7 +108,7 @@ class SdMapFusion(nn.Module):
         config, channels, present = self.config, bev.shape[-1], valid.any()
         norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
         attention = MultiHeadAttention(
-            config.width or channels, config.heads, out=channels, silent=added, name="attention"
+            config.width or channels, config.heads, out=channels, zero_init=added, name="attention"
         )
         query = norm(bev) if added else bev
         found = attention(query + position, tokens, tokens, key_mask(valid) if mask is None else mask)
@@ -123,6 +123,6 @@ def sd_map_mask(
     sd_map: SdMap | None, cells: Float[ArrayLike, "q 2"], config: SdMapModuleConfig
 ) -> Bool[Array, "q r"] | None:
     """Return which BEV cell, centred at (x, y) in metres, may look at which line of the map; None: at all."""
-    if sd_map is None or config.reach is None:
+    if sd_map is None or config.radius is None:
         return None
-    return reach_mask(jnp.asarray(cells), jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.reach)
+    return radius_mask(jnp.asarray(cells), jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.radius)

@@ -9,7 +9,7 @@ Host-side recordings in global coordinates (maps, poses, tracks) are in `tflane_
 """
 
 from tflane_jax.scene.example import Example, RoadImage, shapes_of, stack_examples
-from tflane_jax.scene.prediction import ElementPrediction, LaneCurvePrediction, LanePrediction, Prediction
+from tflane_jax.scene.prediction import ElementPrediction, LanePrediction, LaneShapePrediction, Prediction
 from tflane_jax.scene.priors import MarkerObservations, RoadUser, SdCategory, SdMap, TrafficFlow
 from tflane_jax.scene.truth import Areas, AreaType, LaneGraph, LaneLines, LineType, TrafficElements
 from tflane_jax.scene.views import BevChannel, CameraViews
@@ -21,10 +21,10 @@ __all__ = [
     "CameraViews",
     "ElementPrediction",
     "Example",
-    "LaneCurvePrediction",
     "LaneGraph",
     "LaneLines",
     "LanePrediction",
+    "LaneShapePrediction",
     "LineType",
     "MarkerObservations",
     "Prediction",

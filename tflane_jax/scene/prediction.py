@@ -53,7 +53,7 @@ class Prediction:
 
 
 @struct.dataclass
-class LaneCurvePrediction:
+class LaneShapePrediction:
     """Lane lines predicted by Q queries as parameters of the lane shape model (GTN paper, Eq. 7 and 8).
 
     Attributes:

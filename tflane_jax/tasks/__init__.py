@@ -6,7 +6,7 @@ import functools
 from typing import TYPE_CHECKING, Any
 
 from tflane_jax.tasks.base import Evaluation, Model, System, spread
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 
 if TYPE_CHECKING:
     from tflane_jax.config import RunConfig
@@ -17,10 +17,10 @@ __all__ = ["Evaluation", "Model", "System", "load_test_data", "spread", "system_
 def system_of(config: RunConfig) -> System:
     """Return the system that a configuration's task belongs to."""
     # Imported here, because each brings its own data and metrics along.
-    if isinstance(config.task, LaneCurveTask):
-        from tflane_jax.tasks.lane_shape_system import LaneCurveSystem
+    if isinstance(config.task, LaneShapeTask):
+        from tflane_jax.tasks.lane_shape_system import LaneShapeSystem
 
-        return LaneCurveSystem()
+        return LaneShapeSystem()
     from tflane_jax.tasks.lane_graph_system import LaneGraphSystem
 
     return LaneGraphSystem()

@@ -9,15 +9,15 @@ import jax
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.batch_norm import BATCH_AXIS
-from tflane_jax.losses.lane_shape import LaneCurveLossConfig, cell_loss, lane_curve_loss, lane_curve_targets
+from tflane_jax.losses.lane_shape import LaneShapeLossConfig, cell_loss, lane_shape_loss, lane_shape_targets
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.lstr import LstrConfig, normalise
-from tflane_jax.scene import LaneCurvePrediction, RoadImage
+from tflane_jax.scene import LaneShapePrediction, RoadImage
 from tflane_jax.training.task import STATISTICS, Params, split_statistics
 
 
 @dataclass(frozen=True)
-class LaneCurveTask:
+class LaneShapeTask:
     """A network of the LSTR family; hashable, so that jit takes it as a static argument.
 
     Attributes:
@@ -26,7 +26,7 @@ class LaneCurveTask:
     """
 
     model: LstrConfig = LstrConfig()
-    losses: LaneCurveLossConfig = LaneCurveLossConfig()
+    losses: LaneShapeLossConfig = LaneShapeLossConfig()
 
     def init(self, key: jax.Array, example: RoadImage) -> Params:
         """Return fresh parameters; `example` gives shapes only."""
@@ -49,14 +49,14 @@ class LaneCurveTask:
         images = normalise(batch.image, batch.image_valid)
         train = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
         prediction, auxiliary, updated = train(images, batch.image_valid, keys)
-        targets = lane_curve_targets(batch.lines, shared_horizon=self.losses.shared_horizon)
-        loss, terms = lane_curve_loss(prediction, targets, self.losses)
+        targets = lane_shape_targets(batch.lines, shared_horizon=self.losses.shared_horizon)
+        loss, terms = lane_shape_loss(prediction, targets, self.losses)
         if self.model.cells:
             terms["cells"] = self.losses.cell_weight * jax.vmap(cell_loss)(auxiliary["cells"][0], targets).mean()
             loss += terms["cells"]
         return loss, terms | {STATISTICS: updated}
 
-    def predict(self, params: Params, example: RoadImage) -> LaneCurvePrediction:
+    def predict(self, params: Params, example: RoadImage) -> LaneShapePrediction:
         """Return the last decoder layer's answer for one example; its lines are not looked at."""
         learned, statistics = split_statistics(params)
         image = normalise(example.image, example.image_valid)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.config import LaneCurveSource, RunConfig
+from tflane_jax.config import LaneShapeSource, RunConfig
 from tflane_jax.datasets.augmentation import augment
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
@@ -22,12 +22,12 @@ from tflane_jax.datasets.tusimple import load_road_images as load_tusimple
 from tflane_jax.evaluation.evaluate import predict_batch, predictions
 from tflane_jax.files.images import HEIGHT as INPUT_HEIGHT
 from tflane_jax.files.images import WIDTH as INPUT_WIDTH
-from tflane_jax.losses.lane_shape import lane_curve_loss, lane_curve_targets
+from tflane_jax.losses.lane_shape import lane_shape_loss, lane_shape_targets
 from tflane_jax.metrics import image_lanes
 from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
-from tflane_jax.scene import LaneCurvePrediction, LaneLines, RoadImage, shapes_of, stack_examples
+from tflane_jax.scene import LaneLines, LaneShapePrediction, RoadImage, shapes_of, stack_examples
 from tflane_jax.tasks.base import Evaluation, Model, spread
-from tflane_jax.tasks.lane_shape import LaneCurveTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.batches import Prepare
 from tflane_jax.training.loop import Draw
 from tflane_jax.training.records import Record
@@ -61,14 +61,14 @@ class LabelledImages:
     truth: tuple[RowLanes, ...]
 
 
-class LaneCurveSystem:
+class LaneShapeSystem:
     """See `tasks.base.System`."""
 
     columns: tuple[str, ...] = ("seed", "Accuracy", "FP", "FN", "loss", "frames")
     compared: tuple[str, ...] = ("all/Accuracy", "all/FP", "all/FN")
     errors: tuple[str, ...] = ("all/FP", "all/FN")
 
-    def load(self, source: LaneCurveSource, *, progress: bool = True) -> LabelledImages:
+    def load(self, source: LaneShapeSource, *, progress: bool = True) -> LabelledImages:
         """Return the images of a source, stacked, with their labels."""
         if isinstance(source, FrontViewConfig):
             images = load_front_views(source, progress=progress)
@@ -151,7 +151,7 @@ class LaneCurveSystem:
         ]
 
     def draw_comparison(
-        self, models: Mapping[str, Model], source: LaneCurveSource, data: LabelledImages, path: Path
+        self, models: Mapping[str, Model], source: LaneShapeSource, data: LabelledImages, path: Path
     ) -> Path:
         """Draw a few test images, every model beside the truth."""
         from tflane_jax.plots.images import save_road_images
@@ -162,12 +162,12 @@ class LaneCurveSystem:
         return save_road_images(path, examples, answers)
 
 
-def open_images(source: LaneCurveSource) -> FrontViewDataset | TuSimpleDataset:
+def open_images(source: LaneShapeSource) -> FrontViewDataset | TuSimpleDataset:
     """Return the images of a source one by one."""
     return FrontViewDataset(source) if isinstance(source, FrontViewConfig) else TuSimpleDataset(source)
 
 
-def found_lanes(prediction: LaneCurvePrediction, truth: RowLanes) -> RowLanes:
+def found_lanes(prediction: LaneShapePrediction, truth: RowLanes) -> RowLanes:
     """Return the lanes of one prediction at the rows of the truth."""
     assert truth.rows is not None, "labels have rows"
     return image_lanes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
@@ -185,7 +185,7 @@ def name_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> str:
     return dataset.raw_file(index) if isinstance(dataset, TuSimpleDataset) else dataset.info(index).scene
 
 
-def predict(task: Any, params: Params, examples: RoadImage) -> LaneCurvePrediction:
+def predict(task: Any, params: Params, examples: RoadImage) -> LaneShapePrediction:
     """Return the predictions for stacked images, numpy."""
     ((_, answer),) = predictions(task, params, examples, len(examples.image))
     return answer
@@ -205,7 +205,7 @@ def frames_per_second(model: Model, height: int = INPUT_HEIGHT, width: int = INP
 
 
 @partial(jax.jit, static_argnums=0)
-def _loss(task: LaneCurveTask, answer: LaneCurvePrediction, lines: Any) -> jax.Array:
+def _loss(task: LaneShapeTask, answer: LaneShapePrediction, lines: Any) -> jax.Array:
     one_layer = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], answer)
-    targets = lane_curve_targets(lines, shared_horizon=task.losses.shared_horizon)
-    return lane_curve_loss(one_layer, targets, task.losses)[0]
+    targets = lane_shape_targets(lines, shared_horizon=task.losses.shared_horizon)
+    return lane_shape_loss(one_layer, targets, task.losses)[0]

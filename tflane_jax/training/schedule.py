@@ -39,7 +39,7 @@ class OptimConfig:
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
         weight_decay: on kernels and embeddings only.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam).
-        matrices: how the kernels of dense layers are updated. None of the papers has "muon" (Jordan et al. 2024), whose
+        optimizer: of the kernels of dense layers. None of the papers has "muon" (Jordan et al. 2024), whose
             updates are made orthogonal; what it brings small models stands in docs/cameras.md.
         clip_norm: largest global gradient norm; inf for none.
         b1, b2, eps: of Adam.
@@ -56,7 +56,7 @@ class OptimConfig:
     final_ratio: float = 1e-3
     weight_decay: float = 0.01
     decay: Literal["decoupled", "coupled"] = "decoupled"
-    matrices: Literal["adam", "muon"] = "adam"
+    optimizer: Literal["adam", "muon"] = "adam"
     clip_norm: float = 35.0
     b1: float = 0.9
     b2: float = 0.999
@@ -145,7 +145,7 @@ def _decay_what_learns(rate: float) -> optax.GradientTransformation:
 def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
     """Return Adam, or Muon for matrices beside Adam for the rest."""
     adam = optax.scale_by_adam(b1=config.b1, b2=config.b2, eps=config.eps)
-    if config.matrices == "adam":
+    if config.optimizer == "adam":
         return adam
 
     def labels(params: Params) -> Any:

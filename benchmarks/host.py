@@ -25,8 +25,8 @@ from tflane_jax.datasets.loading import for_training, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.scene import Example
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -52,7 +52,9 @@ def paper_size_tasks() -> dict[str, LaneGraphTask]:
     decoder = LaneDecoderConfig(dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed")
     model = TopoNetConfig(encoder=EvidenceEncoderConfig(dim=64, cell=1), decoder=decoder)
     module = TrafficFlowModuleConfig(width=128, heads=8)
-    with_traffic = dataclasses.replace(model, traffic_flow=TrafficFlowConfig(module=module))
+    with_traffic = dataclasses.replace(
+        model, priors=replace(model.priors, traffic_flow=TrafficFlowConfig(module=module))
+    )
     return {"baseline": LaneGraphTask(model), "+TFM": LaneGraphTask(with_traffic)}
 
 

@@ -30,6 +30,7 @@ from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
@@ -163,19 +164,6 @@ class TuSimpleData:
     def source(self, split: Split) -> TuSimpleConfig:
         """Return the dataset of a split."""
         return TuSimpleConfig(str(self.root), getattr(self, split))
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """Evaluation while training and after it.
-
-    Attributes:
-        batch_size: examples predicted at a time; changes no number.
-        pictures: examples of the validation split that are drawn, spread evenly over it.
-    """
-
-    batch_size: int = 16
-    pictures: int = 4
 
 
 @dataclass(frozen=True)

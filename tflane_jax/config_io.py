@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import importlib
+import pkgutil
 import types
 import typing
 from collections.abc import Iterator
@@ -62,7 +64,27 @@ def from_json(kind: type[T], content: Any) -> T:
     return _dataclass(kind, content, "")
 
 
+def subclasses(kind: type) -> dict[str, type]:
+    """Return the dataclasses that derive from `kind`, by name, with `kind` itself where it stands for something.
+
+    A base class that others fill in (`HostConfig`, `HostLossConfig`) accepts all of them: those of its own package,
+    whose modules are imported to find them, and those of the caller's, as far as they are imported already.
+    """
+    if kind.__module__.startswith("tflane_jax.") and getattr(kind, "open_base", False):
+        package = importlib.import_module(kind.__module__.rpartition(".")[0])
+        for module in pkgutil.iter_modules(package.__path__):
+            importlib.import_module(f"{package.__name__}.{module.name}")
+    found, waiting = {}, [kind]
+    while waiting:
+        each = waiting.pop(0)
+        waiting += each.__subclasses__()
+        found.setdefault(each.__name__, each)
+    return found
+
+
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
+    if isinstance(content, dict) and getattr(kind, "open_base", False):
+        kind = subclasses(kind).get(content.get("class", ""), kind)
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
         raise UserError(f"setting {path or 'at the top'} should be a {kind.__name__}, not {content!r:.80}")
     hints = typing.get_type_hints(kind)
@@ -112,6 +134,8 @@ def choices(config: Any, name: str) -> dict[str, Any]:
     hint = typing.get_type_hints(type(config)).get(field) if dataclasses.is_dataclass(config) else None
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
     named = {kind.__name__: kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
+    if isinstance(hint, type) and getattr(hint, "open_base", False):
+        named = {name: kind for name, kind in subclasses(hint).items() if kind is not hint}
     if named and type(None) in kinds:
         return {"None": type(None), "default": next(iter(named.values())), **named}
     return named

@@ -11,8 +11,10 @@ from pathlib import Path
 
 from tflane_jax.ablations.compare import compare
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
@@ -22,7 +24,7 @@ STEPS = 1400
 
 def configs() -> dict[str, RunConfig]:
     """Return the demo's two configurations: the baseline and the same with traffic flow."""
-    task = LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0))
+    task = LaneGraphTask(losses=TopoNetLossConfig(successor_weight=20.0))
     baseline = RunConfig(
         task=task,
         data=WorldData(train=400, val=10, test=50),
@@ -30,7 +32,7 @@ def configs() -> dict[str, RunConfig]:
         training=TrainingConfig(steps=STEPS, batch_size=4, log_every=25, eval_every=STEPS // 2, checkpoint_every=350),
         evaluation=EvaluationConfig(pictures=2),
     )
-    with_traffic = LaneGraphTask(replace(TopoNetConfig(), traffic_flow=TrafficFlowConfig()), task.losses)
+    with_traffic = LaneGraphTask(TopoNetConfig(priors=PriorsConfig(traffic_flow=TrafficFlowConfig())), task.losses)
     return {"baseline": baseline, "+TFM": replace(baseline, task=with_traffic)}
 
 

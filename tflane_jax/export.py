@@ -20,9 +20,9 @@ from jax import export
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.errors import UserError
+from tflane_jax.models.parameters import Params
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
-from tflane_jax.training.task import Params
 
 PLATFORMS = ("cpu", "cuda")
 Answer = dict[str, Float[Array, "b q c"]]

@@ -5,6 +5,7 @@ This is the Python side of `tflane train`, `eval` and `predict`; notebooks and t
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ import numpy as np
 from tflane_jax.config import RunConfig, Source
 from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.errors import UserError
-from tflane_jax.tasks import system_of
+from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
@@ -26,7 +27,6 @@ from tflane_jax.training.records import Record
 from tflane_jax.training.run_folder import Start, check_start, claimed, read_config, write_json, write_text
 from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.training.state import TrainState, per_seed
-from tflane_jax.training.task import Params, split_statistics
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     Raises UserError as `training.loop.train` and the datasets do.
     """
     check_start(folder, start)  # before data is made, which may take long
-    system = system_of(config)
-    data = system.load(config.data.source("train"), progress=progress)
-    system.check(config, data)
-    arrays = system.examples(config, data)
-    validation = system.load(config.data.source("val"), progress=progress)
+    task = config.task
+    data: Any = task.load(config.data.source("train"), progress=progress)
+    task.check(config.data, data)
+    arrays = task.examples(data)
+    validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:
-        return system.evaluate(config.task, params, validation, config.evaluation.batch_size).scores()
+        return task.evaluate(params, validation, config.evaluation).scores()
 
     return train(
         config.task,
@@ -70,7 +70,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         resolved=to_json(config),
         resolved_text=to_text(config),
         start=start,
-        prepare=system.prepare(config),
+        prepare=task.prepare(config.data),
         evaluate=evaluate,
         draw=_drawing(config),
         progress=progress,
@@ -152,9 +152,9 @@ def evaluate_run(
         The metric's protocol with its version, and rows for a table: one per group and seed; with several seeds,
         their means and standard deviations (n - 1) follow.
     """
-    system, task = system_of(run.config), run.config.task if task is None else task
-    arrays = system.load(source, progress=progress)
-    every = [system.evaluate(task, params, arrays, run.config.evaluation.batch_size) for params in run.params]
+    task = run.config.task if task is None else task
+    arrays = task.load(source, progress=progress)
+    every = [task.evaluate(params, arrays, run.config.evaluation) for params in run.params]
     seeds = run.config.training.seeds
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:
@@ -164,8 +164,18 @@ def evaluate_run(
             table = {name: np.array([one[name] for one in values]) for name in values[0]}
             rows.append({"lanes of": group, "seed": "mean"} | {k: float(v.mean()) for k, v in table.items()})
             rows.append({"lanes of": group, "seed": "std"} | {k: float(v.std(ddof=1)) for k, v in table.items()})
-    columns = system.columns
+    columns = task.columns
     return every[0].protocol, [{name: row[name] for name in columns if name in row} for row in rows]
+
+
+def load_test_data(config: RunConfig) -> Any:
+    """Return the examples of a configuration's test split; the last ones asked for stay in memory."""
+    return _loaded(config.data.source("test"), config.task)
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(source: Any, task: Any) -> Any:
+    return task.load(source)
 
 
 def _drawing(config: RunConfig) -> Draw | None:
@@ -175,10 +185,10 @@ def _drawing(config: RunConfig) -> Draw | None:
         return None
     from tflane_jax.plots import save_curves
 
-    draw_examples = system_of(config).drawing(config)
+    draw_examples = config.task.drawing(config.data, config.evaluation)
 
     def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
         save_curves(folder / "curves.png", records)
-        draw_examples(folder, step, params, records)
+        draw_examples(folder, step, params)
 
     return draw

@@ -9,7 +9,7 @@ Ten minutes on one core. Test split, five seeds: all/DET_l 9.4 +- 1.9 percent, o
 from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -23,7 +23,7 @@ def get_config() -> RunConfig:
     is a mean over all pairs of queries.
     """
     return RunConfig(
-        task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
+        task=LaneGraphTask(losses=TopoNetLossConfig(successor_weight=20.0)),
         data=WorldData(train=1000, val=25, test=150),
         optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),

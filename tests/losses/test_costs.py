@@ -9,10 +9,10 @@ import pytest
 from tests.golden import assert_gradients_close, case_id, golden_modules, load_module_case
 from tflane_jax.layers.positions import inverse_sigmoid
 from tflane_jax.losses.costs import focal_cost, generalised_iou, pairwise_l1
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, matching_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig, matching_cost
 from tflane_jax.losses.traffic_elements import ElementLossConfig, element_cost
 from tflane_jax.matching import match
-from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
+from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph, TrafficElements
 
 
 @pytest.mark.golden
@@ -79,7 +79,7 @@ def test_focal_loss(path):
 def test_lane_assignment(path):
     case = load_module_case(path)
     queries, lanes = len(case.inputs["lane_pred"]), len(case.inputs["gt_lanes"])
-    prediction = LanePrediction(
+    prediction = CenterlinePrediction(
         points=jnp.asarray(case.inputs["lane_pred"]).reshape(1, queries, -1, 3),
         logits=jnp.asarray(case.inputs["cls_pred"])[None],
         successor_logits=jnp.zeros((1, queries, queries)),
@@ -87,7 +87,7 @@ def test_lane_assignment(path):
     truth = LaneGraph.empty(lanes, 11).replace(
         points=case.inputs["gt_lanes"].reshape(lanes, -1, 3), valid=np.ones(lanes, bool)
     )
-    cost = matching_cost(prediction, truth, LaneGraphLossConfig())[0]
+    cost = matching_cost(prediction, truth, TopoNetLossConfig())[0]
     np.testing.assert_allclose(cost, case.outputs["cost"], rtol=1e-4, atol=1e-4)
     assigned = np.zeros(queries, int)
     assigned[np.asarray(match(cost, truth.valid).query)] = np.arange(lanes) + 1

@@ -10,7 +10,7 @@ from tests.golden import case_id, golden_modules, load_module_case
 from tests.models.golden_lanes import bev_maps, check, check_matching, decoder_config, layers_first, queries_of, truth
 from tests.parameters import random_params
 from tflane_jax.convert.toponet import baseline_lane_params
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_losses, matching_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig, lane_losses, matching_cost
 from tflane_jax.matching import match
 from tflane_jax.models.bevformer_detr import BevFormerDetr, BevFormerDetrConfig
 
@@ -19,7 +19,7 @@ from tflane_jax.models.bevformer_detr import BevFormerDetr, BevFormerDetrConfig
 @pytest.mark.parametrize("path", golden_modules("olv2_lc_head*"), ids=case_id)
 def test_lane_head_matches_the_reference(path):
     case = load_module_case(path)
-    sizes, weights = case.meta["config"], LaneGraphLossConfig(points_weight=0.0075)
+    sizes, weights = case.meta["config"], TopoNetLossConfig(points_weight=0.0075)
     module = BevFormerDetr(BevFormerDetrConfig(decoder=decoder_config(sizes, sizes["npts"])))
     lanes = truth(case, sizes["npts"])
     # The fixture has no relationship heads; ours get some, which nothing else depends on.
@@ -35,7 +35,7 @@ def test_lane_head_matches_the_reference(path):
             prediction, state = module.apply(
                 {"params": params}, bev, method=BevFormerDetr.decode, mutable=["intermediates"]
             )
-            return prediction.lanes, queries_of(state)
+            return prediction.centerlines, queries_of(state)
 
         found, queries = jax.vmap(one)(bev_maps(case, inputs["bev_feats"]))
         cost = jax.vmap(lambda p, g: matching_cost(p, g, weights))(found, lanes)

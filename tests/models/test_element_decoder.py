@@ -15,7 +15,7 @@ from tests.golden import (
 )
 from tests.parameters import random_params
 from tflane_jax.convert.toponet import element_decoder_params
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, element_losses
+from tflane_jax.losses.toponet import TopoNetLossConfig, element_losses
 from tflane_jax.losses.traffic_elements import element_cost
 from tflane_jax.matching import match
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig
@@ -52,7 +52,7 @@ def test_matches_the_reference(path):
     padded = tuple(int(n) for n in case.inputs["batch_hw"])
     sizes = case.inputs["img_hw"][:, ::-1].astype(np.int32)
     elements = stack_examples([reference_truth(case, image) for image in range(len(sizes))])
-    weights = LaneGraphLossConfig()
+    weights = TopoNetLossConfig()
     features = {name: case.inputs[name] for name in sorted(case.inputs) if name.startswith("feat")}
 
     def outputs(torch_params, features):

@@ -33,7 +33,7 @@ from tflane_jax.matching import match
 from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig, normalise
-from tflane_jax.scene import LaneShapePrediction, stack_examples
+from tflane_jax.scene import CurvePrediction, stack_examples
 
 PUBLISHED = LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))
 pytestmark = pytest.mark.golden
@@ -154,7 +154,7 @@ def test_costs_assignments_and_losses_match_the_reference(path):
     config = LaneShapeLossConfig(weights["ce"], weights["curves"], weights["lowers"], shared_horizon=False)
     targets = stacked_targets([case.inputs[f"targets.{b}"] for b in range(len(case.meta["counts"]))])
     layers = ("aux0", "main")
-    prediction = LaneShapePrediction(
+    prediction = CurvePrediction(
         *(jnp.stack([case.inputs[f"{layer}.pred_{part}"] for layer in layers], 1) for part in ("logits", "curves"))
     )
     lane_weight = lane_weights(targets, targets.valid)
@@ -221,7 +221,7 @@ def test_the_ten_real_frames_give_the_originals_points():
     metrics = TuSimpleMetrics()
     for i in range(len(dataset)):
         ours = jax.tree.map(lambda leaf, i=i: leaf[i, -1], prediction)
-        theirs = LaneShapePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
+        theirs = CurvePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
         truth = dataset.truth(i)
         found, expected = (row_lanes(one, truth.rows, height=720, width=1280) for one in (ours, theirs))
         np.testing.assert_array_equal(found.x == -2, expected.x == -2)

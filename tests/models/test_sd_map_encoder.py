@@ -88,7 +88,7 @@ def golden_module_config(config):
 def test_map_encoder_matches_the_reference(path):
     case = load_module_case(path)
     config = golden_module_config(case.meta["config"])
-    encoder, capacity = SdMapEncoder(config), 9
+    encoder, capacity = SdMapEncoder(config, RANGE), 9
     categories = [case.inputs[f"onehot.{i}"].argmax(-1) for i in range(2)]
 
     def scalar(torch_params, arrays):
@@ -218,6 +218,8 @@ def test_constructer_matches_the_reference(path):
     assert [row["tensor"] for row in converted.table] == list(case.params)
 
 
+RANGE = BevGrid().range
+NO_MAP = SdMap.empty(1, 11)
 MODULE = SdMapModuleConfig(lines=PolylineEncoderConfig(8, 1, 2, 8, 0.0, 4), heads=2)
 VALID = np.array([True, False, True])
 
@@ -234,8 +236,8 @@ def small_map(valid=VALID, filler=0.0):
 @pytest.mark.parametrize("attend", ["lines", "points"])
 def test_padding_changes_nothing_and_lines_have_no_order(attend):
     config = replace(MODULE, lines=replace(MODULE.lines, attend=attend, layout="interleaved"))
-    encoder = SdMapEncoder(config)
-    params = random_params(encoder.init, None)
+    encoder = SdMapEncoder(config, RANGE)
+    params = random_params(encoder.init, NO_MAP)
 
     @jax.jit
     def run(sd_map):
@@ -308,7 +310,7 @@ class Fused(nn.Module):
 
     @nn.compact
     def __call__(self, sd_map, *inputs):
-        tokens, valid = SdMapEncoder(MODULE, name="sd_map")(sd_map)
+        tokens, valid = SdMapEncoder(MODULE, RANGE, name="sd_map")(sd_map)
         return self.encoder(*inputs, fuse=fused_with(MODULE, tokens, valid) if self.fuses else None)
 
 
@@ -358,7 +360,7 @@ def test_encoders_fuse_the_map_in_every_layer(make, layers):
 def test_paper_size_has_the_published_parameters():
     module = SdMapModuleConfig()
     tokens, valid = jnp.zeros((2, 256)), jnp.ones(2, bool)
-    encoder = jax.eval_shape(SdMapEncoder(module).init, jax.random.key(0), None)
+    encoder = jax.eval_shape(SdMapEncoder(module, RANGE).init, jax.random.key(0), NO_MAP)
     assert sum(leaf.size for leaf in jax.tree.leaves(encoder)) == 2_467_072
     config = BevFormerConfig(grid=BevGrid(), levels=1, cameras=2)
     views = jax.tree.map(jnp.asarray, ring(2, (32, 32)))
@@ -372,13 +374,12 @@ def test_paper_size_has_the_published_parameters():
 
 
 def test_a_map_is_where_its_coordinates_are():
-    """The same road seen from two places is the same road: normalised by the range of the prior."""
+    """The same road seen from two places is the same road: normalised by the range of the host."""
     wide = PerceptionRange((-20.0, 20.0), (-10.0, 10.0))
-    prior = SdMapPriorConfig(range=wide)
-    encoder = SdMapEncoder(replace(MODULE, prior=prior))
-    params = random_params(encoder.init, None)
+    encoder = SdMapEncoder(MODULE, wide)
+    params = random_params(encoder.init, NO_MAP)
     half = small_map()
-    double = replace(MODULE, prior=SdMapPriorConfig(range=PerceptionRange((-40.0, 40.0), (-20.0, 20.0))))
+    double = SdMapEncoder(MODULE, PerceptionRange((-40.0, 40.0), (-20.0, 20.0)))
     tokens, _ = jax.jit(encoder.apply)(params, half)
-    scaled, _ = jax.jit(SdMapEncoder(double).apply)(params, half.replace(points=2 * half.points))
+    scaled, _ = jax.jit(double.apply)(params, half.replace(points=2 * half.points))
     np.testing.assert_allclose(tokens, scaled, atol=1e-5)

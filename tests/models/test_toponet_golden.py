@@ -16,7 +16,7 @@ from tests.models.golden_lanes import (
     truth,
 )
 from tflane_jax.convert.toponet import toponet_lane_params
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, element_lane_loss, lane_losses, matching_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig, element_lane_loss, lane_losses, matching_cost
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.toponet import TopoNet, TopoNetConfig
@@ -42,7 +42,7 @@ def element_truth(case, lanes, capacity=3):
 @pytest.mark.parametrize("path", golden_modules("toponet_head*"), ids=case_id)
 def test_lane_head_matches_the_reference(path):
     case = load_module_case(path)
-    sizes, weights = case.meta["config"], LaneGraphLossConfig()
+    sizes, weights = case.meta["config"], TopoNetLossConfig()
     decoder = decoder_config(sizes, sizes["n_points"])
     module = TopoNet(TopoNetConfig(decoder=decoder))
     lanes = truth(case, sizes["n_points"])
@@ -63,15 +63,15 @@ def test_lane_head_matches_the_reference(path):
         prediction, queries = jax.vmap(one, in_axes=(0, 1, 1))(
             bev_maps(case, inputs["bev_feats"]), inputs["te_feats"], logits
         )
-        cost = jax.vmap(lambda p, g: matching_cost(p, g, weights))(prediction.lanes, lanes)
+        cost = jax.vmap(lambda p, g: matching_cost(p, g, weights))(prediction.centerlines, lanes)
         assignment = match(cost, lanes.valid[:, None])
-        terms = lane_losses(prediction.lanes, assignment, lanes, weights)
+        terms = lane_losses(prediction.centerlines, assignment, lanes, weights)
         terms["lcte"] = element_lane_loss(prediction.elements, assignment, found, lanes, elements, weights)
         out = layers_first(
             {
-                "all_cls_scores": prediction.lanes.logits,
-                "all_lanes_preds": prediction.lanes.points,
-                "all_lclc_preds": prediction.lanes.successor_logits[..., None],
+                "all_cls_scores": prediction.centerlines.logits,
+                "all_lanes_preds": prediction.centerlines.points,
+                "all_lclc_preds": prediction.centerlines.successor_logits[..., None],
                 "all_lcte_preds": prediction.elements.lane_logits[..., None],
                 "history_states": queries,
             }
@@ -86,9 +86,9 @@ def test_lane_head_matches_the_reference(path):
     for image in range(len(lanes.valid)):
         answer = jax.tree.map(lambda leaf, i=image: leaf[i, -1], prediction)
         decoded = {
-            "lanes": answer.lanes.points.reshape(sizes["num_query"], -1),
-            "scores": answer.lanes.scores,
-            "lclc": jax.nn.sigmoid(answer.lanes.successor_logits),
+            "lanes": answer.centerlines.points.reshape(sizes["num_query"], -1),
+            "scores": answer.centerlines.scores,
+            "lclc": jax.nn.sigmoid(answer.centerlines.successor_logits),
             "lcte": jax.nn.sigmoid(answer.elements.lane_logits),
         }
         expected = {name: case.outputs[f"decoded.{image}.{name}"] for name in decoded}

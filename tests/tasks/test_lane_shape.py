@@ -10,6 +10,7 @@ import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
 from tests.parameters import random_params
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneShapeHeads, nearest, normalise, shrink
@@ -17,7 +18,6 @@ from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
-from tflane_jax.training.task import STATISTICS
 
 ENCODERS = {
     "transformer": None,

@@ -24,8 +24,8 @@ from tflane_jax.ablations.comparison import Variant, compact, summarise
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.runs import open_run, train_run
-from tflane_jax.tasks import Model, System, load_test_data, system_of
+from tflane_jax.runs import load_test_data, open_run, train_run
+from tflane_jax.tasks import Model, Task
 from tflane_jax.training.run_folder import write_json
 from tflane_jax.training.runtime import configure_jax
 
@@ -67,7 +67,7 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
         UserError: the configurations do not test on the same examples, or a training failed.
     """
     first = next(iter(configs.values()))
-    source, system = first.data.source("test"), system_of(first)
+    source, task = first.data.source("test"), first.task
     if any(config.data.source("test") != source for config in configs.values()):
         raise UserError("the configurations have different test data (data.test): their numbers cannot be compared")
     plan = {
@@ -79,7 +79,7 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
     }
     # Before any worker starts, so that nobody builds the same data twice.
     for each in {config.data.source(split) for config in configs.values() for split in ("train", "val", "test")}:
-        system.load(each)
+        task.load(each)
     # Seed by seed, so that a comparison stopped early has pairs.
     train_all([plan[name][i] for i in range(len(seeds)) for name in plan], jobs)
 
@@ -96,12 +96,12 @@ def compare(configs: dict[str, RunConfig], seeds: Sequence[int], out: Path, *, j
                 measured.setdefault(f"{name}, {way}" if way else name, []).append(scores)
         run = open_run(trainings[0].folder, "last")
         models[name] = Model(run.config.task, run.params[0])
-        remarks[name] = system.remarks(models[name])
+        remarks[name] = run.config.task.remarks(run.params[0])
         variants += [Variant(way, tuple(scores)) for way, scores in measured.items()]
     picture = None
     if importlib.util.find_spec("matplotlib") is not None:
-        picture = system.draw_comparison(models, source, load_test_data(first), out / "comparison.png")
-    return _report(system, variants, remarks, protocol, out, picture, seeds)
+        picture = task.draw_comparison(models, source, load_test_data(first), out / "comparison.png")
+    return _report(task, variants, remarks, protocol, out, picture, seeds)
 
 
 def _measured(job: Job) -> dict[str, Any]:
@@ -114,9 +114,9 @@ def _measured(job: Job) -> dict[str, Any]:
         if kept["of"] == of:
             return kept
     run = open_run(job.folder, "last")
-    system, task, params = system_of(job.config), run.config.task, run.params[0]
-    data, ways = load_test_data(job.config), {"": task} | system.inference_variants(task)
-    every = {way: system.evaluate(used, params, data, run.config.evaluation.batch_size) for way, used in ways.items()}
+    task, params = run.config.task, run.params[0]
+    data, ways = load_test_data(job.config), {"": task} | task.inference_variants()
+    every = {way: used.evaluate(params, data, run.config.evaluation) for way, used in ways.items()}
     found = {"of": of, "protocol": every[""].protocol, "ways": {way: one.scores() for way, one in every.items()}}
     write_json(path, found)
     return found
@@ -227,7 +227,7 @@ def _step(folder: Path) -> int:
 
 
 def _report(
-    system: System,
+    task: Task,
     variants: list[Variant],
     remarks: dict[str, dict[str, str]],
     protocol: str,
@@ -238,13 +238,13 @@ def _report(
     """Print the tables and save them beside the pictures."""
     title = f"{protocol}, test split, {len(seeds)} seed{'s' if len(seeds) > 1 else ''}, percent (mean ± std)"
     every = [scores for variant in variants for scores in variant.scores]
-    metrics = [name for name in system.compared if all(name in scores for scores in every)]
-    rows = [row | remarks.get(row["model"], {}) for row in compact(variants, metrics)] + system.quoted()
+    metrics = [name for name in task.compared if all(name in scores for scores in every)]
+    rows = [row | remarks.get(row["model"], {}) for row in compact(variants, metrics)] + task.quoted()
     print("\n" + format_table(rows, title=title))
     markdown, _ = save_table(out / "table", rows, {"protocol": protocol, "seeds": list(seeds)}, title=title)
     written = [markdown]
     if len(seeds) > 1:
-        rows = summarise(variants, metrics, system.errors)
+        rows = summarise(variants, metrics, task.errors)
         title = f"{protocol}: paired differences to {variants[0].name}, two-sided t-test over {len(seeds)} seeds"
         print("\n" + format_table(rows, title=title, digits=4))
         written.append(save_table(out / "paired", rows, {"protocol": protocol}, title=title, digits=4)[0])

@@ -12,8 +12,7 @@ from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.config import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.runs import Run, open_run
-from tflane_jax.tasks import load_test_data, system_of
+from tflane_jax.runs import Run, load_test_data, open_run
 
 
 def sweep(
@@ -54,9 +53,9 @@ def sweep(
                 for run in trained:
                     bar.set_description(f"{setting} = {value}: {name}")
                     changed = apply_overrides(run.config, [f"--{setting}", value, *overrides])
-                    system, data, size = system_of(changed), load_test_data(changed), changed.evaluation.batch_size
+                    task, data = run.config.task, load_test_data(changed)
                     for params in run.params:
-                        evaluation = system.evaluate(run.config.task, params, data, size)
+                        evaluation = task.evaluate(params, data, changed.evaluation)
                         found.append(evaluation.scores())
                     protocol = evaluation.protocol
                     bar.update()
@@ -65,7 +64,7 @@ def sweep(
     known = [name for name in every[0] if all(name in each for each in every)]
     if unknown := set(metrics or ()) - set(known):
         raise UserError(f"no metric {min(unknown)}, only {', '.join(known)}")
-    metrics = metrics or [name for name in system.compared if name in known]
+    metrics = metrics or [name for name in task.compared if name in known]
     rows = []
     for i, value in enumerate(values):
         variants = [Variant(name, tuple(by_value[i])) for name, by_value in scores.items()]

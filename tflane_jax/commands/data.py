@@ -11,6 +11,7 @@ import numpy as np
 from tflane_jax.commands.sources import lane_graph_source, lane_shape_source, source_name
 from tflane_jax.config import FrontViewData, LaneShapeSource, RunConfig, apply_overrides, load_config
 from tflane_jax.datasets.argoverse2 import check_log, find_logs, load_log
+from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
 from tflane_jax.datasets.openlane_check import check_openlane_v2
@@ -19,11 +20,9 @@ from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.errors import UserError
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.scene import stack_examples
-from tflane_jax.tasks import spread, system_of
-from tflane_jax.tasks.lane_graph_system import open_dataset
-from tflane_jax.tasks.lane_shape import LaneShapeTask
-from tflane_jax.tasks.lane_shape_system import open_images
-from tflane_jax.training.batches import prepared
+from tflane_jax.tasks import spread
+from tflane_jax.tasks.lane_graph import open_dataset
+from tflane_jax.tasks.lane_shape import LaneShapeTask, open_images
 
 _FAULTS = 50  # printed
 
@@ -63,7 +62,7 @@ def _show_images(source: LaneShapeSource, config: RunConfig, options: argparse.N
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
     columns = {"images": examples}
-    if (prepare := system_of(config).prepare(config)) is not None:
+    if (prepare := config.task.prepare(config.data)) is not None:
         columns["augmented"] = prepared(examples, prepare, 0, 0)
     for name, shown in columns.items():
         path = options.out if name == "images" else options.out.with_stem(f"{options.out.stem}-{name}")

@@ -11,7 +11,7 @@ from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
-from tflane_jax.tasks.lane_graph_system import open_dataset
+from tflane_jax.tasks.lane_graph import open_dataset
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:

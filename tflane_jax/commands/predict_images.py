@@ -30,7 +30,7 @@ from tflane_jax.plots.images import predicted_lines, save_photo, save_road_image
 from tflane_jax.runs import Run
 from tflane_jax.scene import LaneLines, RoadImage, stack_examples
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_shape_system import found_lanes, name_of, open_images, predict, truth_of
+from tflane_jax.tasks.lane_shape import found_lanes, name_of, open_images, predict_curves, truth_of
 from tflane_jax.training.run_folder import write_json, write_text
 
 
@@ -45,7 +45,7 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
         fitted = fit_photo(photo, camera)
         example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
-        answer = jax.tree.map(lambda leaf: leaf[0], predict(trained.config.task, trained.params[0], stacked))
+        answer = jax.tree.map(lambda leaf: leaf[0], predict_curves(trained.config.task, trained.params[0], stacked))
         lanes = fitted.placement.to_photo(predicted_lines(answer))
         # A lane goes on beyond the picture's edge; what lies outside it is neither drawn nor written.
         inside = [_inside(lane, photo.shape) for lane in lanes]
@@ -73,7 +73,7 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
-    answers = predict(trained.config.task, trained.params[0], examples)
+    answers = predict_curves(trained.config.task, trained.params[0], examples)
     make_folder(options.out)
     predictions, truths = [], []
     for i, index in enumerate(indices):

@@ -31,10 +31,11 @@ from scipy.special import expit
 from tflane_jax.commands.sources import lane_graph_source, limited_task, make_folder
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_graph_system import open_dataset, predict_examples, titles
+from tflane_jax.tasks.lane_graph import open_dataset, titles
 from tflane_jax.training.run_folder import write_json
 
 _RELATION_THRESHOLD = 0.5
@@ -48,7 +49,8 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
     indices = spread(len(dataset), options.count)
-    examples, lanes, elements = predict_examples(task, trained.params[0], dataset, indices)
+    examples, answer = predict_examples(task, trained.params[0], dataset, indices)
+    lanes, elements = answer.centerlines, answer.elements
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
     successor = expit(lanes.successor_logits)

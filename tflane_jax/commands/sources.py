@@ -17,8 +17,7 @@ from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, open_run, open_weights
-from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.tasks.lane_graph_system import limit_instances
+from tflane_jax.tasks.lane_graph import LaneGraphTask, limit_instances
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.world.cameras.ring import CameraRigConfig
 

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from tflane_jax.convert.renaming import Converted, below, check_fits, convert, renamed_params
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.models.lstr import LstrConfig
-from tflane_jax.training.task import STATISTICS, Params
+from tflane_jax.models.parameters import Params
 
 RESNET = (
     (r"(conv\d)\.weight", r"\1/kernel", "conv"),

@@ -20,11 +20,12 @@ from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, conv
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.parameters import Params
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import CameraViews, Example
-from tflane_jax.training.task import STATISTICS, Params
 
 _DEFORMABLE = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
 _ATTENTION = (

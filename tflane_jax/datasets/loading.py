@@ -1,6 +1,6 @@
 """Datasets as arrays in memory: one stacked `Example` with a leading axis.
 
-The arrays are numpy and stay on the host (`training.batches` gathers from them). Parts that a model does not look at
+The arrays are numpy and stay on the host (`datasets.batches` gathers from them). Parts that a model does not look at
 need not be read at all.
 """
 

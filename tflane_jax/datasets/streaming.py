@@ -1,6 +1,6 @@
 """Datasets too large for memory: examples are loaded by workers shortly before they are needed, with grain.
 
-Which example comes when is decided by whoever asks (`training.batches`: by seed and step alone), so that neither the
+Which example comes when is decided by whoever asks (`datasets.batches`: by seed and step alone), so that neither the
 number of workers nor a stop in between changes anything, and the position is the step that the checkpoint holds.
 """
 

@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.distances import pad_lines
-from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
+from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph, TrafficElements
 
 Lines = Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"]
 
@@ -105,7 +105,9 @@ def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None
     )
 
 
-def detections_from_prediction(prediction: LanePrediction, elements: ElementPrediction | None = None) -> LaneDetections:
+def detections_from_prediction(
+    prediction: CenterlinePrediction, elements: ElementPrediction | None = None
+) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
     No score threshold; a traffic element is of the attribute that its query finds likeliest.

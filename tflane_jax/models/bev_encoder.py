@@ -21,11 +21,7 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
-
-# What priors add to the BEV features of a layer: (number of the layer, places (q, 2) of the cells in [0, 1], features
-# (q, c), their position encodings (q, c)) -> features.
-# Modules that it uses are made inside it, so that their parameters stand below the layer that calls it.
-Fuse = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
+from tflane_jax.models.prior import BevHook
 
 
 @dataclass(frozen=True)
@@ -121,7 +117,7 @@ class BevEncoder(nn.Module):
         history: BevMemory,
         shift: Float[Array, "2"],
         deterministic: bool,
-        fuse: Fuse | None = None,
+        fuse: BevHook | None = None,
     ) -> Float[Array, "q c"]:
         """Return the encoded queries; see `BevFormer.encode` and the attentions for the arguments."""
         config, initial = self.config, queries

@@ -22,7 +22,8 @@ from tflane_jax.geometry.pillars import pillar_points, project_pillars
 from tflane_jax.geometry.poses import pose_yaw
 from tflane_jax.layers.bev_alignment import ego_shift, rotate_nearest, vehicle_center, warp
 from tflane_jax.layers.positions import LearnedImageEncoding
-from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory, Fuse
+from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory
+from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import CameraViews
 
 # Length of the reference's vector of vehicle motion (the "CAN bus").
@@ -42,7 +43,7 @@ class BevFormer(nn.Module):
         previous_from_ego: Float[Array, "4 4"],
         *,
         deterministic: bool = True,
-        fuse: Fuse | None = None,
+        fuse: BevHook | None = None,
     ) -> Float[Array, "h w c"]:
         """Return the BEV features.
 
@@ -73,7 +74,7 @@ class BevFormer(nn.Module):
         motion: Float[Array, " m"],
         *,
         deterministic: bool = True,
-        fuse: Fuse | None = None,
+        fuse: BevHook | None = None,
     ) -> Float[Array, "h w c"]:
         """Return the BEV features from a memory that has been aligned (`align`) and a vector of vehicle motion."""
         config, grid = self.config, self.config.grid

@@ -12,10 +12,10 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config
 from tflane_jax.training.state import TrainState, per_seed
-from tflane_jax.training.task import Params
 
 
 def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, partly: bool) -> list[Params]:

@@ -18,9 +18,10 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.errors import UserError
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.adaptive import Memory
-from tflane_jax.training.batches import Prepare, batches, first_example
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import starting_params
 from tflane_jax.training.interrupt import StopRequest
@@ -31,7 +32,7 @@ from tflane_jax.training.run_folder import Start, claimed, read_config, write_js
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, per_seed, with_params
 from tflane_jax.training.step import compiled_update
-from tflane_jax.training.task import Params, Task
+from tflane_jax.training.task import Trainable
 
 Evaluate = Callable[[Params], dict[str, float]]
 """Averaged parameters of one seed -> numbers by name."""
@@ -107,7 +108,7 @@ class TrainingResult:
 
 
 def train(
-    task: Task,
+    task: Trainable,
     arrays: Any,
     folder: Path,
     *,
@@ -125,14 +126,14 @@ def train(
 
     Args:
         task: what to train.
-        arrays: training examples, see `training.batches`. Which of them a step sees follows from its number, so that
+        arrays: training examples, see `datasets.batches`. Which of them a step sees follows from its number, so that
             the step in a checkpoint is also the position in the data.
         folder: of the run.
         config, optim: settings.
         resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
         resolved_text: the same for people.
         start: see `run_folder.claimed`.
-        prepare: augments every example, see `training.batches`.
+        prepare: augments every example, see `datasets.batches`.
         evaluate, draw: called at every evaluation.
         progress: show a bar with rate and time left.
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from optax.contrib import muon
 
 from tflane_jax.errors import UserError
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.restarts import (
     Cycle,
     RestartsConfig,
@@ -26,7 +27,6 @@ from tflane_jax.training.restarts import (
     half_cosine,
     relative_rate,
 )
-from tflane_jax.training.task import Params
 
 
 @dataclass(frozen=True)

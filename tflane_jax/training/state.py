@@ -11,8 +11,9 @@ import optax
 from flax import struct
 from jaxtyping import Array, Int
 
+from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.rng import stream
-from tflane_jax.training.task import Params, Task, split_statistics
+from tflane_jax.training.task import Trainable
 
 
 @struct.dataclass
@@ -34,7 +35,7 @@ class TrainState:
     key: jax.Array
 
 
-def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Array, example: Any) -> TrainState:
+def init_state(task: Trainable, optimizer: optax.GradientTransformation, key: jax.Array, example: Any) -> TrainState:
     """Return the state before the first update."""
     params = task.init(stream(key, "params"), example)
     return TrainState(
@@ -46,7 +47,9 @@ def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Arr
     )
 
 
-def init_states(task: Task, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any) -> TrainState:
+def init_states(
+    task: Trainable, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any
+) -> TrainState:
     """Return the state of a run: without a seed axis for one seed, with a leading one for several."""
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
 

@@ -11,16 +11,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
 from tflane_jax.training.state import TrainState
-from tflane_jax.training.task import Params, Task, split_statistics
+from tflane_jax.training.task import Trainable
 
 Metrics = dict[str, jax.Array]
 UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 
 
-def make_update_step(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
+def make_update_step(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
     """Return the jitted update (state, batch) -> (state, metrics); the state that goes in is consumed.
 
     Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group of its own, "matching/lanes",
@@ -32,7 +33,7 @@ def make_update_step(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
 
 
 def make_multi_seed_step(
-    task: Task, optim: OptimConfig, steps: int, *, batch: Literal["shared", "per_seed"]
+    task: Trainable, optim: OptimConfig, steps: int, *, batch: Literal["shared", "per_seed"]
 ) -> UpdateStep:
     """Return the update of several seeds at once: state and metrics have a leading seed axis.
 
@@ -49,7 +50,7 @@ def make_multi_seed_step(
 
 
 def compiled_update(
-    task: Task, optim: OptimConfig, steps: int, seeds: int, state: TrainState, batch: Any
+    task: Trainable, optim: OptimConfig, steps: int, seeds: int, state: TrainState, batch: Any
 ) -> UpdateStep:
     """Return the update of one or several seeds (batches of their own), compiled for these shapes.
 
@@ -60,7 +61,9 @@ def compiled_update(
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(task: Task, optim: OptimConfig, steps: int, seeds: int, tree: Any, types: tuple[Any, ...]) -> UpdateStep:
+def _compiled(
+    task: Trainable, optim: OptimConfig, steps: int, seeds: int, tree: Any, types: tuple[Any, ...]
+) -> UpdateStep:
     if seeds == 1:
         update: Any = make_update_step(task, optim, steps)
     else:
@@ -98,7 +101,7 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
     return checked
 
 
-def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
+def _update(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
     optimizer, rate = make_optimizer(optim, steps), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:

@@ -81,19 +81,19 @@ def is_key(leaf):
 
 
 def test_predicts_one_class_and_one_curve_for_each_query(fitted):
-    answer = fitted.predict(fitted.params, road_image(0))
+    answer = fitted.predict(fitted.params, road_image(0)).curves
     assert answer.logits.shape == (5, 2)
     assert answer.curves.shape == (5, 8)
     # k'', f'', m'' and n' belong to the image.
     assert np.ptp(answer.curves[:, 2:6], axis=0).max() < 1e-6
-    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).logits)
+    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).curves.logits)
 
 
 def test_what_stands_in_padding_changes_nothing(fitted):
     clean, soiled = (padded(road_image(0), fill) for fill in (0, 200))
     answer = fitted.predict(fitted.params, clean)
     jax.tree.map(np.testing.assert_array_equal, answer, fitted.predict(fitted.params, soiled))
-    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(0)).logits)
+    assert not np.array_equal(answer.curves.logits, fitted.predict(fitted.params, road_image(0)).curves.logits)
 
     # The optimiser's first moment is the gradient, scaled.
     (state, metrics), other = (fitted.updated(pair(example)) for example in (clean, soiled))

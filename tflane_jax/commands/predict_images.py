@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from tflane_jax.commands.sources import lane_shape_source, make_folder
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.images import PhotoCamera, fit_photo, list_photos, read_image
 from tflane_jax.metrics import image_lanes
 from tflane_jax.metrics.tusimple import RowLanes
@@ -31,7 +32,6 @@ from tflane_jax.runs import Run
 from tflane_jax.scene import LaneLines, RoadImage, stack_examples
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_shape_system import found_lanes, name_of, open_images, predict, truth_of
-from tflane_jax.training.run_folder import write_json, write_text
 
 
 def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:

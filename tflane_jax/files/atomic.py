@@ -59,7 +59,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
         _delete(temporary)
 
 
-def write_bytes(path: Path | str, content: bytes) -> Path:
+def write_bytes(path: Path | str, content: bytes | bytearray) -> Path:
     """Write a file whole or not at all and return its path; raises UserError as `replacing` does."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)

@@ -11,7 +11,8 @@ from tests.shared import shared_path
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.tusimple import ROWS, TuSimpleConfig, TuSimpleDataset, lane_lines, load_road_images, row_lanes
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 
 ROWS_48 = ROWS[8:]
 

@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float
 from tqdm import tqdm
 
 from tflane_jax.datasets.base import FrameInfo, TruncationWarning
+from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.errors import UserError
-from tflane_jax.files.images import HEIGHT, WIDTH, read_image, resize
-from tflane_jax.metrics.tusimple import RowLanes
+from tflane_jax.files.images import read_image, resize
+from tflane_jax.files.tusimple import RowLanes, read_truth
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.scoring.tusimple import read_truth
 
 ROWS = np.arange(160.0, 720.0, 10.0)
 """Rows of the points of a line (56), pixels of an image `ROWS_HEIGHT` high."""

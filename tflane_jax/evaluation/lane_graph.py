@@ -7,8 +7,8 @@ from typing import Any
 import jax
 
 from tflane_jax.datasets.streaming import Streamed
+from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
-from tflane_jax.metrics.frames import detections_from_prediction, truth_from_example
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Example

@@ -17,17 +17,18 @@ from jaxtyping import Array, Float
 from tflane_jax.datasets.augmentation import augment
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
 from tflane_jax.datasets.front_views import load_road_images as load_front_views
+from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
+from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset, row_lanes
 from tflane_jax.datasets.tusimple import load_road_images as load_tusimple
+from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.predict import predict_batch, predictions
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
-from tflane_jax.files.images import HEIGHT as INPUT_HEIGHT
-from tflane_jax.files.images import WIDTH as INPUT_WIDTH
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig, lane_shape_loss, lane_shape_targets
-from tflane_jax.metrics import image_lanes
-from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.lstr import LstrConfig, normalise
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
@@ -207,7 +208,7 @@ def open_images(source: FrontViewConfig | TuSimpleConfig) -> FrontViewDataset | 
 def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
     """Return the lanes of one prediction at the rows of the truth."""
     assert truth.rows is not None, "labels have rows"
-    return image_lanes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
+    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
 
 
 def truth_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> RowLanes:

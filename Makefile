@@ -1,20 +1,21 @@
-# Everything a fresh machine needs: Python 3.11-3.13 and make.
+# A fresh machine needs Python 3.11 to 3.13 and make.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup demo test test-slow lint bench clean
+.PHONY: help setup demo test test-slow lint same-losses bench clean
 
 help:
-	@echo "make demo       set up, train TF-Lane with and without traffic flow on the built-in world, print the table"
-	@echo "make test       set up, lint, run the tests (what CI runs)"
-	@echo "make test-slow  the checks that take minutes"
-	@echo "make lint       ruff and pyright"
-	@echo "make bench      the benchmarks, as JSON under runs/bench"
+	@echo "make demo         set up, train TF-Lane with and without traffic flow on the built-in world, print the table"
+	@echo "make test         set up, lint, run the tests (what CI runs)"
+	@echo "make test-slow    the tests that take minutes"
+	@echo "make lint         ruff (rules and format) and pyright"
+	@echo "make same-losses  train every configuration in this checkout and in BEFORE=../before, compare bit by bit"
+	@echo "make bench        the benchmarks, as JSON under runs/bench"
 
 # Constraints pin every version; the index is whatever pip is configured with.
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml setup.py constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 13) else "tflane_jax needs Python 3.11 to 3.13; set PYTHON=python3.12, say")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
@@ -22,16 +23,24 @@ $(STAMP): pyproject.toml constraints.txt
 
 setup: $(STAMP)
 
+# pyright needs Node.js; its Python package fetches one where none is installed.
 lint: $(STAMP)
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
-test: $(STAMP)
-	$(BIN)/ruff check .
+test: lint
 	$(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --durations=15
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow --durations=15
+
+# For a change that must not change a number: git worktree add ../before COMMIT, then for example
+# make same-losses BEFORE=../before NAMES="tf_lane camera.toponet" STEPS=20
+BEFORE ?= ../before
+STEPS ?= 50
+same-losses: $(STAMP)
+	$(BIN)/python -m tests.same_losses $(BEFORE) $(NAMES) --steps $(STEPS)
 
 demo: $(STAMP)
 	$(BIN)/tflane demo

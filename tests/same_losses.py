@@ -23,6 +23,8 @@ from tests.test_config import ROOT, shipped
 
 _FEW_SCENES = ["--data.train", "8", "--data.val", "1", "--data.test", "1"]
 _PAPER_SIZE_STEPS = 3
+_TRAIN_LOG = "adcf7d18-0510-35b0-a2fa-b4cea13a6d76"
+_TEST_LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 
 
 def arguments_of(name: str, steps: int, exported: Path) -> list[str]:
@@ -40,9 +42,20 @@ def arguments_of(name: str, steps: int, exported: Path) -> list[str]:
         arguments += ["--training.init_from", "None"]
     if name == "camera.native_ring":
         arguments += ["--data.example.cameras.scale", "0.1"]
-    if name not in ("tf_lane.argoverse2", "gtn_lane.lstr", "gtn_lane.overfit"):
-        arguments += _FEW_SCENES
-    return arguments
+    return arguments + (_real_data(name) or _FEW_SCENES)
+
+
+def _real_data(name: str) -> list[str]:
+    """Return the settings that name the folders of a configuration on real data; none for the built-in world."""
+    data = _shared() / "data"
+    if name in ("gtn_lane.lstr", "gtn_lane.overfit"):
+        return ["--data.root", str(data / "tusimple" / "LaneDetection")]
+    if name == "tf_lane.argoverse2":
+        logs = data / "argoverse2" / "sensor" / "val"
+        train, test = str(logs / _TRAIN_LOG), str(logs / _TEST_LOG)
+        splits = ["--data.train", train, "--data.val", test, "--data.test", test]
+        return [*splits, "--data.openlane", str(data / "openlanev2")]
+    return []
 
 
 def run(checkout: Path, arguments: list[str], log: Path) -> bool:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.shared import ROOT, shared_path
+from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.files.tusimple import read_predictions, read_truth
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
@@ -138,13 +138,17 @@ def test_pictures_of_the_data(trained, config, tmp_path, capsys):
     assert "lane lines" in capsys.readouterr().out
 
 
+def test_weights_need_a_configuration(trained, capsys):
+    assert main(["eval", str(trained), "--weights", "weights.npz"]) == 2
+    assert "add --config FILE" in capsys.readouterr().err
+
+
 @pytest.mark.golden
-def test_published_weights_on_the_real_frames(tmp_path, capsys, monkeypatch):
+def test_published_weights_on_the_real_frames(tmp_path, capsys):
     """The original's accuracy 0.96562, FP 0.0 and FN 0.025, and its points within half a pixel."""
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setenv("TFLANE_SHARED", str(shared_path(".")))
-    lstr = ["--config", "configs/gtn_lane/lstr.py"]
-    assert main(["eval", *lstr, "--out", str(tmp_path / "score")]) == 0
+    lstr = ["--config", "gtn_lane/lstr", "--weights", str(shared_path("data/lstr/LSTR_500000.npz"))]
+    frames = ["--root", str(shared_path("data/tusimple/LaneDetection"))]
+    assert main(["eval", *lstr, *frames, "--out", str(tmp_path / "score")]) == 0
     rows = json.loads((tmp_path / "score.json").read_text())["rows"]
     assert rows[0]["Accuracy"] == pytest.approx(0.96562, abs=5e-6)
     assert rows[0]["FP"] == 0.0
@@ -153,6 +157,6 @@ def test_published_weights_on_the_real_frames(tmp_path, capsys, monkeypatch):
     run = tmp_path / "converted"
     assert main(["convert", *lstr, "--out", str(run)]) == 0
     assert "186 tensors" in capsys.readouterr().out
-    assert main(["eval", str(run), "--out", str(tmp_path / "again")]) == 0
+    assert main(["eval", str(run), *frames, "--out", str(tmp_path / "again")]) == 0
     again = json.loads((tmp_path / "again.json").read_text())["rows"]
     assert {k: again[0][k] for k in ("Accuracy", "FP", "FN")} == {k: rows[0][k] for k in ("Accuracy", "FP", "FN")}

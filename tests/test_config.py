@@ -41,7 +41,6 @@ def shipped() -> dict[str, str]:
 @pytest.mark.parametrize(("name", "reference"), shipped().items())
 def test_shipped_configurations_have_not_changed_silently(name, reference, monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
-    monkeypatch.delenv("TFLANE_SHARED", raising=False)
     text = to_text(load_config(reference) if reference else RunConfig())
     golden = GOLDEN / f"{name}.txt"
     if not golden.exists() or golden.read_text(encoding="utf-8") != text:
@@ -218,6 +217,42 @@ def test_config_files_that_are_wrong_are_named(tmp_path, content, message):
     with pytest.raises(UserError, match=message) as error:
         load_config(str(path))
     assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "ablation"), [("tf_lane/toponet_tfm", ""), ("tf_lane/toponet_tfm", ":abla1"), ("markers/host", "")]
+)
+def test_shipped_configurations_load_by_name_from_any_folder(name, ablation, tmp_path, monkeypatch):
+    by_path = load_config(f"{ROOT}/configs/{name}.py{ablation}")
+    monkeypatch.chdir(tmp_path)
+    assert load_config(f"{name}{ablation}") == by_path
+
+
+def test_a_file_comes_before_a_shipped_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text("from tflane_jax.config import RunConfig\n\nget_config = RunConfig\n")
+    assert load_config("own.py") == RunConfig()
+    with pytest.raises(UserError, match="config file own does not exist"):
+        load_config("own")
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        ("tf_lane/topnet_tfm", "did you mean tf_lane/toponet_tfm"),
+        ("toponet_tfm", "did you mean .*tf_lane/toponet_tfm"),
+        ("host", "did you mean markers/host"),
+        ("configs/tf_lane/toponet_tfm.py:abla1", "the shipped configuration is called tf_lane/toponet_tfm"),
+        ("xyz", "the package ships .*gtn_lane/lstr, .*tf_lane/toponet_tfm"),
+        ("tf_lane/toponet_tfm:abla", "no ablation abla: did you mean abla"),
+        ("tf_lane/toponet_tfm:xyz", "no ablation xyz: it has abla1, .*abla8"),
+        ("gtn_lane/lstr:xyz", r"has no function ablations\(\)"),
+    ],
+)
+def test_references_that_are_wrong_are_answered_with_close_names(reference, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=message):
+        load_config(reference)
 
 
 def test_config_files_that_are_not_there(tmp_path):

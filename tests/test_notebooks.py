@@ -1,4 +1,6 @@
-"""Every notebook runs from top to bottom and draws."""
+"""Every notebook runs from top to bottom and draws; the example of the README runs."""
+
+import re
 
 import pytest
 
@@ -18,3 +20,12 @@ def test_notebook_runs(path, tmp_path, monkeypatch):
     assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
     printed = "".join(output.get("text", "") for output in outputs)
     assert "step 12: loss" in printed
+
+
+def test_the_example_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    names: dict = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert names["lanes"].points.shape == (48, 11, 3)

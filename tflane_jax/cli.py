@@ -130,6 +130,9 @@ def _model_arguments(parser: argparse.ArgumentParser, inputs: str = "run folder"
         "--config", metavar="FILE[:NAME]", help="instead of a run: a config file that names published weights"
     )
     parser.add_argument(
+        "--weights", metavar="FILE", type=Path, help="with --config: file of the weights (default: the config's)"
+    )
+    parser.add_argument(
         "--checkpoint",
         metavar="best|last|STEP",
         type=_checkpoint,

@@ -1,6 +1,6 @@
 """A run's configuration: what the parts' own configurations are assembled into, where files and overrides enter.
 
-A config file is Python with `get_config() -> RunConfig` and, if it likes, `ablations() -> dict[str, RunConfig]`.
+A config file is Python with `get_config() -> RunConfig` and optionally `ablations() -> dict[str, RunConfig]`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
+from tflane_jax.config_files import find_config, split_reference
 from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Keyframes
 from tflane_jax.datasets.augmentation import AugmentationConfig
@@ -188,29 +189,29 @@ class RunConfig:
 
 
 def load_config(reference: str) -> RunConfig:
-    """Return the configuration of a file, `path.py`, or one of its ablations, `path.py:name`.
+    """Return a configuration: `path.py`, a shipped one (`tf_lane/toponet_tfm`), or an ablation of either (`...:name`).
 
     Raises:
-        UserError: no such file, function or ablation, or an exception inside the file (named with its line).
+        UserError: no such file, name, function or ablation, or an exception inside the file (named with its line).
     """
-    path, _, ablation = reference.partition(".py:")
+    name, ablation = split_reference(reference)
     if not ablation:
-        return _called(Path(path), "get_config", RunConfig)
-    ablations = load_ablations(f"{path}.py")
+        return _called(find_config(name), "get_config", RunConfig)
+    ablations = load_ablations(name)
     if ablation not in ablations:
-        raise UserError(f"config file {path}.py has no ablation {ablation}, only {', '.join(ablations)}")
+        close = difflib.get_close_matches(ablation, ablations, 3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(ablations)}"
+        raise UserError(f"config file {name} has no ablation {ablation}: {hint}")
     return ablations[ablation]
 
 
-def load_ablations(path: str) -> dict[str, RunConfig]:
-    """Return the ablations of a config file by name; raises UserError like `load_config`."""
-    return _called(Path(path), "ablations", dict)
+def load_ablations(name: str) -> dict[str, RunConfig]:
+    """Return the ablations of a config file or shipped configuration; raises UserError like `load_config`."""
+    return _called(find_config(name), "ablations", dict)
 
 
 def _called(path: Path, function: str, kind: type[T]) -> T:
     """Run a config file and return what one of its functions gives."""
-    if not path.is_file():
-        raise UserError(f"config file {path} does not exist")
     spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise UserError(f"config file {path} is no Python file (.py)")

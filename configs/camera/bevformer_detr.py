@@ -1,9 +1,9 @@
-"""BEVFormer-DETR, OpenLane-V2's baseline, from six cameras of the built-in world: the baseline of `toponet.py`.
+"""BEVFormer-DETR, OpenLane-V2's baseline, from six cameras of the built-in world: to be compared with `toponet.py`.
 
-    tflane train --config configs/camera/bevformer_detr.py
+    tflane train --config camera/bevformer_detr
 
-Encoder, traffic elements, data and training are those of `toponet.py`; the decoder has no graph, its references never
-move, and topology is read from the last layer alone.
+Encoder, traffic elements, data and training are those of `toponet.py`. The decoder has no scene graph, its reference
+points are not refined, and the topology comes from the last layer only.
 """
 
 from dataclasses import replace

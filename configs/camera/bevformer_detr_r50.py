@@ -1,7 +1,9 @@
-"""OpenLane-V2's large baseline at its full size, on subset A: as `toponet_r50.py`, 100 queries, lanes as Bezier curves.
+"""OpenLane-V2's large baseline at its full size, on subset A: 100 queries, lanes as Bezier curves.
 
-tflane summary --config configs/camera/bevformer_detr_r50.py --no-compile   # needs no data
-tflane train --config configs/camera/bevformer_detr_r50.py --data.root PATH
+    tflane summary --config camera/bevformer_detr_r50 --no-compile   # needs no data
+    tflane train --config camera/bevformer_detr_r50 --data.root PATH
+
+Encoder and training are those of `toponet_r50.py`; control points, loss weights and image sizes are the baseline's.
 """
 
 from dataclasses import replace
@@ -19,7 +21,6 @@ def get_config() -> RunConfig:
     toponet = load_config(str(Path(__file__).with_name("toponet_r50.py")))
     assert isinstance(toponet.data, OpenLaneV2Data)
     assert isinstance(toponet.task, LaneGraphTask)
-    # The same encoder.
     task = LaneGraphTask(
         replace(paper_config(control_points=5), encoder=toponet.task.model.encoder), BevFormerDetrLossConfig()
     )

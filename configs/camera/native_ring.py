@@ -1,10 +1,10 @@
 """Scenes in the seven cameras of Argoverse 2 at their native 2048 x 1550, to be written in OpenLane-V2's layout.
 
-    tflane data export --config configs/camera/native_ring.py --out data/world
-    tflane train --config configs/camera/toponet_r50.py --data.root data/world --training.batch_size 1 \\
+    tflane data export --config camera/native_ring --out data/world
+    tflane train --config camera/toponet_r50 --data.root data/world --training.batch_size 1 \\
         --training.steps 2 --optim.epoch_steps 0 --optim.warmup_steps 0
 
-The second command makes two updates of the paper's size, for who has no OpenLane-V2 at hand.
+The second command makes two updates of the paper-size model, for users without OpenLane-V2.
 """
 
 from dataclasses import replace

@@ -1,11 +1,10 @@
 """TopoNet at the paper's size, on OpenLane-V2 subset A: ResNet-50, seven cameras, 200 x 100 BEV cells, 200 queries.
 
-    tflane summary --config configs/camera/toponet_r50.py --no-compile          # needs no data
-    tflane train --config configs/camera/toponet_r50.py --data.root PATH
+    tflane summary --config camera/toponet_r50 --no-compile          # needs no data
+    tflane train --config camera/toponet_r50 --data.root PATH
 
-The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each. `:remat` keeps less for the gradient and
-computes it again, `:bfloat16` does so in half precision; `:six_layers` has six encoder layers instead of TopoNet's
-three.
+The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each. `:remat` recomputes activations in the
+backward pass, `:bfloat16` does so in half precision, `:six_layers` has six encoder layers instead of TopoNet's three.
 """
 
 from dataclasses import replace
@@ -19,8 +18,8 @@ from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
 EPOCH = 22_477 // 8
-# One camera of Argoverse 2 sees at most 4,710 of the 20,000 cells; serving all of them costs three times as much and
-# changes nothing.
+# One camera of Argoverse 2 sees at most 4,710 of the 20,000 cells. Attention for all 20,000 costs three times as much
+# and gives the same output.
 CAPACITY = 6000
 ENCODER = replace(PAPER_CAMERA_ENCODER, bev=replace(PAPER_CAMERA_ENCODER.bev, capacity=CAPACITY))
 

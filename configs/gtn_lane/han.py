@@ -1,10 +1,10 @@
 """LSTR with a heterogeneous graph attention network, on front views of the built-in world.
 
-    tflane train --config configs/gtn_lane/han.py
+    tflane train --config gtn_lane/han
 
 Eleven minutes on one core. Test split, three seeds: accuracy 91.8 +- 0.5 percent (docs/gtn_lane.md).
 
-All but the encoder is that of `transformer.py`.
+Everything except the encoder is that of `transformer.py`.
 """
 
 import dataclasses

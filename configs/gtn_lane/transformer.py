@@ -1,10 +1,10 @@
 """LSTR's own transformer encoder on front views of the built-in world, sized for two CPU cores: the baseline.
 
-    tflane train --config configs/gtn_lane/transformer.py
-    tflane compare configs/gtn_lane/{transformer,gtn,gcn,han}.py --seeds 0 1 2 --out runs/table1
+    tflane train --config gtn_lane/transformer
+    tflane compare gtn_lane/{transformer,gtn,gcn,han} --seeds 0 1 2 --out runs/table1
 
-Eleven minutes on one core. Test split, three seeds: accuracy 74.6 +- 13.6 percent, two of them still at the start
-(docs/gtn_lane.md).
+Eleven minutes on one core. Test split, three seeds: accuracy 74.6 +- 13.6 percent, because two of the three
+had not left the initial plateau (docs/gtn_lane.md).
 """
 
 from tflane_jax.config import EvaluationConfig, FrontViewData, RunConfig
@@ -22,7 +22,7 @@ LAYER = TransformerConfig(dropout=0.0)
 
 def get_config() -> RunConfig:
     """Return the baseline."""
-    # Half the resolution and as many cells as at the full one: four times as many steps in the same time.
+    # Half the resolution with the same number of feature cells: four times as many steps in the same time.
     model = LstrConfig(
         ResNetConfig(strides=(1, 2, 2, 1)),
         encoder=TransformerEncoderConfig(layer=LAYER),

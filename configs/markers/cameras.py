@@ -1,13 +1,13 @@
 """The marker paper's Table II from camera images: markers and their ablations on the small camera TopoNet, on clips.
 
-    tflane compare configs/camera/toponet.py --seeds 0 --out runs/camera
-    C=configs/markers/cameras.py
+    tflane compare camera/toponet --seeds 0 --out runs/camera
+    C=markers/cameras
     tflane compare toponet=$C:toponet uniform=$C:uniform hard=$C:hard markers=$C --seeds 0 1 2 --jobs 2 \\
         --out runs/markers/cameras
 
-Every row goes on from the host that the first command trains, one for all seeds: those of the second command vary the
-new parameters and the order of the clips. Boards stand in the images too, but there are too few pixels to read one:
-detections are drawn as in `toponet_markers.py` (paper, section IV-A). What came out: docs/markers.md.
+The first command trains the host. Every row of the second starts from that one host; its seeds vary the new parameters
+and the order of the clips. The images show the marker boards, but too small to be read: detections are simulated as in
+`toponet_markers.py` (paper, section IV-A). Results: docs/markers.md.
 """
 
 from dataclasses import replace
@@ -35,7 +35,7 @@ def get_config() -> RunConfig:
     example = replace(
         host.data.example, cameras=replace(host.data.example.cameras, markers=True), markers=MarkerConfig()
     )
-    # Denoising is for decoders that learn where lanes are from nothing.
+    # Denoising speeds up training from random weights; this decoder is trained already.
     model = replace(host.task.model, denoising=None, priors=PriorsConfig(markers=SMALL_MARKER_FUSION))
     return replace(
         host,
@@ -47,7 +47,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the other rows of the table, and no memory."""
+    """Return the other rows of the table, and gated fusion without memory."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
     markers = SMALL_MARKER_FUSION

@@ -1,9 +1,9 @@
-"""TopoNet's lane branch on single frames: what every model of `toponet_markers.py` begins with.
+"""TopoNet's lane branch on single frames: the host that every model of `toponet_markers.py` starts from.
 
-    tflane compare configs/markers/host.py configs/markers/host.py:bevformer_detr --seeds 0 1 2 3 4 --jobs 2 \\
+    tflane compare markers/host markers/host:bevformer_detr --seeds 0 1 2 3 4 --jobs 2 \\
         --out runs/markers/hosts
 
-The examples hold markers and an SD map all the same, so that hosts and models with priors share their data.
+The examples hold markers and an SD map, which the hosts ignore, so that models with priors use the same cached data.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from tflane_jax.world.simulate import WorldConfig
 
 # Eight frames half a second apart, as in OpenLane-V2.
 WORLD = WorldConfig(duration_s=5.6, keyframes=8, markers=PlacementConfig(side="both"))
-# A receiver off by two metres and a compass by one degree, on top of a map whose roads are off by 1.5 m.
+# GNSS receiver: 2 m and 1 degree (standard deviations), on top of the map's own error of 1.5 m.
 EXAMPLE = ExampleConfig(markers=MarkerConfig(), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
 
 

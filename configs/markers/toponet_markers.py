@@ -1,12 +1,12 @@
 """TopoNet with fiducial markers (Wu and Hu), and the other rows of the paper's Tables I to IV, on clips.
 
-    tflane compare configs/markers/host.py configs/markers/host.py:bevformer_detr --seeds 0 1 2 3 4 \\
+    tflane compare markers/host markers/host:bevformer_detr --seeds 0 1 2 3 4 \\
         --out runs/markers/hosts
-    tflane compare configs/markers/toponet_markers.py:{toponet,bevformer_detr,toponet_smerf} \\
-        configs/markers/toponet_markers.py --seeds 0 1 2 3 4 --out runs/markers/table_1
+    tflane compare markers/toponet_markers:{toponet,bevformer_detr,toponet_smerf} \\
+        markers/toponet_markers --seeds 0 1 2 3 4 --out runs/markers/table_1
 
-Every row starts from the host of `host.py` that was trained with the same seed, and goes on for as many updates, with
-or without a prior: what is compared is what a prior adds to one host. Clips are of four frames, half a second apart.
+Every row starts from the host of `host.py` trained with the same seed and makes the same number of updates, with or
+without a prior. The rows differ only in the prior. A clip has four frames, half a second apart.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the other rows of each table, and what goes beyond the paper."""
+    """Return the other rows of each table, and two variants beyond the paper."""
     memory = MARKERS.memory
     assert memory is not None
     table_1 = {
@@ -53,16 +53,16 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _tuned(host: str = "host", **priors: Any) -> RunConfig:
-    """Return the training that goes on from a host, with priors."""
+    """Return the fine-tuning of a host with priors."""
     path = str(Path(__file__).with_name("host.py"))
     config = load_config(path if host == "host" else f"{path}:{host}")
     assert isinstance(config.task, LaneGraphTask)
-    # Denoising is for decoders that learn where lanes are from nothing.
+    # Denoising speeds up training from random weights; this decoder is trained already.
     model = replace(config.task.model, denoising=None, priors=PriorsConfig(**priors))
     return replace(
         config,
         task=replace(config.task, model=model, clip=4),
-        # Averaged over the last hundred updates or so: over a thousand, most of the average would be the host.
+        # Average over about the last 100 updates: over 1,000, the host's own weights would dominate it.
         optim=replace(config.optim, ema_decay=0.99),
         training=replace(
             config.training,

@@ -1,29 +1,29 @@
-"""A world-trained +TFM model, fine-tuned on one real Argoverse 2 log and evaluated on another.
+"""A model with traffic flow, trained on the built-in world, fine-tuned on one Argoverse 2 log, evaluated on another.
 
-    tflane train --config configs/tf_lane/argoverse2.py --training.init-from RUN --out runs/finetuned
+    tflane train --config tf_lane/argoverse2 --training.init-from RUN --out runs/finetuned
     tflane eval runs/finetuned
 
-RUN is a run of `toponet_tfm.py`; the two logs are those of $TFLANE_SHARED/data/argoverse2 (default ../shared). One log
-of 32 frames shows that the program runs on real data; it says little about accuracy. Numbers: docs/argoverse2.md.
+RUN is a run of `toponet_tfm.py`. The two logs are expected under `data/argoverse2`, in the layout of the download;
+`--data.train`, `--data.val` and `--data.test` name other folders, `--data.openlane` that of OpenLane-V2's split files.
+One log of 32 frames shows that the program runs on real data and says little about accuracy: docs/argoverse2.md.
 """
 
 import dataclasses
-import os
 from pathlib import Path
 
 from tflane_jax.config import LogData, RunConfig, load_config
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
+SENSOR = Path("data/argoverse2/sensor")
 TRAIN = "adcf7d18-0510-35b0-a2fa-b4cea13a6d76"
 TEST = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 
 
 def get_config() -> RunConfig:
     """Return 100 steps from a trained model on one log, at a tenth of the world's learning rate."""
-    shared = Path(os.environ.get("TFLANE_SHARED", "../shared")) / "data"
-    logs = shared / "argoverse2" / "sensor" / "val"
-    data = LogData(train=logs / TRAIN, val=logs / TEST, test=logs / TEST, openlane=shared / "openlanev2")
+    test = SENSOR / "val" / TEST
+    data = LogData(train=SENSOR / "train" / TRAIN, val=test, test=test, openlane=Path("data/OpenLane-V2"))
     return dataclasses.replace(
         load_config(str(Path(__file__).with_name("toponet_tfm.py"))),
         data=data,

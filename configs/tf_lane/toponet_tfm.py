@@ -1,7 +1,7 @@
 """TopoNet's lane branch with the traffic-flow module (TF-Lane), and the ablations of the paper's Tables 5 and 6.
 
-    tflane train --config configs/tf_lane/toponet_tfm.py
-    tflane train --config configs/tf_lane/toponet_tfm.py:abla1
+    tflane train --config tf_lane/toponet_tfm
+    tflane train --config tf_lane/toponet_tfm:abla1
 
 Same data, optimiser and host as `toponet.py`. The paper runs its ablations on LaneSegNet; here they run on TopoNet.
 """

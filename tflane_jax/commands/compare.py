@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config_files import split_reference
 from tflane_jax.errors import UserError
 from tflane_jax.training.runtime import configure_jax
 
@@ -31,5 +32,5 @@ def _named(reference: str) -> tuple[str, str]:
     name, separator, path = reference.partition("=")
     if separator:
         return name, path
-    path, _, ablation = reference.partition(".py:")
+    path, ablation = split_reference(reference)
     return ablation or Path(path).stem, reference

@@ -25,7 +25,10 @@ from tflane_jax.world.cameras.ring import CameraRigConfig
 def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
     """Return the model that is named, by --config (published weights) or as first input (a run), and further inputs."""
     if options.config is not None:
-        return open_weights(load_config(options.config)), options.inputs
+        config = load_config(options.config)
+        return open_weights(replace(config, weights=options.weights or config.weights)), options.inputs
+    if options.weights is not None:
+        raise UserError("--weights are those of a configuration: add --config FILE")
     if not options.inputs:
         raise UserError("say which model: a run folder, or --config FILE with published weights")
     return open_run(options.inputs[0], options.checkpoint), options.inputs[1:]

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.config_files import split_reference
 from tflane_jax.config_io import to_text
 from tflane_jax.errors import UserError
 from tflane_jax.runs import resumable_config, train_run
@@ -23,7 +24,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
             print(f"settings of {options.config}:\n\n{to_text(load_config(options.config))}")
         return 0
     if options.config is None and options.start != "resume":
-        raise UserError("say what to train: --config FILE (configs/ has some), or --resume with --out RUN")
+        raise UserError("say what to train: --config FILE (or a name, say tf_lane/toponet), or --resume with --out RUN")
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
 
@@ -57,5 +58,5 @@ def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) ->
 def _default_folder(config: str | None) -> Path:
     if config is None:
         raise UserError("say which run to resume: --out RUN")
-    path, _, ablation = config.partition(".py:")
+    path, ablation = split_reference(config)
     return Path("runs") / (f"{Path(path).stem}-{ablation}" if ablation else Path(path).stem)

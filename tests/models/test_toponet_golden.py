@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.golden import assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.golden import case_id, golden_modules, load_module_case
+from tests.golden_compare import assert_outputs_close
 from tests.models.golden_lanes import (
     bev_maps,
+    by_layer,
     check,
     check_matching,
     decoder_config,
@@ -23,9 +25,10 @@ from tflane_jax.models.toponet import TopoNet, TopoNetConfig
 from tflane_jax.scene import TrafficElements, stack_examples
 
 
-def element_truth(case, lanes, capacity=3):
+def element_truth(case, lanes):
     """Return the fixture's lane-element relations, and the assignment of elements that it was made with."""
     layers, images = case.inputs["te_feats"].shape[:2]
+    capacity = 1 + max(case.inputs[f"gt_lcte.{image}"].shape[1] for image in range(images))
     elements, query = [], np.zeros((images, layers, capacity), np.int32)
     for image in range(images):
         relation, one = case.inputs[f"gt_lcte.{image}"], TrafficElements.empty(capacity, lanes)
@@ -41,11 +44,13 @@ def element_truth(case, lanes, capacity=3):
 @pytest.mark.golden
 @pytest.mark.parametrize("path", golden_modules("toponet_head*"), ids=case_id)
 def test_lane_head_matches_the_reference(path):
-    case = load_module_case(path)
-    sizes, weights = case.meta["config"], TopoNetLossConfig()
-    decoder = decoder_config(sizes, sizes["n_points"])
+    check_head(load_module_case(path))
+
+
+def check_head(case):
+    decoder, weights = decoder_config(case), TopoNetLossConfig()
     module = TopoNet(TopoNetConfig(decoder=decoder))
-    lanes = truth(case, sizes["n_points"])
+    lanes = truth(case)
     elements, found = element_truth(case, lanes.valid.shape[1])
 
     def outputs(torch_params, inputs):
@@ -78,15 +83,15 @@ def test_lane_head_matches_the_reference(path):
         )
         names = {"lane_cls": "class", "lane_reg": "points", "lclc_rel": "successor", "lcte_rel": "lcte"}
         for name, term in names.items():
-            out |= {f"loss.loss_{name}": terms[term][1], f"loss.d0.loss_{name}": terms[term][0]}
+            out |= by_layer(f"loss_{name}", terms[term])
         return out, (cost, assignment, prediction)
 
-    cost, assignment, prediction = check(case, outputs, {name: case.inputs[name] for name in ("bev_feats", "te_feats")})
+    cost, assignment, prediction = check(case, outputs)
     check_matching(case, cost, assignment)
     for image in range(len(lanes.valid)):
         answer = jax.tree.map(lambda leaf, i=image: leaf[i, -1], prediction)
         decoded = {
-            "lanes": answer.centerlines.points.reshape(sizes["num_query"], -1),
+            "lanes": answer.centerlines.points.reshape(decoder.queries, -1),
             "scores": answer.centerlines.scores,
             "lclc": jax.nn.sigmoid(answer.centerlines.successor_logits),
             "lcte": jax.nn.sigmoid(answer.elements.lane_logits),

@@ -22,10 +22,10 @@ from tflane_jax.models.parameters import Params
 RESNET = (
     (r"(conv\d)\.weight", r"\1/kernel", "conv"),
     (r"bn1\.(weight|bias|running_mean|running_var)", r"bn1/\1", "norm"),
-    (r"layer(\d)\.(\d)\.(conv\d)\.weight", r"layer\1_\2/\3/kernel", "conv"),
-    (r"layer(\d)\.(\d)\.(bn\d)\.(\w+)", r"layer\1_\2/\3/\4", "norm"),
-    (r"layer(\d)\.(\d)\.downsample\.0\.weight", r"layer\1_\2/downsample_conv/kernel", "conv"),
-    (r"layer(\d)\.(\d)\.downsample\.1\.(\w+)", r"layer\1_\2/downsample_bn/\3", "norm"),
+    (r"layer(\d+)\.(\d+)\.(conv\d)\.weight", r"layer\1_\2/\3/kernel", "conv"),
+    (r"layer(\d+)\.(\d+)\.(bn\d)\.(\w+)", r"layer\1_\2/\3/\4", "norm"),
+    (r"layer(\d+)\.(\d+)\.downsample\.0\.weight", r"layer\1_\2/downsample_conv/kernel", "conv"),
+    (r"layer(\d+)\.(\d+)\.downsample\.1\.(\w+)", r"layer\1_\2/downsample_bn/\3", "norm"),
 )
 _ATTENTION = (
     (r"self_attn\.in_proj_(weight|bias)", r"self_attention/\1", "packed"),

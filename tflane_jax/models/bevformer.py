@@ -1,7 +1,7 @@
 """BEVFormer: from feature maps of several cameras, and the previous frame's result, to bird's-eye-view features.
 
-Reference: Li et al. 2022; specs/modules.md section 4 (the BEV constructer of TopoNet). One frame is a module, time an
-explicit carry: `encode_sequence` scans over the frames, `step` makes one of them, with equal results.
+Reference: Li et al. 2022; the published version is TopoNet's "BEV constructer". A module encodes one frame, and time is
+an explicit carry: `encode_sequence` scans over the frames, and `step` encodes one of them, with equal results.
 """
 
 from __future__ import annotations
@@ -163,7 +163,8 @@ def align(
         return BevMemory(moved, memory.valid), jnp.zeros(2, moved.dtype)
     center = config.rotation_center or vehicle_center(config.grid)
     turned = rotate_nearest(memory.features, pose_yaw(previous_from_ego), center)
-    return BevMemory(turned, memory.valid), ego_shift(config.grid, previous_from_ego)
+    axes = "lidar" if config.align == "bevformer" else "ego"
+    return BevMemory(turned, memory.valid), ego_shift(config.grid, previous_from_ego, axes)
 
 
 def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]) -> Float[Array, " m"]:

@@ -70,8 +70,7 @@ def fakes():
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
             patch.setattr(LaneGraphTask, function.__name__, function)
-        for module in ("tasks.lane_graph_system", "commands.predict_lanes"):
-            patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
+        patch.setattr("tflane_jax.datasets.sources.open_dataset", open_fake)
         yield
 
 
@@ -256,14 +255,14 @@ def test_every_command_has_help(capsys):
 def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
     import signal
 
-    from tflane_jax.tasks import lane_graph
+    from tflane_jax.tasks import lane_graph_system
 
     def interrupting(*arguments):
         os.kill(os.getpid(), signal.SIGINT)
         return evaluate(*arguments)
 
-    evaluate = lane_graph.evaluate_lanes
-    monkeypatch.setattr(lane_graph, "evaluate_lanes", interrupting)
+    evaluate = lane_graph_system.evaluate_lanes
+    monkeypatch.setattr(lane_graph_system, "evaluate_lanes", interrupting)
     folder = tmp_path / "stopped"
     assert main(["train", "--config", f"{config}:baseline", "--out", str(folder)]) == 130
     said = capsys.readouterr().err

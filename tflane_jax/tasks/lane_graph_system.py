@@ -11,14 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from tflane_jax.config import LaneGraphSource, RunConfig
-from tflane_jax.datasets.argoverse2 import Argoverse2Dataset
+from tflane_jax.config import RunConfig
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import Dataset
-from tflane_jax.datasets.cache import CachedDataset, cached
-from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays
-from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
+from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
-from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.evaluate import Sightings, evaluate_lanes, predictions
@@ -33,8 +30,6 @@ from tflane_jax.training.records import Record
 from tflane_jax.training.task import Params
 
 _COMPARED_EXAMPLES = 6
-IN_MEMORY = 6 * 2**30
-"""Bytes of training examples that are held in memory; more are read from the disk while training."""
 
 
 class LaneGraphSystem:
@@ -66,15 +61,9 @@ class LaneGraphSystem:
     )
     errors: tuple[str, ...] = ()
 
-    def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example | Streamed:
-        """Return the examples of a source, stacked; those of OpenLane-V2, and of a large world, are read while used."""
-        dataset = open_dataset(source, progress=progress)
-        select = partial(keep, parts=TRAINING_PARTS)
-        if isinstance(source, OpenLaneV2Config):
-            return Streamed(dataset, source.loading, select)
-        if isinstance(dataset, CachedDataset) and dataset.nbytes(TRAINING_PARTS) > IN_MEMORY:
-            return Streamed(dataset, select=select)
-        return load_arrays(dataset, parts=TRAINING_PARTS, progress=progress)
+    def load(self, source: Any, *, progress: bool = True) -> Example | Streamed:
+        """Return the examples of a source, see `datasets.sources.load`."""
+        return sources.load(source, progress=progress)
 
     def examples(self, config: RunConfig, data: Example | Streamed) -> Example | Streamed:
         """Return the examples themselves, or the clips that they are in."""
@@ -84,14 +73,7 @@ class LaneGraphSystem:
 
     def shapes(self, config: RunConfig) -> Example:
         """Return shapes of the training parts of an example."""
-        source = _source(config, "train")
-        if isinstance(source, OpenLaneV2Config) and not source.root.is_dir():
-            example = nominal_example(source)
-        else:
-            # Not from the cache: one example is made sooner than all of them.
-            made = isinstance(source, ProceduralConfig)
-            example = (ProceduralDataset(source) if made else open_dataset(source)).example(0)
-        return shapes_of(keep(example, TRAINING_PARTS))
+        return shapes_of(keep(sources.sample(config.data.source("train")), TRAINING_PARTS))
 
     def check(self, config: RunConfig, data: Example | Streamed) -> None:
         """Raise UserError where a camera sees more BEV cells than it can serve."""
@@ -115,8 +97,8 @@ class LaneGraphSystem:
         """Return the function that draws a few validation examples from above and in their camera images."""
         from tflane_jax.plots import save_camera_views, save_examples
 
-        source = _source(config, "val")
-        dataset = open_dataset(source)
+        source = config.data.source("val")
+        dataset = sources.open_dataset(source)
         indices = spread(len(dataset), config.evaluation.pictures)
 
         def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
@@ -145,13 +127,11 @@ class LaneGraphSystem:
         """Return nothing: the papers' numbers are of real data."""
         return []
 
-    def draw_comparison(
-        self, models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path
-    ) -> Path:
+    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: Example | Streamed, path: Path) -> Path:
         """Draw the test frames with the most hidden lanes (of streamed data, any), every model beside the truth."""
         from tflane_jax.plots import save_examples
 
-        dataset = open_dataset(source)
+        dataset = sources.open_dataset(source)
         if isinstance(data, Streamed):
             indices = spread(len(data), _COMPARED_EXAMPLES)
         else:
@@ -169,13 +149,6 @@ class LaneGraphSystem:
             ground=source.example.ground,
             view=source.example.range,
         )
-
-
-def open_dataset(source: LaneGraphSource, *, progress: bool = True) -> Dataset:
-    """Return the dataset of a source; the built-in world is built once and then read from its cache."""
-    if isinstance(source, ProceduralConfig):
-        return cached(ProceduralDataset(source), progress=progress)
-    return OpenLaneV2Dataset(source) if isinstance(source, OpenLaneV2Config) else Argoverse2Dataset(source)
 
 
 def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:
@@ -242,7 +215,3 @@ def clips(data: Example | Streamed, length: int) -> Example:
             f"scenes do not split into clips of {length} frames: set data.world.keyframes to a multiple of task.clip"
         )
     return jax.tree.map(lambda leaf: leaf.reshape(frames // length, length, *leaf.shape[1:]), data)
-
-
-def _source(config: RunConfig, split) -> LaneGraphSource:
-    return config.data.source(split)  # pyright: ignore[reportReturnType]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.config import LaneShapeSource, RunConfig
+from tflane_jax.config import RunConfig
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import augment
-from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
-from tflane_jax.datasets.front_views import load_road_images as load_front_views
-from tflane_jax.datasets.tusimple import TuSimpleDataset, row_lanes
-from tflane_jax.datasets.tusimple import load_road_images as load_tusimple
+from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.evaluation.evaluate import predict_batch, predictions
 from tflane_jax.files.images import HEIGHT as INPUT_HEIGHT
 from tflane_jax.files.images import WIDTH as INPUT_WIDTH
@@ -48,19 +45,6 @@ _TABLE_1 = (
 )
 
 
-@dataclass(frozen=True)
-class LabelledImages:
-    """A split in memory.
-
-    Attributes:
-        images: stacked.
-        truth: the labels of each, as the metric wants them.
-    """
-
-    images: RoadImage
-    truth: tuple[RowLanes, ...]
-
-
 class LaneShapeSystem:
     """See `tasks.base.System`."""
 
@@ -68,15 +52,9 @@ class LaneShapeSystem:
     compared: tuple[str, ...] = ("all/Accuracy", "all/FP", "all/FN")
     errors: tuple[str, ...] = ("all/FP", "all/FN")
 
-    def load(self, source: LaneShapeSource, *, progress: bool = True) -> LabelledImages:
+    def load(self, source: Any, *, progress: bool = True) -> LabelledImages:
         """Return the images of a source, stacked, with their labels."""
-        if isinstance(source, FrontViewConfig):
-            images = load_front_views(source, progress=progress)
-            lines = (jax.tree.map(lambda leaf, i=i: leaf[i], images.lines) for i in range(len(images.image)))
-            return LabelledImages(images, tuple(row_lanes(each, HEIGHT, WIDTH) for each in lines))
-        dataset = TuSimpleDataset(source)
-        images = load_tusimple(dataset, progress=progress)
-        return LabelledImages(images, tuple(dataset.truth(index) for index in range(len(dataset))))
+        return sources.load(source, progress=progress)
 
     def examples(self, config: RunConfig, data: LabelledImages) -> RoadImage:
         """Return the images with their lines."""
@@ -117,7 +95,7 @@ class LaneShapeSystem:
         """Return the function that draws lanes over a few validation images."""
         from tflane_jax.plots.images import save_road_images
 
-        dataset = open_images(config.data.source("val"))  # pyright: ignore[reportArgumentType]
+        dataset = sources.open_dataset(config.data.source("val"))
         indices = spread(len(dataset), config.evaluation.pictures)
         examples = stack_examples([dataset.example(index) for index in indices]) if indices else None
 
@@ -150,9 +128,7 @@ class LaneShapeSystem:
             for name, fps, accuracy, fp, fn in _TABLE_1
         ]
 
-    def draw_comparison(
-        self, models: Mapping[str, Model], source: LaneShapeSource, data: LabelledImages, path: Path
-    ) -> Path:
+    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: LabelledImages, path: Path) -> Path:
         """Draw a few test images, every model beside the truth."""
         from tflane_jax.plots.images import save_road_images
 
@@ -162,27 +138,10 @@ class LaneShapeSystem:
         return save_road_images(path, examples, answers)
 
 
-def open_images(source: LaneShapeSource) -> FrontViewDataset | TuSimpleDataset:
-    """Return the images of a source one by one."""
-    return FrontViewDataset(source) if isinstance(source, FrontViewConfig) else TuSimpleDataset(source)
-
-
 def found_lanes(prediction: LaneShapePrediction, truth: RowLanes) -> RowLanes:
     """Return the lanes of one prediction at the rows of the truth."""
     assert truth.rows is not None, "labels have rows"
     return image_lanes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
-
-
-def truth_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> RowLanes:
-    """Return the labels of one image as the metric wants them."""
-    if isinstance(dataset, TuSimpleDataset):
-        return dataset.truth(index)
-    return row_lanes(dataset.example(index).lines, HEIGHT, WIDTH)
-
-
-def name_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> str:
-    """Return the name of one image."""
-    return dataset.raw_file(index) if isinstance(dataset, TuSimpleDataset) else dataset.info(index).scene
 
 
 def predict(task: Any, params: Params, examples: RoadImage) -> LaneShapePrediction:

@@ -7,7 +7,6 @@ answer = program.call(images)    # (b, 360, 640, 3) uint8 RGB -> {"logits": (b, 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from jax import export
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_bytes
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.task import Params
@@ -53,17 +53,7 @@ def export_model(
     (batch,) = export.symbolic_shape("b")
     images = jax.ShapeDtypeStruct((batch, height, width, 3), jnp.uint8)
     content = export.export(jax.jit(image_program(task, params)), platforms=platforms)(images).serialize()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
-    return path
+    return write_bytes(path, content)
 
 
 def load_program(path: Path) -> export.Exported:

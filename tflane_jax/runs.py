@@ -18,12 +18,13 @@ import numpy as np
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.tasks import system_of
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
-from tflane_jax.training.run_folder import Start, check_start, claimed, read_config, write_json, write_text
+from tflane_jax.training.run_folder import Start, check_start, claimed, read_config
 from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.training.state import TrainState, per_seed
 from tflane_jax.training.task import Params, split_statistics

@@ -12,7 +12,8 @@ from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.lane_rows import ROWS, lane_lines, row_lanes
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset, load_road_images
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 
 ROWS_48 = ROWS[8:]
 

@@ -19,6 +19,7 @@ from tests.golden import (
 from tests.shared import shared_path, shared_root
 from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
+from tflane_jax.evaluation.lane_shapes import detected, pixel_points, row_lanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
@@ -30,7 +31,6 @@ from tflane_jax.losses.lane_shape import (
     matching_cost,
 )
 from tflane_jax.matching import match
-from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig, normalise
 from tflane_jax.scene import LaneShapePrediction, stack_examples

@@ -23,10 +23,10 @@ from tqdm import tqdm
 from tflane_jax.ablations.comparison import Variant, compact, summarise
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import open_run, train_run
 from tflane_jax.tasks import Model, System, load_test_data, system_of
-from tflane_jax.training.run_folder import write_json
 from tflane_jax.training.runtime import configure_jax
 
 

@@ -23,16 +23,17 @@ from tqdm import tqdm
 
 from tflane_jax.commands.sources import chosen_source, make_folder
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.photos import PhotoCamera, fit_photo
 from tflane_jax.errors import UserError
-from tflane_jax.files.images import PhotoCamera, fit_photo, list_photos, read_image
-from tflane_jax.metrics import image_lanes
-from tflane_jax.metrics.tusimple import RowLanes
+from tflane_jax.evaluation import lane_shapes
+from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.files.images import list_photos, read_image
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.plots.images import predicted_lines, save_photo, save_road_images
 from tflane_jax.runs import Run
 from tflane_jax.scene import LaneLines, RoadImage, stack_examples
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_shape_system import found_lanes, predict
-from tflane_jax.training.run_folder import write_json, write_text
 
 
 def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
@@ -50,7 +51,7 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
         lanes = fitted.placement.to_photo(predicted_lines(answer))
         # Predicted lanes may leave the picture; points outside it are neither drawn nor written.
         inside = [_inside(lane, photo.shape) for lane in lanes]
-        scores = image_lanes.lane_scores(answer)[image_lanes.left_to_right(answer)]
+        scores = lane_shapes.lane_scores(answer)[lane_shapes.left_to_right(answer)]
         found = [
             {"score": float(s), "points": np.round(lane, 2).tolist()}
             for s, lane in zip(scores, inside, strict=True)

@@ -32,11 +32,11 @@ from tflane_jax.commands.sources import chosen_source, limited_task, make_folder
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_graph_system import predict_examples, titles
-from tflane_jax.training.run_folder import write_json
 
 _RELATION_THRESHOLD = 0.5
 
@@ -136,6 +136,6 @@ def _relations(scores: Float[np.ndarray, "a b"], first: str, second: str) -> lis
 
 
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    temporary = path.with_name(f".{path.stem}.tmp.npz")
-    np.savez_compressed(temporary, **arrays)  # pyright: ignore[reportArgumentType]
-    temporary.replace(path)
+    # An open file, because numpy appends .npz to any other name.
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

@@ -20,8 +20,9 @@ from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import SPLITS, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.lane_rows import LabelledImages, lane_lines
+from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.errors import UserError
-from tflane_jax.files.images import HEIGHT, WIDTH, read_image, resize
+from tflane_jax.files.images import read_image, resize
 from tflane_jax.files.tusimple import RowLanes, read_truth
 from tflane_jax.scene import LaneLines, RoadImage
 

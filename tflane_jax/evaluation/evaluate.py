@@ -10,7 +10,7 @@ import jax
 from jax import lax
 
 from tflane_jax.datasets.streaming import Streamed
-from tflane_jax.metrics.frames import detections_from_prediction, truth_from_example
+from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.scene import Example
 from tflane_jax.training.batches import ordered_batches

@@ -1,4 +1,7 @@
-"""TuSimple's label and prediction files: one JSON record a line, one record an image."""
+"""TuSimple's label and prediction files: one JSON record a line, `lanes` as x at the rows `h_samples`.
+
+Format: README of github.com/TuSimple/tusimple-benchmark, doc/lane_detection.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ class RowLanes:
     Attributes:
         x: (L, H) pixels; negative where a lane has no point in a row.
         rows: (H,) the image rows, pixels (`h_samples`); None for predictions, which use those of the truth.
-        run_time: milliseconds that a prediction took.
+        run_time: duration of the prediction, milliseconds.
     """
 
     x: Float[np.ndarray, "l h"]

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from tflane_jax.evaluation.lane_shapes import left_to_right
 from tflane_jax.geometry.lane_shapes import curve_columns
-from tflane_jax.metrics.image_lanes import left_to_right
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.scene import LaneLines, LaneShapePrediction, RoadImage
 

@@ -16,12 +16,13 @@ from tflane_jax.config import RunConfig
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import augment
 from tflane_jax.datasets.lane_rows import LabelledImages
+from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
+from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
+from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.evaluate import predict_batch, predictions
-from tflane_jax.files.images import HEIGHT as INPUT_HEIGHT
-from tflane_jax.files.images import WIDTH as INPUT_WIDTH
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.losses.lane_shape import lane_shape_loss, lane_shape_targets
-from tflane_jax.metrics import image_lanes
-from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.scene import LaneLines, LaneShapePrediction, RoadImage, shapes_of, stack_examples
 from tflane_jax.tasks.base import Evaluation, Model, spread
 from tflane_jax.tasks.lane_shape import LaneShapeTask
@@ -141,7 +142,7 @@ class LaneShapeSystem:
 def found_lanes(prediction: LaneShapePrediction, truth: RowLanes) -> RowLanes:
     """Return the lanes of one prediction at the rows of the truth."""
     assert truth.rows is not None, "labels have rows"
-    return image_lanes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
+    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
 
 
 def predict(task: Any, params: Params, examples: RoadImage) -> LaneShapePrediction:

@@ -19,6 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.batches import Prepare, batches, first_example
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
@@ -27,7 +28,7 @@ from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import Start, claimed, read_config, write_json, write_text
+from tflane_jax.training.run_folder import Start, claimed, read_config
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, per_seed, with_params
 from tflane_jax.training.step import compiled_update

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 
 import tflane_jax
-from tflane_jax.training.run_folder import write_json
+from tflane_jax.files.atomic import write_json
 
 _PACKAGES = ("tflane_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import is_temporary
 
 Start = Literal["new", "resume", "overwrite"]
 _CONTENT = (
@@ -44,18 +44,6 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise UserError(f"{folder} holds no run (it has no config.json)") from error
     except ValueError as error:
         raise UserError(f"{folder / 'config.json'} is damaged ({error}): checkpoints hold a copy") from error
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file, whole or not at all."""
-    write_text(path, json.dumps(content, indent=1) + "\n")
-
-
-def write_text(path: Path, content: str) -> None:
-    """Write a text file, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(content, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 @contextlib.contextmanager
@@ -94,7 +82,9 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
-    if not holds_run and folder.is_dir() and (other := {p.name for p in folder.iterdir()} - set(_CONTENT)):
+    found = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+    # A process killed while it wrote the first file leaves a temporary one: still no foreign file.
+    if not holds_run and (other := {name for name in found if not is_temporary(name)} - set(_CONTENT)):
         raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
 
 

@@ -5,7 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.metrics import CenterlineMetrics, detections_from_prediction, truth_from_example
+from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
+from tflane_jax.metrics import CenterlineMetrics
 from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
 
 

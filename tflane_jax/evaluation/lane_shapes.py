@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import softmax
 
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry.lane_shapes import curve_columns
-from tflane_jax.metrics.tusimple import RowLanes
 from tflane_jax.scene import LaneShapePrediction
 
 _NO_POINT = -2.0  # TuSimple's mark of a row without a point

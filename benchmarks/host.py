@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from benchmarks.timing import Compiled, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import load_config
-from tflane_jax.datasets.loading import for_training, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
@@ -61,7 +61,7 @@ def paper_size_tasks() -> dict[str, LaneGraphTask]:
 def examples() -> Example:
     """Return a batch of examples of the built-in world, on the device."""
     dataset = ProceduralDataset(ProceduralConfig(split="val", scenes=BATCH // 4))
-    return jax.tree.map(jnp.asarray, for_training(load_arrays(dataset, progress=False)))
+    return jax.tree.map(jnp.asarray, load_arrays(dataset, parts=TRAINING_PARTS, progress=False))
 
 
 def inference(batch: Example, seconds: float) -> dict[str, Any]:

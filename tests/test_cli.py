@@ -72,8 +72,7 @@ def fakes():
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
             patch.setattr(LaneGraphTask, function.__name__, function)
-        for module in ("tasks.lane_graph", "commands.predict_lanes"):
-            patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
+        patch.setattr("tflane_jax.datasets.sources.open_dataset", open_fake)
         yield
 
 

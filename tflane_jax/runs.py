@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.config import RunConfig, Source
+from tflane_jax.config import RunConfig
 from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -138,14 +138,12 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
         write_json(folder / "config.json", to_json(config))  # last: from here on the folder holds a run
 
 
-def evaluate_run(
-    run: Run, source: Source, *, task: Any = None, progress: bool = True
-) -> tuple[str, list[dict[str, Any]]]:
+def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = True) -> tuple[str, list[dict[str, Any]]]:
     """Evaluate every seed of a run.
 
     Args:
         run: see `open_run`.
-        source: the examples.
+        source: the examples, a config of `datasets.sources`.
         task: another way to use the parameters, such as `limit_instances` gives; None is the run's own.
         progress: show bars while data is made.
 

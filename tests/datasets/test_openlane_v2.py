@@ -13,7 +13,7 @@ from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tests.fakes import FakeConfig, FakeDataset
 from tests.shared import shared_path
 from tflane_jax.cli import build_parser
-from tflane_jax.commands.sources import lane_graph_source
+from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.batches import batches
@@ -241,7 +241,7 @@ def test_it_is_training_data(whole):
 def test_the_command_line_names_it(whole):
     def chosen(*arguments, config=None):
         options = build_parser().parse_args(["eval", "run", "--split", "val", *arguments])
-        return lane_graph_source(config or RunConfig(), options)
+        return chosen_source(config or RunConfig(), options)
 
     source = chosen("--data", "openlane-v2", "--root", str(whole))
     assert (source.root, source.split, source.subset, source.image) == (whole, "val", "B", TOPONET_SUBSET_B)
@@ -254,10 +254,10 @@ def test_the_command_line_names_it(whole):
 
 def test_a_world_too_large_for_memory_is_streamed(tmp_path, monkeypatch):
     kept = cached(FakeDataset(FakeConfig(5)), root=tmp_path, workers=1, progress=False)
-    monkeypatch.setattr("tflane_jax.tasks.lane_graph.open_dataset", lambda source, progress: kept)
+    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda source, progress: kept)
     task, source = RunConfig().task, RunConfig().data.source("train")
     whole = task.load(source)
-    monkeypatch.setattr("tflane_jax.tasks.lane_graph.IN_MEMORY", 1000)
+    monkeypatch.setattr("tflane_jax.datasets.loading.IN_MEMORY", 1000)
     large = task.load(source)
     assert isinstance(large, Streamed)
     for one, other in zip(*(batches(data, (3,), range(4), 2) for data in (whole, large)), strict=True):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
+from tflane_jax.evaluation.lane_shapes import detected, pixel_points, row_lanes
 
 from tests.golden import case_id, golden_modules, load_module_case, numbered, options
 from tests.golden_compare import assert_outputs_close, compare

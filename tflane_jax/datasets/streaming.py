@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from tflane_jax.datasets.base import Source
+from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
 
 
@@ -52,7 +52,7 @@ class Streamed:
         select: what to keep of an example, None is all of it.
     """
 
-    dataset: Source
+    dataset: IndexedExamples
     config: StreamingConfig = StreamingConfig()
     select: Callable[[Any], Any] | None = None
 

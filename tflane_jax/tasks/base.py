@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from tflane_jax.datasets.data_source import SplitData
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.models.parameters import Params
@@ -30,14 +31,6 @@ Terms = dict[str, Float[Array, ""] | Params]
 """Numbers to record of a loss; the entry `STATISTICS` holds new running statistics."""
 Draw = Callable[[Path, int, Params], None]
 """(run folder, step, averaged parameters) -> pictures in the run folder."""
-
-
-class DataConfig(Protocol):
-    """Where the examples of a run come from: what the data classes of `config` have in common."""
-
-    def source(self, split: Any) -> Any:
-        """Return the dataset of a split."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -111,14 +104,14 @@ class Task(Generic[ExampleT, DataT]):
         """Return what training looks at of a split, as `datasets.batches` takes it."""
         raise NotImplementedError
 
-    def shapes(self, data: DataConfig) -> ExampleT:
+    def shapes(self, data: SplitData) -> ExampleT:
         """Return shapes and types of one example, as far as can be told without its data."""
         raise NotImplementedError
 
-    def check(self, data: DataConfig, train: DataT) -> None:
+    def check(self, data: SplitData, train: DataT) -> None:
         """Raise UserError where the training split shows that the model cannot learn from these data."""
 
-    def prepare(self, data: DataConfig) -> Prepare | None:
+    def prepare(self, data: SplitData) -> Prepare | None:
         """Return the augmentation of training examples, None for none."""
         return None
 
@@ -133,7 +126,7 @@ class Task(Generic[ExampleT, DataT]):
         """Return the names ("group/name") of the scores that `evaluate` will give, without predicting anything."""
         raise NotImplementedError
 
-    def drawing(self, data: DataConfig, config: EvaluationConfig) -> Draw:
+    def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws predictions for a few validation examples while training."""
         raise NotImplementedError
 

@@ -13,15 +13,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from tflane_jax.datasets.argoverse2 import Argoverse2Dataset
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.batches import first_example
-from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.clips import as_clips
-from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays
-from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
+from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
-from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
@@ -38,12 +36,10 @@ from tflane_jax.models.parameters import Params, joined_statistics, split_statis
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
-from tflane_jax.tasks.base import DataConfig, Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 
 T = TypeVar("T")
 _COMPARED_EXAMPLES = 6
-IN_MEMORY = 6 * 2**30
-"""Bytes of training examples that are held in memory; more are read from the disk while training."""
 
 
 @dataclass(frozen=True)
@@ -181,14 +177,8 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     # Data
 
     def load(self, source: Any, *, progress: bool = True) -> Example | Streamed:
-        """Return the examples of a source, stacked; OpenLane-V2, and a large world, are read while they are used."""
-        dataset = open_dataset(source, progress=progress)
-        select = partial(keep, parts=self.parts)
-        if isinstance(source, OpenLaneV2Config):
-            return Streamed(dataset, source.loading, select)
-        if isinstance(dataset, CachedDataset) and dataset.nbytes(self.parts) > IN_MEMORY:
-            return Streamed(dataset, select=select)
-        return load_arrays(dataset, parts=self.parts, progress=progress)
+        """Return the examples of a source, see `datasets.sources.load`."""
+        return sources.load(source, progress=progress, parts=self.parts)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -200,24 +190,17 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         """Return the examples themselves, or the clips that they form."""
         return data if self.clip == 1 else as_clips(data, self.clip)
 
-    def shapes(self, data: DataConfig) -> Example:
+    def shapes(self, data: SplitData) -> Example:
         """Return shapes of the training parts of an example."""
-        source = data.source("train")
-        if isinstance(source, OpenLaneV2Config) and not source.root.is_dir():
-            example = nominal_example(source)
-        else:
-            # Not from the cache: one example is made sooner than all of them.
-            made = isinstance(source, ProceduralConfig)
-            example = (ProceduralDataset(source) if made else open_dataset(source)).example(0)
-        return shapes_of(keep(example, self.parts))
+        return shapes_of(keep(sources.sample(data.source("train")), self.parts))
 
-    def check(self, data: DataConfig, train: Example | Streamed) -> None:
+    def check(self, data: SplitData, train: Example | Streamed) -> None:
         """Raise UserError where a camera sees more BEV cells than it can serve."""
         encoder, cameras = self.model.encoder, first_example(train).cameras
         if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
             check_capacity(encoder.bev, cameras)
 
-    def prepare(self, data: DataConfig) -> Prepare | None:
+    def prepare(self, data: SplitData) -> Prepare | None:
         """Return the photometric augmentation of the data, if they have one."""
         augmentation = getattr(data, "augmentation", None)
         return None if augmentation is None else partial(_augmented, augmentation)
@@ -230,12 +213,12 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         metrics = evaluate_lanes(self, params, data, config.batch_size)
         return Evaluation(metrics.protocol, metrics.compute())
 
-    def drawing(self, data: DataConfig, config: EvaluationConfig) -> Draw:
+    def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws a few validation examples from above and in their camera images."""
         from tflane_jax.plots import save_camera_views, save_examples
 
         source = data.source("val")
-        dataset = open_dataset(source)
+        dataset = sources.open_dataset(source)
         indices = spread(len(dataset), config.pictures)
 
         def draw(folder: Path, step: int, params: Params) -> None:
@@ -258,7 +241,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         """Draw the test frames with the most hidden lanes (of streamed data, any), every model beside the truth."""
         from tflane_jax.plots import save_examples
 
-        dataset = open_dataset(source)
+        dataset = sources.open_dataset(source)
         if isinstance(data, Streamed):
             indices = spread(len(data), _COMPARED_EXAMPLES)
         else:
@@ -281,13 +264,6 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         if self.model.priors.traffic_flow is None:
             return {}
         return {"no traffic flow at inference": limit_instances(self, 0)}
-
-
-def open_dataset(source: Any, *, progress: bool = True) -> Dataset:
-    """Return the dataset of a source; the built-in world is built once and then read from its cache."""
-    if isinstance(source, ProceduralConfig):
-        return cached(ProceduralDataset(source), progress=progress)
-    return OpenLaneV2Dataset(source) if isinstance(source, OpenLaneV2Config) else Argoverse2Dataset(source)
 
 
 def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:

@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import augment
-from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset
-from tflane_jax.datasets.front_views import load_road_images as load_front_views
+from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
 from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare
-from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset, row_lanes
-from tflane_jax.datasets.tusimple import load_road_images as load_tusimple
 from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.predict import predict_batch, predictions
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
@@ -33,7 +32,7 @@ from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.lstr import LstrConfig, normalise
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
-from tflane_jax.tasks.base import DataConfig, Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 
 # The metric's image: rows and columns of TuSimple.
@@ -48,19 +47,6 @@ _TABLE_1 = (
     ("FastDraw", 90, 95.20, 7.60, 4.50),
     ("GTN paper", 420, 96.21, 2.93, 4.02),
 )
-
-
-@dataclass(frozen=True)
-class LabelledImages:
-    """A split in memory.
-
-    Attributes:
-        images: stacked.
-        truth: the labels of each, as the metric wants them.
-    """
-
-    images: RoadImage
-    truth: tuple[RowLanes, ...]
 
 
 @dataclass(frozen=True)
@@ -111,25 +97,19 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
 
     def load(self, source: Any, *, progress: bool = True) -> LabelledImages:
         """Return the images of a source, stacked, with their labels."""
-        if isinstance(source, FrontViewConfig):
-            images = load_front_views(source, progress=progress)
-            lines = (jax.tree.map(lambda leaf, i=i: leaf[i], images.lines) for i in range(len(images.image)))
-            return LabelledImages(images, tuple(row_lanes(each, HEIGHT, WIDTH) for each in lines))
-        dataset = TuSimpleDataset(source)
-        images = load_tusimple(dataset, progress=progress)
-        return LabelledImages(images, tuple(dataset.truth(index) for index in range(len(dataset))))
+        return sources.load(source, progress=progress)
 
     def examples(self, data: LabelledImages) -> RoadImage:
         """Return the images with their lines."""
         return data.images
 
-    def shapes(self, data: DataConfig) -> RoadImage:
+    def shapes(self, data: SplitData) -> RoadImage:
         """Return shapes of images at the network's resolution."""
         lines = LaneLines.empty(CAPACITY, len(ROWS))
         size = (INPUT_HEIGHT, INPUT_WIDTH)
         return shapes_of(RoadImage(np.zeros((*size, 3), np.uint8), np.zeros(size, bool), lines))
 
-    def prepare(self, data: DataConfig) -> Prepare | None:
+    def prepare(self, data: SplitData) -> Prepare | None:
         """Return the augmentation of the data, None for none."""
         augmentation = getattr(data, "augmentation", None)
         if augmentation is None:
@@ -155,11 +135,11 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         """Return the names of TuSimple's numbers and of the loss."""
         return frozenset(f"all/{name}" for name in (*TuSimpleMetrics().compute(), "loss")) - {"all/frames"}
 
-    def drawing(self, data: DataConfig, config: EvaluationConfig) -> Draw:
+    def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws lanes over a few validation images."""
         from tflane_jax.plots.images import save_road_images
 
-        dataset = open_images(data.source("val"))
+        dataset = sources.open_dataset(data.source("val"))
         indices = spread(len(dataset), config.pictures)
         examples = stack_examples([dataset.example(index) for index in indices]) if indices else None
 
@@ -200,27 +180,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         ]
 
 
-def open_images(source: FrontViewConfig | TuSimpleConfig) -> FrontViewDataset | TuSimpleDataset:
-    """Return the images of a source one by one."""
-    return FrontViewDataset(source) if isinstance(source, FrontViewConfig) else TuSimpleDataset(source)
-
-
 def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
     """Return the lanes of one prediction at the rows of the truth."""
     assert truth.rows is not None, "labels have rows"
     return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
-
-
-def truth_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> RowLanes:
-    """Return the labels of one image as the metric wants them."""
-    if isinstance(dataset, TuSimpleDataset):
-        return dataset.truth(index)
-    return row_lanes(dataset.example(index).lines, HEIGHT, WIDTH)
-
-
-def name_of(dataset: FrontViewDataset | TuSimpleDataset, index: int) -> str:
-    """Return the name of one image."""
-    return dataset.raw_file(index) if isinstance(dataset, TuSimpleDataset) else dataset.info(index).scene
 
 
 def predict_curves(task: Task[RoadImage, Any], params: Params, examples: RoadImage) -> CurvePrediction:

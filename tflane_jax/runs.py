@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from tflane_jax.config import RunConfig, Source
-from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config_io import added_settings, from_json, to_json, to_text
 from tflane_jax.errors import UserError
-from tflane_jax.tasks import system_of
+from tflane_jax.migrations import migrate
+from tflane_jax.tasks import System, system_of
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
@@ -53,6 +54,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     """
     check_start(folder, start)  # before data is made, which may take long
     system = system_of(config)
+    _check_metrics(config, system)
     data = system.load(config.data.source("train"), progress=progress)
     system.check(config, data)
     arrays = system.examples(config, data)
@@ -69,6 +71,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         optim=config.optim,
         resolved=to_json(config),
         resolved_text=to_text(config),
+        current_form=current_form,
         start=start,
         prepare=system.prepare(config),
         evaluate=evaluate,
@@ -77,9 +80,32 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     )
 
 
+def _check_metrics(config: RunConfig, system: System) -> None:
+    """Raise UserError where a setting names a score that the evaluation does not give."""
+    known = system.score_names(config)
+    adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
+    named = {"training.best_metric": config.training.best_metric}
+    if adaptive is not None:
+        named["optim.restarts.adaptive.metric"] = adaptive.metric
+    for setting, name in named.items():
+        if name not in known:
+            listed = ", ".join(sorted(score for score in known if "@" not in score))
+            raise UserError(f"{setting} is {name}, which the evaluation does not give: choose one of {listed}")
+
+
 def resumable_config(folder: Path) -> RunConfig:
-    """Return the configuration that a run was started with; raises UserError where there is no run."""
-    return from_json(RunConfig, read_config(folder))
+    """Return the configuration that a run was started with; raises UserError if the folder holds no run."""
+    return from_json(RunConfig, migrate(read_config(folder))[0])
+
+
+def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return a saved configuration (JSON) as this version writes it, and a line for each change to tell the user.
+
+    Raises UserError for a setting that this version cannot read.
+    """
+    migrated, notices = migrate(saved)
+    current = to_json(from_json(RunConfig, migrated))
+    return current, notices + added_settings(migrated, current)
 
 
 def open_run(folder: Path, which: Which | None = None) -> Run:
@@ -93,13 +119,16 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: there is no such checkpoint, it is damaged, or of a version that this one cannot read.
     """
     plain = Checkpoints(folder / "checkpoints")
-    config = from_json(RunConfig, plain.manifest(plain.find("last")).config)
+    migrated, notices = migrate(plain.manifest(plain.find("last")).config)
+    for notice in notices:
+        print(notice, file=sys.stderr)
+    config = from_json(RunConfig, migrated)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
     if which is None:
         which = "last" if checkpoints.best_step() is None else "best"
     step = checkpoints.find(which)
     params = per_seed(checkpoints.params(step), config.training.seeds)
-    return Run(str(folder), from_json(RunConfig, checkpoints.manifest(step).config), step, tuple(params))
+    return Run(str(folder), config, step, tuple(params))
 
 
 def open_weights(config: RunConfig) -> Run:

@@ -85,6 +85,10 @@ class System(Protocol):
         """Return the metrics of a model on a split."""
         ...
 
+    def score_names(self, config: Any) -> set[str]:
+        """Return the names ("group/name") of the scores that evaluating a configuration gives."""
+        ...
+
     def drawing(self, config: Any) -> Draw:
         """Return the function that draws predictions for a few validation examples while training."""
         ...

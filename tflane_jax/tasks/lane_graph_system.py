@@ -22,6 +22,8 @@ from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.evaluate import Sightings, evaluate_lanes, predictions
+from tflane_jax.files.openlane import ATTRIBUTES
+from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.scene import ElementPrediction, Example, LanePrediction, shapes_of, stack_examples
@@ -110,6 +112,18 @@ class LaneGraphSystem:
         """Return OpenLane-V2's centerline metrics for all, occluded and clear lanes."""
         metrics = evaluate_lanes(task, params, data, batch_size)
         return Evaluation(metrics.protocol, metrics.compute())
+
+    def score_names(self, config: RunConfig) -> set[str]:
+        """Return OpenLane-V2's centerline metrics by group, with those of traffic elements if the model has them."""
+        task = config.task
+        assert isinstance(task, LaneGraphTask)
+        marked = _source(config, "val").example.markers is not None
+        groups = Sightings.groups if marked else ()
+        names = set(Evaluation("", GroupedCenterlineMetrics(frame_groups=groups).compute()).scores())
+        if task.model.elements is not None:
+            of_elements = ("OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES)))
+            names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}
+        return names
 
     def drawing(self, config: RunConfig) -> Draw:
         """Return the function that draws a few validation examples from above and in their camera images."""

@@ -113,6 +113,10 @@ class LaneShapeSystem:
                 metrics.update(found_lanes(found, truth), truth)
         return Evaluation(metrics.protocol, {"all": metrics.compute() | {"loss": float(np.mean(losses))}})
 
+    def score_names(self, config: RunConfig) -> set[str]:
+        """Return TuSimple's metrics and the loss."""
+        return {f"all/{name}" for name in ("Accuracy", "FP", "FN", "loss")}
+
     def drawing(self, config: RunConfig) -> Draw:
         """Return the function that draws lanes over a few validation images."""
         from tflane_jax.plots.images import save_road_images

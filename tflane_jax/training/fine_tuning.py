@@ -12,6 +12,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.migrations import migrate
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config
 from tflane_jax.training.state import TrainState, per_seed
@@ -39,7 +40,7 @@ def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, 
 
 
 def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
-    settings = read_config(folder)["training"]
+    settings = migrate(read_config(folder))[0]["training"]
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
     step = checkpoints.best_step()
     params = checkpoints.params(checkpoints.find("last") if step is None else step)

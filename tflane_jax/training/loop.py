@@ -1,7 +1,7 @@
 """The training program, top to bottom: set up, state, compile, steps, evaluation, checkpoints, stop.
 
-It knows no dataset, metric or picture: the caller hands in arrays, a function that evaluates and one that draws. All
-that a run needs to go on is in its folder (`training.run_folder`).
+It knows no dataset, metric or picture: the caller passes arrays, a function that evaluates and one that draws. The run
+folder (`training.run_folder`) holds all that is needed to resume.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from tflane_jax.config_io import first_difference
 from tflane_jax.errors import UserError
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.batches import Prepare, batches, first_example
@@ -37,6 +38,8 @@ Evaluate = Callable[[Params], dict[str, float]]
 """Averaged parameters of one seed -> numbers by name."""
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
+CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
+"""Saved configuration (JSON) -> the same in the form of this version, and notices for the user."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class TrainingConfig:
 
 @dataclass
 class _Window:
-    """Sums of metrics since the last record, which a checkpoint carries so that records, too, survive a resume."""
+    """Sums of metrics since the last record; checkpoints hold them, so that a resumed run writes the same records."""
 
     steps: int = 0
     sums: dict[str, list[float]] = field(default_factory=dict)
@@ -115,6 +118,7 @@ def train(
     optim: OptimConfig,
     resolved: dict[str, Any],
     resolved_text: str = "",
+    current_form: CurrentForm | None = None,
     start: Start = "new",
     prepare: Prepare | None = None,
     evaluate: Evaluate | None = None,
@@ -130,7 +134,8 @@ def train(
         folder: of the run.
         config, optim: settings.
         resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
-        resolved_text: the same for people.
+        resolved_text: the same as text, for the run folder.
+        current_form: brings the saved configuration of a resumed run to the form of `resolved`; None leaves it.
         start: see `run_folder.claimed`.
         prepare: augments every example, see `training.batches`.
         evaluate, draw: called at every evaluation.
@@ -149,11 +154,14 @@ def train(
         # =============================================================================================================
         # Run folder
         # =============================================================================================================
-        if start == "resume" and (saved := read_config(folder)) != resolved:
-            raise UserError(
-                f"{folder} was started with another configuration ({_difference(saved, resolved)}): "
-                "resume it as it is, or start another run"
-            )
+        if start == "resume":
+            saved, notices = (current_form or _unchanged)(read_config(folder))
+            if difference := first_difference(saved, resolved):
+                raise UserError(
+                    f"{folder} was started with another configuration ({difference}): "
+                    "resume it as it is, or start another run"
+                )
+            _tell(notices)
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
         # =============================================================================================================
@@ -172,7 +180,7 @@ def train(
             given = starting_params(config.init_from, state, config.seeds, partly=config.init_partly)
             state = with_params(state, given, optimizer)
         first = step = int(np.max(state.step))
-        add_provenance(folder)
+        _tell(add_provenance(folder))
         write_text(folder / "config.txt", resolved_text)
         write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
 
@@ -276,12 +284,10 @@ def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...]
     )
 
 
-def _difference(saved: dict[str, Any], resolved: dict[str, Any], prefix: str = "") -> str:
-    """Return the first entry in which two configurations differ."""
-    for name in sorted(saved.keys() | resolved.keys()):
-        old, new = saved.get(name), resolved.get(name)
-        if isinstance(old, dict) and isinstance(new, dict) and old != new:
-            return _difference(old, new, f"{prefix}{name}.")
-        if old != new:
-            return f"{prefix}{name}: {old} there, {new} here"
-    return ""
+def _unchanged(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    return saved, []
+
+
+def _tell(notices: Sequence[str]) -> None:
+    for notice in notices:
+        tqdm.write(notice, file=sys.stderr)

@@ -17,6 +17,8 @@ import numpy as np
 
 from tflane_jax.config import RunConfig, Source
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
+from tflane_jax.datasets.front_views import FrontViewConfig, load_road_images
+from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.errors import UserError
 from tflane_jax.migrations import migrate
 from tflane_jax.tasks import System, system_of
@@ -91,6 +93,16 @@ def _check_metrics(config: RunConfig, system: System) -> None:
         if name not in known:
             listed = ", ".join(sorted(score for score in known if "@" not in score))
             raise UserError(f"{setting} is {name}, which the evaluation does not give: choose one of {listed}")
+
+
+def build_data(source: Source) -> None:
+    """Make the examples of the built-in world that are not in the cache yet; real data need nothing."""
+    if isinstance(source, ProceduralConfig):
+        from tflane_jax.tasks.lane_graph_system import open_dataset
+
+        open_dataset(source)
+    elif isinstance(source, FrontViewConfig):
+        load_road_images(source)
 
 
 def resumable_config(folder: Path) -> RunConfig:

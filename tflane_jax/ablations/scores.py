@@ -1,0 +1,129 @@
+"""Scores of trained runs on test sets, kept beside each run.
+
+A file of scores is valid for one checkpoint (its content), one data source, one evaluation setting and one state of the
+program's code. Whatever else is in the file is ignored.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tflane_jax
+from tflane_jax.ablations.comparison import Scores
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.config import RunConfig, apply_overrides
+from tflane_jax.config_io import to_json
+from tflane_jax.errors import UserError
+from tflane_jax.runs import open_run
+from tflane_jax.tasks import load_test_data, system_of
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.run_folder import write_json
+
+Which = Literal["last", "best"]
+CHECKPOINTS: tuple[Which, ...] = ("last", "best")
+OWN_TEST = ""
+"""Name of a configuration's own test split."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Scores of one checkpoint on one test set.
+
+    Attributes:
+        step: of the checkpoint.
+        protocol: of the metrics, with its version.
+        ways: scores of each way to use the run: "" as trained, others as `System.inference_variants` names them.
+    """
+
+    step: int
+    protocol: str
+    ways: dict[str, Scores]
+
+
+def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
+    """Return the configuration whose test split is a named test set.
+
+    Raises UserError for settings that are not of the data: the others cannot change in a trained model.
+    """
+    for name in settings:
+        if name.startswith("--") and not name.startswith("--data"):
+            raise UserError(f"a test set changes settings of the data (--data...), {name} is none")
+    return apply_overrides(config, settings) if settings else config
+
+
+def test_sets(job: Job) -> dict[str, RunConfig]:
+    """Return the configuration for each test set by name, the configuration's own test split first."""
+    return {name: with_test_set(job.config, settings) for name, settings in ({OWN_TEST: ()} | dict(job.tests)).items()}
+
+
+def measure_all(job: Job) -> None:
+    """Evaluate a finished run on all of its test sets, so that the scores are at hand afterwards."""
+    for config in test_sets(job).values():
+        for which in CHECKPOINTS:
+            measure(job, config, which)
+
+
+def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
+    """Return the scores of a finished run on a test set, evaluated once.
+
+    Args:
+        job: the run.
+        config: whose test split to evaluate on, see `test_sets`.
+        which: the last checkpoint, or the best one by `training.best_metric` on the validation split.
+
+    Returns:
+        None for "best" if no evaluation gave a finite best metric.
+    """
+    checkpoints = Checkpoints(job.folder / "checkpoints", best_metric=config.training.best_metric)
+    step = checkpoints.best_step() if which == "best" else checkpoints.find("last")
+    if step is None:
+        return None
+    mark = _mark(
+        checkpoint=checkpoints.content(step),
+        source=repr(config.data.source("test")),
+        evaluation=to_json(config.evaluation),
+        code=code_digest(),
+    )
+    path = job.folder.with_name(f"{job.folder.name}.scores.json")
+    kept = {name: entry for name, entry in _read(path) if entry["code"] == code_digest()}
+    if mark not in kept:
+        run = open_run(job.folder, step)
+        system, task = system_of(config), run.config.task
+        data, ways = load_test_data(config), {"": task} | system.inference_variants(task)
+        size = config.evaluation.batch_size
+        found = {way: system.evaluate(used, run.params[0], data, size) for way, used in ways.items()}
+        scores = {way: evaluation.scores() for way, evaluation in found.items()}
+        kept[mark] = {"code": code_digest(), "step": step, "protocol": found[""].protocol, "ways": scores}
+        write_json(path, kept)
+    entry = kept[mark]
+    return Measured(entry["step"], entry["protocol"], entry["ways"])
+
+
+def _mark(**parts: Any) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the entries of a file of scores that are complete."""
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        for mark, entry in content.items() if isinstance(content, dict) else ():
+            if isinstance(entry, dict) and entry.keys() >= {"code", "step", "protocol", "ways"}:
+                yield mark, entry
+
+
+@functools.cache
+def code_digest() -> str:
+    """Return the hash of the package's source files."""
+    package = Path(tflane_jax.__file__).parent
+    digest = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()

@@ -336,6 +336,7 @@ def _sweep(commands) -> None:
     parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
     parser.add_argument("--values", nargs="+", required=True, help="of the setting")
     parser.add_argument("--metrics", nargs="+", help="to show, say all/DET_l gap/recall (default: as compare does)")
+    parser.add_argument("--checkpoint", choices=("last", "best"), default="last", help="default last")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.set_defaults(takes_overrides=True)
 

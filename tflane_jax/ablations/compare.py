@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from tflane_jax.ablations.jobs import Failure, Job, Tests, plan_jobs
 from tflane_jax.ablations.report import Results, save_report
-from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, test_sets, with_test_set
+from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
 from tflane_jax.ablations.workers import noted, train_all, worker_threads
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
@@ -106,7 +106,7 @@ def _evaluate(trained: Mapping[str, Sequence[Job]], results: Results) -> list[Fa
                 continue
             with noted(job, failures):
                 (seed,) = job.config.training.seeds
-                config = test_sets(job)[test]
+                config = with_test_set(job.config, results.tests.get(test, ()))
                 for which in CHECKPOINTS:
                     if (measured := measure(job, config, which)) is not None:
                         results.add(test, which, name, seed, measured)

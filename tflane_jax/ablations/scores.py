@@ -11,7 +11,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.runs import open_run
 from tflane_jax.tasks import load_test_data, system_of
 from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.run_folder import write_json
 
 Which = Literal["last", "best"]
@@ -48,26 +49,29 @@ class Measured:
 
 
 def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
-    """Return the configuration whose test split is a named test set.
+    """Return the configuration whose test split is a named test set; its own for no settings.
 
     Raises UserError for settings that are not of the data: the others cannot change in a trained model.
     """
     for name in settings:
         if name.startswith("--") and not name.startswith("--data"):
             raise UserError(f"a test set changes settings of the data (--data...), {name} is none")
-    return apply_overrides(config, settings) if settings else config
+    if not settings:
+        return config
+    return replace(config, data=_changed(replace(config, training=TrainingConfig()), tuple(settings)).data)
 
 
-def test_sets(job: Job) -> dict[str, RunConfig]:
-    """Return the configuration for each test set by name, the configuration's own test split first."""
-    return {name: with_test_set(job.config, settings) for name, settings in ({OWN_TEST: ()} | dict(job.tests)).items()}
+@functools.lru_cache(maxsize=64)
+def _changed(config: RunConfig, settings: tuple[str, ...]) -> RunConfig:
+    """Apply settings; cached, because this takes a second and is the same for all seeds."""
+    return apply_overrides(config, settings)
 
 
 def measure_all(job: Job) -> None:
     """Evaluate a finished run on all of its test sets, so that the scores are at hand afterwards."""
-    for config in test_sets(job).values():
+    for settings in ((), *job.tests.values()):
         for which in CHECKPOINTS:
-            measure(job, config, which)
+            measure(job, with_test_set(job.config, settings), which)
 
 
 def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
@@ -75,7 +79,7 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
 
     Args:
         job: the run.
-        config: whose test split to evaluate on, see `test_sets`.
+        config: whose test split to evaluate on, see `with_test_set`.
         which: the last checkpoint, or the best one by `training.best_metric` on the validation split.
 
     Returns:

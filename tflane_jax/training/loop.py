@@ -49,16 +49,16 @@ class TrainingConfig:
     Attributes:
         steps: updates.
         batch_size: examples of an update (of each seed).
-        seeds: roots of everything random in training; several train side by side in one program, each exactly as it
-            would alone up to float rounding.
+        seeds: roots of all random numbers in training. Several seeds train in one program, each as it would alone up
+            to float rounding.
         log_every: steps between records; a record holds means over the steps since the last one.
         eval_every: steps between evaluations, each with a checkpoint and pictures; the last step always has one.
         checkpoint_every: steps between further checkpoints.
         keep_checkpoints: how many of the latest to keep, beside the best.
-        best_metric: of the evaluation, higher is better.
-        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); `{seed}` in it stands for
-            the seed. None starts afresh.
-        init_partly: whether that run's model may have other parts: what it lacks starts afresh.
+        best_metric: score of the evaluation that chooses the best checkpoint; higher is better.
+        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); `{seed}` in it is
+            replaced by the seed. None starts from random parameters.
+        init_partly: whether that run's model may have other modules; those that it lacks start from random parameters.
     """
 
     steps: int = 10_000
@@ -129,8 +129,8 @@ def train(
 
     Args:
         task: what to train.
-        arrays: training examples, see `training.batches`. Which of them a step sees follows from its number, so that
-            the step in a checkpoint is also the position in the data.
+        arrays: training examples, see `training.batches`. The step determines which of them are used, so that the step
+            of a checkpoint is also the position in the data.
         folder: of the run.
         config, optim: settings.
         resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
@@ -142,8 +142,8 @@ def train(
         progress: show a bar with rate and time left.
 
     Raises:
-        UserError: see `run_folder.claimed` and `Checkpoints`; settings that cannot work; a loss that is not finite,
-            after the last good state was written.
+        UserError: see `run_folder.claimed` and `Checkpoints`; settings out of range; a loss that is not finite, after
+            the last good state was written.
     """
     _check(config)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
@@ -215,7 +215,7 @@ def train(
             while batch is not None and stop.signal is None:
                 began = time.perf_counter()
                 state, values = update(state, batch)
-                # Waiting here costs nothing: matching is on the host, so that the host is needed in every step anyway.
+                # Waiting here costs nothing: matching runs on the host, which is needed in every step anyway.
                 values = jax.device_get(values)
                 if not values["finite"].all():
                     save({})
@@ -268,12 +268,12 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:
-    """Return the record of values that every seed has one of."""
+    """Return the record of values with one entry per seed."""
     return {"step": step, "split": split} | {name: v[0] if len(v) == 1 else v for name, v in values.items()}
 
 
 def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
-    """Name the step, the seed and the first thing that is not finite: a loss term, else the loss, else the gradient."""
+    """Return a message with the step, the seed and everything that is not finite: loss terms, loss, gradient."""
     bad = int(np.argmin(np.atleast_1d(values["finite"])))
     numbers = {name: float(np.atleast_1d(value)[bad]) for name, value in values.items()}
     terms = [name for name, value in sorted(numbers.items(), reverse=True) if not np.isfinite(value)]

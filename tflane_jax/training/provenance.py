@@ -39,7 +39,7 @@ def thread_setting(cores: int | None = None) -> dict[str, Any]:
 
 
 def provenance() -> dict[str, Any]:
-    """Return what is needed to know which program gave these numbers, as plain JSON."""
+    """Return code version, package versions, machine and command of this process, as plain JSON."""
     device = jax.devices()[0]
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -91,7 +91,7 @@ def _git() -> dict[str, Any] | None:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        # A package installed inside some other project's checkout is not that project's code.
+        # A package that is installed inside the checkout of another project is not that project's code.
         if not git("ls-files", "--", str(root / "__init__.py")):
             return None
         return {"commit": git("rev-parse", "HEAD"), "uncommitted_changes": bool(git("status", "--porcelain", "-uno"))}

@@ -1,7 +1,7 @@
-"""`tflane demo`: the main job on the built-in world, small enough for two cores and ten minutes.
+"""`tflane demo`: a small comparison on the built-in world, for two cores and ten minutes.
 
-The same host is trained twice, on BEV evidence alone and with traffic flow, and both are evaluated on scenes that
-neither has seen. One short run of each says little: `tflane compare` trains several seeds and tests the difference.
+The same host is trained twice, on BEV evidence alone and with traffic flow. Both are evaluated on unseen scenes. A
+single short run is no evidence: `tflane compare` trains several seeds and tests the difference.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def configs() -> dict[str, RunConfig]:
 
 
 def main(out: Path) -> int:
-    """Run the demo into a folder; what is there already is not done again."""
+    """Run the demo into a folder; finished runs in it are used."""
     print("Two trainings on the built-in world: lanes from BEV evidence alone, then with traffic flow (TF-Lane).")
     compare(configs(), (0,), out)
-    print("\nOne short run of each says little: `tflane compare` trains several seeds and tests the difference.")
+    print("\nA single short run is no evidence: `tflane compare` trains several seeds and tests the difference.")
     return 0

@@ -17,9 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from tflane_jax.config import RunConfig
-from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config_io import added_settings, from_json, to_json, to_text
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
@@ -54,6 +56,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     """
     check_start(folder, start)  # before data is made, which may take long
     task = config.task
+    _check_metrics(config)
     data: Any = task.load(config.data.source("train"), progress=progress)
     task.check(config.data, data)
     arrays = task.examples(data)
@@ -70,6 +73,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         optim=config.optim,
         resolved=to_json(config),
         resolved_text=to_text(config),
+        current_form=current_form,
         start=start,
         prepare=task.prepare(config.data),
         evaluate=evaluate,
@@ -78,9 +82,49 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     )
 
 
+def _check_metrics(config: RunConfig) -> None:
+    """Raise UserError where a setting names a score that the evaluation does not give."""
+    known = config.task.score_names(config.data, config.evaluation)
+    adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
+    named = {"training.best_metric": config.training.best_metric}
+    if adaptive is not None:
+        named["optim.restarts.adaptive.metric"] = adaptive.metric
+    for setting, name in named.items():
+        if name not in known:
+            listed = ", ".join(sorted(score for score in known if "@" not in score))
+            raise UserError(f"{setting} is {name}, which the evaluation does not give: choose one of {listed}")
+
+
+def build_data(source: Any) -> None:
+    """Make the examples of a source that are not in the cache yet; real data need nothing."""
+    build = source_of(source).build
+    if build is not None:
+        build(source, True)
+
+
+def load_test_data(config: RunConfig) -> Any:
+    """Return the examples of a configuration's test split; the last ones asked for stay in memory."""
+    return _loaded(config.data.source("test"), config.task)
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(source: Any, task: Any) -> Any:
+    return task.load(source)
+
+
 def resumable_config(folder: Path) -> RunConfig:
-    """Return the configuration that a run was started with; raises UserError where there is no run."""
-    return from_json(RunConfig, read_config(folder))
+    """Return the configuration that a run was started with; raises UserError if the folder holds no run."""
+    return from_json(RunConfig, migrate(read_config(folder))[0])
+
+
+def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return a saved configuration (JSON) as this version writes it, and a line for each change to tell the user.
+
+    Raises UserError for a setting that this version cannot read.
+    """
+    migrated, notices = migrate(saved)
+    current = to_json(from_json(RunConfig, migrated))
+    return current, notices + added_settings(migrated, current)
 
 
 def open_run(folder: Path, which: Which | None = None) -> Run:
@@ -94,13 +138,16 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: there is no such checkpoint, it is damaged, or of a version that this one cannot read.
     """
     plain = Checkpoints(folder / "checkpoints")
-    config = from_json(RunConfig, plain.manifest(plain.find("last")).config)
+    migrated, notices = migrate(plain.manifest(plain.find("last")).config)
+    for notice in notices:
+        print(notice, file=sys.stderr)
+    config = from_json(RunConfig, migrated)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
     if which is None:
         which = "last" if checkpoints.best_step() is None else "best"
     step = checkpoints.find(which)
     params = per_seed(checkpoints.params(step), config.training.seeds)
-    return Run(str(folder), from_json(RunConfig, checkpoints.manifest(step).config), step, tuple(params))
+    return Run(str(folder), config, step, tuple(params))
 
 
 def open_weights(config: RunConfig) -> Run:
@@ -143,7 +190,7 @@ def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = Tr
 
     Args:
         run: see `open_run`.
-        source: the examples, a config of `datasets.sources`.
+        source: the examples.
         task: another way to use the parameters, such as `limit_instances` gives; None is the run's own.
         progress: show bars while data is made.
 
@@ -165,16 +212,6 @@ def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = Tr
             rows.append({"lanes of": group, "seed": "std"} | {k: float(v.std(ddof=1)) for k, v in table.items()})
     columns = task.columns
     return every[0].protocol, [{name: row[name] for name in columns if name in row} for row in rows]
-
-
-def load_test_data(config: RunConfig) -> Any:
-    """Return the examples of a configuration's test split; the last ones asked for stay in memory."""
-    return _loaded(config.data.source("test"), config.task)
-
-
-@functools.lru_cache(maxsize=1)
-def _loaded(source: Any, task: Any) -> Any:
-    return task.load(source)
 
 
 def _drawing(config: RunConfig) -> Draw | None:

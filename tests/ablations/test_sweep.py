@@ -46,6 +46,8 @@ def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
     assert again.read_text().splitlines()[2].split("|")[1:-1] == [" data.world.severity ", " model ", " all/recall "]
     with pytest.raises(UserError, match="no metric all/wit, only all/DET_l, "):
         sweep(one, "data.world.severity", ["0"], tmp_path / "again", metrics=["all/wit"])
+    with pytest.raises(UserError, match="none is best: ask for `last`"):  # runs of no steps were never evaluated
+        sweep(one, "data.world.severity", ["0"], tmp_path / "again", which="best")
     first = json.loads(again.with_suffix(".json").read_text())["meta"]["scores"]["one"][0][0]
     assert first == content["meta"]["scores"]["one"][0][0]
 

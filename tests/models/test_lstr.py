@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tflane_jax.evaluation.lane_shapes import detected, pixel_points, row_lanes
 
 from tests.golden import case_id, golden_modules, load_module_case, numbered, options
 from tests.golden_compare import assert_outputs_close, compare
 from tests.shared import shared_path, shared_root
 from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
+from tflane_jax.evaluation.lane_shapes import detected, pixel_points, row_lanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig

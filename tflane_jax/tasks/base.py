@@ -122,8 +122,8 @@ class Task(Generic[ExampleT, DataT]):
         """Return the metrics of a model on a split."""
         raise NotImplementedError
 
-    def score_names(self, data: DataT, config: EvaluationConfig) -> frozenset[str]:
-        """Return the names ("group/name") of the scores that `evaluate` will give, without predicting anything."""
+    def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
+        """Return the names ("group/name") of the scores that evaluating on the validation split gives."""
         raise NotImplementedError
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:

@@ -25,9 +25,11 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
+from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -212,6 +214,16 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         """Return the metrics of everything that the host predicts and the examples label."""
         metrics = evaluate_lanes(self, params, data, config.batch_size)
         return Evaluation(metrics.protocol, metrics.compute())
+
+    def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
+        """Return OpenLane-V2's centerline metrics by group, with those of traffic elements if the model has them."""
+        marked = data.source("val").example.markers is not None
+        groups = Sightings.groups if marked else ()
+        names = set(Evaluation("", GroupedCenterlineMetrics(frame_groups=groups).compute()).scores())
+        if self.model.elements is not None:
+            of_elements = ("OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES)))
+            names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}
+        return names
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws a few validation examples from above and in their camera images."""

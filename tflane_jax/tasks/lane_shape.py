@@ -131,9 +131,9 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
                 metrics.update(found_lanes(found, truth), truth)
         return Evaluation(metrics.protocol, {"all": metrics.compute() | {"loss": float(np.mean(losses))}})
 
-    def score_names(self, data: LabelledImages, config: EvaluationConfig) -> frozenset[str]:
-        """Return the names of TuSimple's numbers and of the loss."""
-        return frozenset(f"all/{name}" for name in (*TuSimpleMetrics().compute(), "loss")) - {"all/frames"}
+    def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
+        """Return TuSimple's metrics and the loss."""
+        return {f"all/{name}" for name in ("Accuracy", "FP", "FN", "loss")}
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws lanes over a few validation images."""

@@ -1,4 +1,4 @@
-"""Parameters to start from: those of another run, whole or as far as the two models are the same."""
+"""Starting from the parameters of another run: all of them, or those that both models have."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config
@@ -19,18 +20,19 @@ from tflane_jax.training.state import TrainState, per_seed
 
 
 def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, partly: bool) -> list[Params]:
-    """Return the parameters that each seed starts from: the best averaged ones of a run (the last, where none was
-    evaluated).
+    """Return the parameters that each seed starts from: the averaged ones of a run's best checkpoint.
+
+    The last checkpoint counts as best if none was evaluated.
 
     Args:
-        reference: run folder; `{seed}` in it stands for the seed, so that each starts from a run of its own.
+        reference: run folder; `{seed}` in it is replaced by the seed, so that each seed can have its own run.
         state: fresh.
         seeds: of the state.
-        partly: keep the fresh parameters of what the run's model lacks, and leave out what only that one has.
+        partly: keep fresh parameters where the run's model has none, and ignore those that only that model has.
 
     Raises:
-        UserError: no such run, or it holds another model; where `partly`, one with nothing in common or with a
-            parameter of another shape.
+        UserError: no such run, or a run of another model; with `partly`, a model without common parameters or with
+            a parameter of another shape.
     """
     return [
         _params_of_run(Path(reference.replace("{seed}", str(seed))), fresh.params, partly=partly)
@@ -39,7 +41,7 @@ def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, 
 
 
 def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
-    settings = read_config(folder)["training"]
+    settings = migrate(read_config(folder))[0]["training"]
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
     step = checkpoints.best_step()
     params = checkpoints.params(checkpoints.find("last") if step is None else step)

@@ -1,8 +1,8 @@
-"""The folder of a run: who may write into it, and what lies where.
+"""The folder of a run: its files, and the lock that only one process at a time can hold.
 
-config.json, config.txt   resolved configuration: to load again, to read
-provenance.json           git hash, versions, device, command of every start
-metrics.jsonl             records; tensorboard/ holds the same
+config.json, config.txt   resolved configuration, as JSON and as text
+provenance.json           git hash, versions, device, cores, threads and command of every start
+metrics.jsonl             records; tensorboard/ holds the same numbers
 checkpoints/              see training.checkpoint
 curves.png, pictures/     drawn at every evaluation
 evaluations/              tables of `tflane eval`
@@ -37,7 +37,7 @@ _CONTENT = (
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the resolved configuration of a run as plain JSON; raises UserError where the folder holds no run."""
+    """Return the resolved configuration of a run as saved (JSON); raises UserError if the folder holds no run."""
     try:
         return json.loads((folder / "config.json").read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -48,15 +48,15 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def claimed(folder: Path, start: Start) -> Iterator[None]:
-    """Make the folder ready for this process alone, for as long as the block lasts.
+    """Prepare the folder and lock it for this process inside the block.
 
     Args:
         folder: of the run.
-        start: "new" refuses a folder that holds a run, "overwrite" deletes that run (and nothing else), "resume" needs
-            one.
+        start: "new" refuses a folder that holds a run, "overwrite" deletes that run (and no other files), "resume"
+            requires a run.
 
     Raises:
-        UserError: the folder is not what `start` says, another process trains into it, or it cannot be written.
+        UserError: the folder does not fit `start`, another process trains into it, or it cannot be written.
     """
     check_start(folder, start)
     try:
@@ -73,7 +73,7 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
 
 
 def check_start(folder: Path, start: Start) -> None:
-    """Raise UserError where the folder is not what `start` says; see `claimed`. Nothing is written."""
+    """Raise UserError if the folder does not fit `start`, see `claimed`. Nothing is written."""
     holds_run = (folder / "config.json").exists()
     if start == "new" and holds_run:
         raise UserError(
@@ -89,10 +89,10 @@ def check_start(folder: Path, start: Start) -> None:
 
 
 def _lock(file: int, folder: Path) -> None:
-    """Take the lock, which the system releases even where the process is killed."""
+    """Take the lock; the system releases it even if the process is killed."""
     try:
         import fcntl
-    except ImportError:  # Windows has no such lock; two processes in one folder are then the user's to avoid
+    except ImportError:  # Windows: two processes in one folder are not detected
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""What training carries from step to step: everything that a bit-exact resume needs, and nothing else."""
+"""State of a training between two steps: exactly what a bit-exact resume needs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tflane_jax.training.task import Trainable
 
 @struct.dataclass
 class TrainState:
-    """State after `step` updates; a further leading axis on every leaf when several seeds train together.
+    """State after `step` updates; with several seeds, every leaf has a leading seed axis.
 
     Attributes:
         step: () number of updates made.
         params: the task's parameters, running statistics included.
         ema_params: their exponential moving average, which is what gets evaluated.
         opt_state: of the optimiser.
-        key: () root key of the run; it never changes, streams are derived from it by name and step.
+        key: () root key of the run; it never changes, random streams are derived from it by name and step.
     """
 
     step: Int[Array, "*seeds"]
@@ -62,13 +62,13 @@ def init_states(
 
 
 def _run_once(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function compiled without optimisation: for one call the compiler takes longer than the program."""
+    """Call a function compiled without optimisation, because compiling takes longer than one call."""
     compiled = jax.jit(function).lower(*arguments).compile({"xla_backend_optimization_level": "0"})
     return compiled(*arguments)
 
 
 def with_params(state: TrainState, given: Sequence[Params], optimizer: optax.GradientTransformation) -> TrainState:
-    """Return the state of a run that starts from given parameters, one for each seed, as fine-tuning does."""
+    """Return the state of a run that starts from given parameters, one tree for each seed (fine-tuning)."""
     params: Params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given) if state.step.ndim else given[0]
     learned, _ = split_statistics(params)
     opt_state = jax.vmap(optimizer.init)(learned) if state.step.ndim else optimizer.init(learned)

@@ -87,6 +87,22 @@ def test_runs_from_before_thread_settings_were_recorded_are_used(tiny, out):
     assert losses(out / "base" / "seed_0") == before
 
 
+def test_a_run_that_started_from_another_one_depends_on_it(tiny, compared, tmp_path, capsys):
+    shutil.copytree(compared / "base", tmp_path / "hosts")
+    start = ["--training.init-from", str(tmp_path / "hosts" / "seed_{seed}")]
+    assert again(tiny, tmp_path / "out", *start) == 0
+    before = losses(tmp_path / "out" / "base" / "seed_0")
+    assert again(tiny, tmp_path / "out", *start) == 0
+    assert again(tiny, tmp_path / "other", "--optim.lr", "0.5") == 0
+    shutil.rmtree(tmp_path / "hosts")
+    assert again(tiny, tmp_path / "out", *start) == 0  # nothing is known to have changed
+    shutil.copytree(tmp_path / "other" / "base", tmp_path / "hosts")
+    capsys.readouterr()
+    assert again(tiny, tmp_path / "out", *start) == 2
+    assert f"training.init_from: {tmp_path / 'hosts' / 'seed_0'} was trained anew since" in capsys.readouterr().err
+    assert losses(tmp_path / "out" / "base" / "seed_0") == before
+
+
 def test_names_that_would_share_a_folder_get_one_each(tiny, tmp_path):
     command = ["compare", f"+TFM={tiny}", f"TFM={tiny}:baseline", "--seeds", "0", "--out", str(tmp_path)]
     assert main([*command, *QUICK]) == 0

@@ -1,7 +1,8 @@
 """The trainings of a comparison: folders, identities, and whether a folder already holds the wanted run.
 
 A run is identified by its whole resolved configuration, with exactly one seed, and by the thread setting of the process
-that trains it (`training.provenance.thread_setting`), because results depend on both.
+that trains it (`training.provenance.thread_setting`), because results depend on both. A run that starts from another
+one (`training.init_from`) also depends on that run's checkpoint.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.runs import current_form
 from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.fine_tuning import origins
 from tflane_jax.training.provenance import read_provenance, thread_setting
 from tflane_jax.training.run_folder import Start, read_config
 
@@ -63,10 +65,27 @@ class Job:
             saved, _ = current_form(read_config(self.folder))
         except UserError as error:
             return str(error)
-        # A run that was started before thread settings were recorded is taken as it is.
-        starts = [start["threads"] for start in read_provenance(self.folder) if "threads" in start]
-        threads = (first_difference(start, dict(self.threads)) for start in starts)
-        return first_difference(saved, to_json(self.config)) or next(filter(None, threads), "")
+        if difference := first_difference(saved, to_json(self.config)):
+            return difference
+        # A run that was started before these were recorded is taken as it is.
+        for start in read_provenance(self.folder):
+            if difference := first_difference(start.get("threads", self.threads), dict(self.threads)):
+                return difference
+            if difference := self._other_origin(start.get("init_from", [])):
+                return difference
+        return ""
+
+    def _other_origin(self, recorded: Sequence[Mapping[str, Any]]) -> str:
+        """Return which run of training.init_from is not the recorded one any more; "" if it is, or is gone."""
+        if not recorded:
+            return ""
+        training = self.config.training
+        try:
+            now = origins(training.init_from or "", training.seeds)
+        except UserError:
+            return ""
+        changed = [new["run"] for old, new in zip(recorded, now, strict=True) if old["content"] != new["content"]]
+        return f"training.init_from: {changed[0]} was trained anew since" if changed else ""
 
     def start(self) -> Start:
         """Return how the training has to start."""
@@ -125,9 +144,10 @@ def plan_jobs(
     if differences and not retrain:
         job, text = differences[0]
         more = f", and so do {len(differences) - 1} other folders" if len(differences) > 1 else ""
+        hint = "; --test evaluates finished runs on other data" if text.startswith("data.test") else ""
         raise UserError(
             f"{job.folder} holds a run of another configuration ({text}){more}: choose another folder with --out, or "
-            "train such runs anew with --retrain, which deletes them"
+            f"train such runs anew with --retrain, which deletes them{hint}"
         )
     return plan
 

@@ -35,17 +35,36 @@ def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, 
             a parameter of another shape.
     """
     return [
-        _params_of_run(Path(reference.replace("{seed}", str(seed))), fresh.params, partly=partly)
-        for seed, fresh in zip(seeds, per_seed(state, seeds), strict=True)
+        _params_of_run(folder, fresh.params, partly=partly)
+        for folder, fresh in zip(_folders(reference, seeds), per_seed(state, seeds), strict=True)
     ]
 
 
-def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
+def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Return folder, step and content of the checkpoint that each seed starts from, see `starting_params`."""
+    found = []
+    for folder in _folders(reference, seeds):
+        checkpoints, step, _ = _starting_checkpoint(folder)
+        found.append({"run": str(folder), "step": step, "content": checkpoints.content(step)})
+    return found
+
+
+def _folders(reference: str, seeds: Sequence[int]) -> list[Path]:
+    return [Path(reference.replace("{seed}", str(seed))) for seed in seeds]
+
+
+def _starting_checkpoint(folder: Path) -> tuple[Checkpoints, int, list[int]]:
+    """Return the checkpoints of a run, the step to start from, and the run's seeds."""
     settings = migrate(read_config(folder))[0]["training"]
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
     step = checkpoints.best_step()
-    params = checkpoints.params(checkpoints.find("last") if step is None else step)
-    saved, wanted = (_flat(tree) for tree in (per_seed(params, settings["seeds"])[0], fresh))
+    return checkpoints, checkpoints.find("last") if step is None else step, settings["seeds"]
+
+
+def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
+    checkpoints, step, seeds = _starting_checkpoint(folder)
+    params = checkpoints.params(step)
+    saved, wanted = (_flat(tree) for tree in (per_seed(params, seeds)[0], fresh))
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
             raise UserError(

@@ -25,7 +25,7 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.models.parameters import Params
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
-from tflane_jax.training.fine_tuning import starting_params
+from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter
@@ -171,7 +171,7 @@ def train(
         # =============================================================================================================
         state = init_states(task, optimizer, config.seeds, first_example(arrays))
         window, metrics, seconds = _Window(), {}, 0.0
-        memories = [Memory() for _ in config.seeds]
+        memories, started_from = [Memory() for _ in config.seeds], {}
         if start == "resume" and (written := checkpoints.steps()):
             manifest = checkpoints.manifest(written[-1])
             state = checkpoints.restore(manifest.step, state)
@@ -181,8 +181,9 @@ def train(
         elif config.init_from is not None:
             given = starting_params(config.init_from, state, config.seeds, partly=config.init_partly)
             state = with_params(state, given, optimizer)
+            started_from = {"init_from": origins(config.init_from, config.seeds)}
         first = step = int(np.max(state.step))
-        _tell(add_provenance(folder))
+        _tell(add_provenance(folder, **started_from))
         write_text(folder / "config.txt", resolved_text)
         write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
 

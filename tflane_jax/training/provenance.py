@@ -53,13 +53,13 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def add_provenance(folder: Path) -> list[str]:
-    """Append this start to the run folder's provenance.json.
+def add_provenance(folder: Path, **more: Any) -> list[str]:
+    """Append this start to the run folder's provenance.json, with further entries of plain JSON.
 
     Returns:
         A line for the user where an earlier start of the run had another thread setting.
     """
-    earlier, new = read_provenance(folder), provenance()
+    earlier, new = read_provenance(folder), provenance() | more
     write_json(folder / "provenance.json", [*earlier, new])
     others = [start["threads"] for start in earlier if start.get("threads", new["threads"]) != new["threads"]]
     if not others:

@@ -84,7 +84,7 @@ class LaneSegmentMetrics:
 
     def __init__(self, flavour: Flavour = "OpenLane-V2") -> None:
         self.flavour: Flavour = flavour
-        self._lanes = CenterlineMetrics("v2.1")
+        self._lanes = CenterlineMetrics(("v2.1",))
         self._true_areas = np.zeros(BOUNDARY + 1, np.int64)  # by category
         self._area_detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, categories, hits
 

@@ -51,11 +51,11 @@ def _centerline(version: Version) -> ScoringProtocol:
         read_predictions=_plain_or(plain.read_predictions, openlane_v2.read_predictions),
         read_truth=_plain_or(plain.read_truth, openlane_v2.read_truth),
         scene_of=lambda key: key.scene,
-        metrics=partial(CenterlineMetrics, version),
+        metrics=partial(CenterlineMetrics, (version,)),
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
         groups={
-            "occlusion": partial(GroupedCenterlineMetrics, version=version),
-            "distance": partial(DistanceCenterlineMetrics, version=version),
+            "occlusion": partial(GroupedCenterlineMetrics, versions=(version,)),
+            "distance": partial(DistanceCenterlineMetrics, versions=(version,)),
         },
     )
 

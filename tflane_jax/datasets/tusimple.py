@@ -21,13 +21,12 @@ from tflane_jax.datasets.base import FrameInfo, TruncationWarning
 from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image, resize
-from tflane_jax.files.tusimple import RowLanes, read_truth
+from tflane_jax.files.tusimple import NO_POINT, RowLanes, read_truth
 from tflane_jax.scene import LaneLines, RoadImage
 
 ROWS = np.arange(160.0, 720.0, 10.0)
 """Rows of the points of a line (56), pixels of an image `ROWS_HEIGHT` high."""
 ROWS_HEIGHT = 720
-_NO_POINT = -2.0
 
 Split = Literal["train", "val", "test", "all"]
 
@@ -199,7 +198,7 @@ def row_lanes(lines: LaneLines, height: float = ROWS_HEIGHT, width: float = 1280
     u, v = points[..., 0], points[..., 1]
     if valid.shape[1] != len(ROWS) or (valid & ~(np.abs(v * ROWS_HEIGHT - ROWS) < 0.01)).any():
         raise ValueError("the lines' points do not stand at TuSimple's rows: give lines that were not augmented")
-    return RowLanes(np.where(valid & (u >= 0.0), u * width, _NO_POINT), ROWS * (height / ROWS_HEIGHT))
+    return RowLanes(np.where(valid & (u >= 0.0), u * width, NO_POINT), ROWS * (height / ROWS_HEIGHT))
 
 
 def _label_files(root: Path, config: TuSimpleConfig) -> tuple[tuple[Path, ...], tuple[str, ...]]:

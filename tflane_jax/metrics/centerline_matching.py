@@ -1,4 +1,4 @@
-"""Matching of one frame by the OpenLane-V2 centerline rules, and what the metrics keep of it.
+"""Matching of one frame by the OpenLane-V2 centerline rules.
 
 Source: openlanev2/centerline/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md describes the rules.
 """
@@ -68,7 +68,7 @@ def iou_distance(a: Float[np.ndarray, "t 2 2"], b: Float[np.ndarray, "u 2 2"]) -
 
 @dataclass(frozen=True)
 class MatchedFrame:
-    """Everything that the metrics keep of one frame (K lane thresholds, P detections, G lanes).
+    """Matching results of one frame (K lane thresholds, P detections, G lanes).
 
     Attributes:
         scores: (P,).
@@ -106,7 +106,7 @@ class MatchedFrame:
 
 @dataclass(frozen=True)
 class MatchedElements:
-    """Everything that the metrics keep of the traffic elements of one frame.
+    """Matching results of the traffic elements of one frame.
 
     Attributes:
         scores, attributes, hits: (U,) detections, matched inside their attribute.
@@ -142,7 +142,7 @@ def match_lanes(
     """Match one frame whose detections are at `distance` from their `nearest` lanes; see `match_frame`."""
     g, p = len(truth.points), len(detections.points)
     edges, confidence = np.asarray(truth.successor, bool), np.asarray(detections.successor)
-    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
+    scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(edges, (g, g), "truth: successor")
     check_shape(scores, (p,), "detections: scores")
     check_shape(confidence, (p, p), "detections: successor")
@@ -171,7 +171,7 @@ def _match_elements(
     """Match the traffic elements of a frame whose lanes are matched; `lane_levels` by version, -1 for no lane."""
     t, u, p = len(truth.boxes), len(detections.boxes), next(iter(lane_levels.values())).shape[-1]
     edges, confidence = np.asarray(truth.lane, bool), np.asarray(detections.lane)
-    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
+    scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(np.asarray(truth.boxes), (t, 2, 2), "truth: element boxes")
     check_shape(edges, (lanes, t), "truth: lane to element")
     check_shape(np.asarray(detections.boxes), (u, 2, 2), "detections: element boxes")

@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import json
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -11,6 +12,7 @@ import pytest
 
 from tests.shared import ROOT
 from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, apply_overrides, load_ablations, load_config
+from tflane_jax.config_files import shipped_configs
 from tflane_jax.config_io import from_json, settings, to_json, to_text
 from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
@@ -226,6 +228,19 @@ def test_shipped_configurations_load_by_name_from_any_folder(name, ablation, tmp
     by_path = load_config(f"{ROOT}/configs/{name}.py{ablation}")
     monkeypatch.chdir(tmp_path)
     assert load_config(f"{name}{ablation}") == by_path
+
+
+def test_configurations_that_pages_name_exist():
+    """In commands and docstrings; braces and shell variables are left out."""
+    texts = [
+        path.read_text("utf-8") for path in [ROOT / "README.md", *ROOT.glob("docs/*.md"), *shipped_configs().values()]
+    ]
+    systems = "|".join(sorted({name.partition("/")[0] for name in shipped_configs()}))
+    pattern = rf"(?<![\w/.])(?:{systems})/[a-z0-9_]+(?::[a-z0-9_]+)?(?![\w/.])"
+    names = {name for text in texts for name in re.findall(pattern, text)}
+    assert len(names) > 20, "hardly anything found: has the pattern changed?"
+    for name in sorted(names):
+        load_config(name)
 
 
 def test_a_file_comes_before_a_shipped_name(tmp_path, monkeypatch):

@@ -34,20 +34,28 @@ def detections_from_prediction(
 ) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
-    No score threshold. The attribute of a traffic element is the one with the highest score of its query.
+    Without topology, no edge has any confidence. No score threshold. The attribute of a traffic element is the one with the highest score of its query.
     """
     scores = expit(np.asarray(prediction.logits)).max(-1)
     order = np.argsort(-scores, kind="stable")
+    edges = prediction.successor_logits
     return LaneDetections(
         points=np.asarray(prediction.points)[order],
         scores=scores[order],
-        successor=expit(np.asarray(prediction.successor_logits)[np.ix_(order, order)]),
-        elements=None if elements is None else _element_detections(elements, order),
+        successor=np.zeros((len(order),) * 2) if edges is None else expit(np.asarray(edges)[np.ix_(order, order)]),
+        elements=None if elements is None else element_detections(elements, order),
     )
 
 
-def _element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"]) -> ElementDetections:
-    """Return the elements, best score first, with the lanes in the given order."""
+def element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"] | None = None) -> ElementDetections:
+    """Return the traffic elements, best score first, with the lanes in the given order (None: that of the queries).
+
+    Raises ValueError for a prediction without lane-element topology.
+    """
+    if elements.lane_logits is None:
+        raise ValueError("the metrics of traffic elements need the lane-element topology (lane_logits)")
+    edges = np.asarray(elements.lane_logits)
+    lanes = np.arange(len(edges)) if lanes is None else lanes
     confidence = expit(np.asarray(elements.logits))
     scores = confidence.max(-1)
     order = np.argsort(-scores, kind="stable")
@@ -55,5 +63,5 @@ def _element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"
         boxes=np.asarray(elements.box)[order],
         attributes=confidence.argmax(-1)[order],
         scores=scores[order],
-        lane=expit(np.asarray(elements.lane_logits)[np.ix_(lanes, order)]),
+        lane=expit(edges[np.ix_(lanes, order)]),
     )

@@ -1,51 +1,166 @@
-"""Every protocol for what is around the vehicle: centerlines, lane segments, vector maps, by what a model predicts."""
+"""All protocols for what is around the vehicle, chosen by what a model predicts and an example labels.
+
+| predicted part | protocol | groups of numbers |
+|---|---|---|
+| `centerlines` (with `elements`) | OpenLane-V2 centerline | all, occluded, clear; seen, gap, before for markers |
+| `segments` | OpenLane-V2 lane segment; LaneSegNet | segments; lanesegnet |
+| `lines` | MapTR | lines |
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
+import numpy as np
+from scipy.special import expit
 
 from tflane_jax.datasets.streaming import Streamed
-from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
+from tflane_jax.evaluation.centerlines import detections_from_prediction, element_detections, truth_from_example
+from tflane_jax.evaluation.lane_segments import segment_detections, segment_truth
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
+from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.evaluation.vector_maps import map_detections, map_lines, map_truth
+from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
+from tflane_jax.metrics.topology import Version
+from tflane_jax.metrics.vector_map import CLASSES, VectorMapMetrics
 from tflane_jax.models.parameters import Params
-from tflane_jax.scene import Example
+from tflane_jax.scene import ElementPrediction, Example, LinePrediction, Prediction, SegmentPrediction, TrafficElements
+
+
+class LaneGraphMetrics:
+    """Accumulator of every protocol that applies; which ones, the first frame's prediction decides.
+
+    Args:
+        versions: of the OpenLane-V2 centerline metrics.
+        frame_groups: names of groups of frames, see `GroupedCenterlineMetrics`.
+    """
+
+    def __init__(self, versions: Sequence[Version] = ("v2.1",), frame_groups: Sequence[str] = ()) -> None:
+        self._centerlines = GroupedCenterlineMetrics(versions=versions, frame_groups=frame_groups)
+        self._segments = {"segments": LaneSegmentMetrics("OpenLane-V2"), "lanesegnet": LaneSegmentMetrics("LaneSegNet")}
+        self._lines = VectorMapMetrics()
+        self._measured: tuple[str, ...] = ()
+
+    @property
+    def protocol(self) -> str:
+        """Names and versions of the protocols that apply."""
+        return "; ".join(metrics.protocol for metrics in self._applied().values())
+
+    def update(self, prediction: Prediction, example: Example, frame_group: str | None = None) -> None:
+        """Add one frame.
+
+        Args:
+            prediction: of the last decoder layer, for this example alone.
+            example: with the truth of everything that is predicted. Traffic elements count where both have them.
+            frame_group: the group of frames that this frame belongs to.
+
+        Raises:
+            ValueError: nothing is predicted that a protocol measures.
+        """
+        parts = tuple(name for name in ("centerlines", "segments", "lines") if getattr(prediction, name) is not None)
+        if not parts:
+            raise ValueError("this task predicts no lanes, so there is nothing to measure")
+        self._measured = parts
+        both = prediction.elements is not None and example.traffic_elements is not None
+        found, true = (prediction.elements, example.traffic_elements) if both else (None, None)
+        if prediction.centerlines is not None:
+            detections = detections_from_prediction(prediction.centerlines, found)
+            self._centerlines.update(detections, truth_from_example(example.lanes, true), frame_group)
+        if prediction.segments is not None:
+            self._update_segments(prediction.segments, found, true, example)
+        if prediction.lines is not None:
+            self._lines.update(_lines(prediction.lines), _true_lines(example))
+
+    def _update_segments(
+        self,
+        segments: SegmentPrediction,
+        found: ElementPrediction | None,
+        true: TrafficElements | None,
+        example: Example,
+    ) -> None:
+        confidence = expit(np.asarray(segments.logits))
+        edges = segments.successor_logits
+        successor = np.zeros((len(confidence),) * 2) if edges is None else expit(np.asarray(edges))
+        detections = segment_detections(
+            np.asarray(segments.points),
+            np.asarray(segments.left),
+            np.asarray(segments.right),
+            confidence.argmax(-1),
+            confidence.max(-1),
+            successor,
+            elements=None if found is None else element_detections(found),
+        )
+        truth = segment_truth(example.segments, example.areas, true, None if true is None else example.lanes)
+        for metrics in self._segments.values():
+            metrics.update(detections, truth)
+
+    def compute(self) -> dict[str, dict[str, float]]:
+        """Return numbers by name, for every group of every protocol that applies."""
+        groups: dict[str, dict[str, float]] = {}
+        for name, metrics in self._applied().items():
+            groups |= metrics.compute() if name == "centerlines" else {name: metrics.compute()}
+        return groups
+
+    def _applied(self) -> dict[str, Any]:
+        """Return the accumulators that apply; without any frame, that of centerlines."""
+        measured = self._measured or ("centerlines",)
+        applied: dict[str, Any] = {"centerlines": self._centerlines} if "centerlines" in measured else {}
+        applied |= self._segments if "segments" in measured else {}
+        return applied | ({"lines": self._lines} if "lines" in measured else {})
+
+
+def _lines(lines: LinePrediction):
+    """Return the lines of the classes that MapTR's metric knows, each of its likeliest class."""
+    confidence = expit(np.asarray(lines.logits))
+    classes = confidence.argmax(-1)
+    return map_detections(np.asarray(lines.points), classes, confidence.max(-1), classes < len(CLASSES))
+
+
+def _true_lines(example: Example):
+    """Return the labelled map lines; without labels, those that lane segments and areas imply."""
+    lines = example.map_lines
+    if lines is None:
+        return map_truth(example.segments, example.areas)
+    return map_lines(lines.points, lines.category, np.asarray(lines.valid) & (np.asarray(lines.category) < len(CLASSES)))
 
 
 def evaluate_lanes(
-    task: Predictor, params: Params, arrays: Example | Streamed, batch_size: int = 16
-) -> GroupedCenterlineMetrics:
-    """Return the filled accumulator of OpenLane-V2's centerline metrics (groups all, occluded, clear) of a dataset.
+    task: Predictor, params: Params, arrays: Example | Streamed, config: EvaluationConfig | None = None
+) -> LaneGraphMetrics:
+    """Return the filled accumulator of a dataset.
 
-    Traffic elements are measured where the task predicts them and the examples have them. Examples that have markers
-    are measured by marker visibility as well, see `Sightings`.
+    Frames of examples with markers are grouped by marker visibility as well, see `Sightings`.
 
     Args:
-        task: predicts centerlines.
+        task: predicts lanes of any kind.
         params: of the task.
-        arrays: examples with `lanes`, see `datasets.batches`.
-        batch_size: see `predictions`.
+        arrays: examples with truth, see `datasets.batches`.
+        config: batch size and versions.
 
     Raises:
-        ValueError: the task predicts no centerlines.
+        ValueError: the task predicts no lanes.
     """
-    sightings, metrics = Sightings(), None
-    for indices, batch, answer in predicted_batches(task, params, arrays, batch_size):
-        if answer.centerlines is None:
-            raise ValueError("this task predicts no lanes, so there is nothing to measure")
-        both = answer.elements is not None and batch.traffic_elements is not None
-        found = answer.centerlines, answer.elements if both else None
-        true = batch.lanes, batch.traffic_elements if both else None
-        metrics = metrics or GroupedCenterlineMetrics(frame_groups=sightings.groups if batch.markers else ())
+    config = config or EvaluationConfig()
+    sightings, metrics = Sightings(), LaneGraphMetrics(config.versions)
+    for number, (indices, batch, answer) in enumerate(predicted_batches(task, params, arrays, config.batch_size)):
+        if number == 0 and batch.markers is not None:
+            metrics = LaneGraphMetrics(config.versions, sightings.groups)
         for row in range(len(indices)):
-            metrics.update(
-                detections_from_prediction(*jax.tree.map(lambda leaf, i=row: leaf[i], found)),
-                truth_from_example(*jax.tree.map(lambda leaf, i=row: leaf[i], true)),
-                sightings.next(batch.markers.valid[row].any(), batch.has_previous[row]) if batch.markers else None,
-            )
-    return metrics or GroupedCenterlineMetrics()
+            prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
+            group = None
+            if batch.markers is not None:
+                group = sightings.next(batch.markers.valid[row].any(), batch.has_previous[row])
+            metrics.update(prediction, example, group)
+    return metrics
+
+
+def _labels(batch: Example) -> Example:
+    """Return examples without what sensors and priors saw: no protocol reads it."""
+    inputs = ("bev", "hidden", "cameras", "traffic_flow", "markers", "sd_map")
+    return batch.replace(**dict.fromkeys(inputs))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class Sightings:

@@ -55,6 +55,8 @@ class HostConfig:
 
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
+    truth: ClassVar[tuple[str, ...]] = ("lanes",)
+    """Fields of `Example` with the truth that the loss and the metrics of this host read."""
     query_type: ClassVar[Literal["instance", "point"]] = "instance"
     """What a query represents, see `HostSpec.query_type`."""
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.scene.arrays import Array
 from tflane_jax.scene.priors import MarkerObservations, SdMap, TrafficFlow
-from tflane_jax.scene.truth import Areas, LaneGraph, LaneLines, TrafficElements
+from tflane_jax.scene.truth import Areas, LaneGraph, LaneLines, MapLines, TrafficElements
 from tflane_jax.scene.views import CameraViews
 
 
@@ -37,6 +37,7 @@ class Example:
         previous_from_ego: (4, 4) pose of this ego frame in the previous frame's ego frame.
         has_previous: () the previous frame belongs to the same scene.
         cameras: what the cameras see.
+        map_lines: truth, lines of a vector map; None where a dataset has none of its own.
     """
 
     bev: UInt8[Array, "h w c"] | None
@@ -51,6 +52,7 @@ class Example:
     previous_from_ego: Float[Array, "4 4"]
     has_previous: Bool[Array, ""]
     cameras: CameraViews | None = None
+    map_lines: MapLines | None = None
 
     def validate(self) -> None:
         """Validate every part; raise AssertionError naming the first field that does not fit."""
@@ -63,6 +65,7 @@ class Example:
             self.areas,
             self.traffic_elements,
             self.cameras,
+            self.map_lines,
         )
         for part in parts:
             if part is not None:

@@ -185,7 +185,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     @property
     def parts(self) -> tuple[str, ...]:
         """Fields of `Example` that training and evaluation read."""
-        further = {name for prior in self.model.build_priors().values() for name in prior.reads}
+        further = {name for prior in self.model.build_priors().values() for name in prior.reads}.union(self.model.truth)
         return (*TRAINING_PARTS, *sorted(further - set(TRAINING_PARTS)))
 
     def examples(self, data: Example | Streamed) -> Example | Streamed:
@@ -212,14 +212,15 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
 
     def evaluate(self, params: Params, data: Example | Streamed, config: EvaluationConfig) -> Evaluation:
         """Return the metrics of everything that the host predicts and the examples label."""
-        metrics = evaluate_lanes(self, params, data, config.batch_size)
+        metrics = evaluate_lanes(self, params, data, config)
         return Evaluation(metrics.protocol, metrics.compute())
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
         """Return OpenLane-V2's centerline metrics by group, with those of traffic elements if the model has them."""
         marked = data.source("val").example.markers is not None
         groups = Sightings.groups if marked else ()
-        names = set(Evaluation("", GroupedCenterlineMetrics(frame_groups=groups).compute()).scores())
+        metrics = GroupedCenterlineMetrics(frame_groups=groups, versions=config.versions)
+        names = set(Evaluation("", metrics.compute()).scores())
         if self.model.elements is not None:
             of_elements = ("OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES)))
             names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}

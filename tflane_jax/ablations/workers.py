@@ -24,7 +24,7 @@ from tflane_jax.runs import build_data, train_run
 from tflane_jax.training.provenance import thread_setting
 from tflane_jax.training.runtime import configure_jax
 
-_POLL_SECONDS = 0.5
+_POLL_SECONDS = 1.0
 
 
 def train_all(jobs: Sequence[Job], parallel: int) -> list[Failure]:

@@ -119,20 +119,20 @@ def test_smoothing_is_symmetrically_normalised(shape):
 @pytest.mark.parametrize("relation", ["near", "row", "column"])
 def test_graph_attention_equals_loops(relation):
     valid = random_valid(12)
-    listen, speak = random_array(13, *SHAPE, 2), random_array(14, *SHAPE, 2)
+    destination, source = random_array(13, *SHAPE, 2), random_array(14, *SHAPE, 2)
     value = random_array(15, *SHAPE, 2, 3)
     if relation == "near":
-        out, weights = jax.jit(attend_near)(listen, speak, value, jnp.asarray(valid))
+        out, weights = jax.jit(attend_near)(destination, source, value, jnp.asarray(valid))
         total = weights.sum(0)
     else:
         along = jax.jit(attend_along, static_argnums=0)
-        out, weights = along(int(relation == "row"), listen, speak, value, jnp.asarray(valid))
+        out, weights = along(int(relation == "row"), destination, source, value, jnp.asarray(valid))
         total = weights.sum(2) if relation == "row" else weights.sum(2).swapaxes(0, 1)
     np.testing.assert_allclose(np.asarray(total)[valid], 1.0, rtol=1e-5)
-    listen, speak, value, out = (np.asarray(x) for x in (listen, speak, value, out))
+    destination, source, value, out = (np.asarray(x) for x in (destination, source, value, out))
     for (i, j), head in itertools.product(zip(*np.nonzero(valid), strict=True), range(2)):
         cells = senders(relation, i, j, valid)
-        scores = [float(listen[i, j, head] + speak[a, b, head]) for a, b in cells]
+        scores = [float(destination[i, j, head] + source[a, b, head]) for a, b in cells]
         exps = [math.exp(score if score > 0 else 0.2 * score) for score in scores]
         expected = sum(e * value[a, b, head] for e, (a, b) in zip(exps, cells, strict=True)) / sum(exps)
         np.testing.assert_allclose(out[i, j, head], expected, rtol=1e-5, atol=1e-5)

@@ -1,15 +1,14 @@
-"""Weights of the reference's image encoder and BEVFormer encoder as parameters of ours.
+"""Weights of the published image encoder and BEVFormer encoder (TopoNet's copy) as parameters of ours.
 
-Names and layouts: shared specs/modules.md sections 1, 3, 4 and 11.
+The backbone has torchvision's names, the pyramid MMDetection's, and the encoder those of mmcv's transformer layers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from tflane_jax.convert.lstr import RESNET
-from tflane_jax.convert.renaming import Converted, Rule, below, convert, renamed_params
+from tflane_jax.convert.renaming import Converted, Rule, below, convert
 from tflane_jax.geometry.namespace import AnyArray
 
 FEATURE_PYRAMID: tuple[Rule, ...] = (
@@ -57,20 +56,3 @@ def convert_bevformer(state: Mapping[str, AnyArray]) -> Converted:
         UserError: a tensor that the constructer does not have.
     """
     return convert(state, BEV_CONSTRUCTER, "BEVFormer")
-
-
-def convert_image_encoder(state: Mapping[str, AnyArray]) -> Converted:
-    """Return the variables of `models.image_encoder.ImageEncoder` with frozen norms, and an account of every tensor.
-
-    Args:
-        state: `img_backbone.` and `img_neck.` of a detector.
-
-    Raises:
-        UserError: a tensor that the image encoder does not have.
-    """
-    return convert(state, IMAGE_ENCODER, "the image encoder", frozen=r"backbone/(.*/)?(\w*bn\d?)/.*")
-
-
-def params_of(state: Mapping[str, AnyArray], rules: tuple[Rule, ...]) -> dict[str, Any]:
-    """Return the parameters of one of the parts above; raises UserError where a tensor is none of its."""
-    return renamed_params(state, rules)

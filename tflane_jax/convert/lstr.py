@@ -1,6 +1,6 @@
 """The published LSTR weights as parameters of `models.lstr.Lstr`, every tensor accounted for.
 
-Names and layouts: shared specs/modules.md sections 1 and 2.
+Names are those of the published state dict (github.com/liuruijin17/LSTR); `convert.renaming` has the layouts.
 """
 
 from __future__ import annotations

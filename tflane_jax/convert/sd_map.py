@@ -1,6 +1,6 @@
-"""Weights of the reference SMERF: its map encoder, and a BEV encoder that looks at the map in every layer.
+"""Weights of the published SMERF: its map encoder, and the BEV encoder that attends to the map in every layer.
 
-Names and layouts: shared specs/modules.md sections 1, 4 and 9.
+Names are those of the published state dict (github.com/NVlabs/SMERF).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SD_MAP_ENCODER: tuple[Rule, ...] = (
     (_LAYER + r"norm1\.(weight|bias)", r"lines/layer_\1/attended/norm/\2", "norm"),
     (_LAYER + r"norm2\.(weight|bias)", r"lines/layer_\1/fed/norm/\2", "norm"),
 )
-# Before BEVFormer's rules: the norm of the map stands between the cameras' and the last.
+# Before BEVFormer's rules, since the map's norm comes before the last one and so shifts its number.
 SMERF_CONSTRUCTER: tuple[Rule, ...] = (
     *below(r"encoder\.layers\.(\d+)\.attentions\.2\.", r"encoder/layer_\1/sd_map_\1", CROSS_ATTENTION),
     (r"encoder\.layers\.(\d+)\.norms\.2\.(weight|bias)", r"encoder/layer_\1/sd_map_\1/norm/\2", "norm"),

@@ -1,8 +1,8 @@
-"""Weights of the reference TopoNet and of BEVFormer-DETR (OpenLane-V2's baseline) as parameters of our hosts.
+"""Weights of the published TopoNet and of BEVFormer-DETR (OpenLane-V2's baseline) as parameters of our hosts.
 
-Names and layouts: shared specs/modules.md sections 1, 5 and 9. Decoders are built from mmcv's layers: attentions and
-norms are numbered in the order in which a layer runs them. Both detectors call their encoder `bev_constructor`, the
-head of traffic elements `bbox_head` and that of lanes `pts_bbox_head`.
+Names are those of the published state dicts (github.com/OpenDriveLab/TopoNet and OpenLane-V2). Decoders are built from
+mmcv's layers: attentions and norms are numbered in the order in which a layer runs them. Both detectors call their
+encoder `bev_constructor`, the head of traffic elements `bbox_head` and that of lanes `pts_bbox_head`.
 """
 
 from __future__ import annotations

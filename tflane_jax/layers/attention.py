@@ -1,8 +1,8 @@
 """Masked attention whose empty rows are exactly zero, and multi-head attention on top of it.
 
-Library attention returns the mean of the masked values for a query whose keys are all masked; here such a query gets 0
-and contributes no gradient, so that an absent prior equals no prior. What stands in masked slots may be anything, NaN
-included. Softmax and its gradient are written out, which decides the speed on CPU (`benchmarks/attention_masks.py`).
+Library attention returns the mean of the masked values for a query whose keys are all masked. Here such a query gets 0
+and contributes no gradient, so that an absent prior equals no prior. Masked slots may hold anything, NaN included.
+Softmax and its gradient are written out, which decides the speed on CPU (`benchmarks/attention_masks.py`).
 """
 
 from __future__ import annotations
@@ -210,9 +210,9 @@ class MultiHeadAttention(nn.Module):
     Attributes:
         dim: channels that are split over the heads.
         heads: number of heads.
-        dropout: share of attention weights that training drops.
+        dropout: probability with which training drops an attention weight.
         out: channels out, None for `dim`.
-        zero_init: begin with a result of 0, for an attention that is added to what has been trained without it.
+        zero_init: initialise the output projection with 0, to add the attention to a model trained without it.
     """
 
     dim: int

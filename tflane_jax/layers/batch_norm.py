@@ -18,8 +18,8 @@ class BatchNorm(nn.Module):
     get the same update). Where there is no axis of the given name, the statistics are those of the one example.
 
     Attributes:
-        frozen: never learn: scale and bias are constants in `batch_stats` too, and training uses the running
-            statistics (hosts with a pretrained backbone; the stem of the published LSTR).
+        frozen: constant: scale and bias lie in `batch_stats` too, and training uses the running statistics (hosts with
+            a pretrained backbone; the stem of the published LSTR).
         axis_name: of the batch axis.
         momentum: weight of the new statistics in the running ones (PyTorch's sense).
         epsilon: added to the variance.
@@ -50,7 +50,7 @@ class BatchNorm(nn.Module):
                 mean.value += self.momentum * (used_mean - mean.value)
                 variance.value += self.momentum * (unbiased - variance.value)
         factor = scale * lax.rsqrt(used_variance + self.epsilon)
-        # In float32, the answer in the precision of what came in.
+        # Computed in float32; the result has the precision of the input.
         return (x * _like(factor, x) + _like(bias - used_mean * factor, x)).astype(x.dtype)
 
     def _batch_statistics(self, x):

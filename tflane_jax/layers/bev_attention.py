@@ -1,6 +1,6 @@
 """BEVFormer's two attentions of bird's-eye-view queries: to the previous frame and to the cameras.
 
-Reference: Li et al. 2022, sections 3.3 and 3.4; specs/modules.md section 3.
+Reference: Li et al. 2022, sections 3.3 and 3.4.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _INIT = nn.initializers.xavier_uniform()
 
 
 class TemporalSelfAttention(nn.Module):
-    """Queries look at the previous BEV features and at the present ones.
+    """Deformable attention of BEV queries to the previous and the present BEV features.
 
     Attributes:
         dim: channels in and out.
         heads, points: sampling points per head and frame.
-        value_projections: how often the value is projected; OpenLane-V2's baseline and SMERF do it twice.
+        value_projections: how often the value is projected; twice in OpenLane-V2's baseline and SMERF.
         dtype: of the projections.
     """
 
@@ -59,7 +59,7 @@ class TemporalSelfAttention(nn.Module):
         value = frames
         for _ in range(self.value_projections):
             value = project(value)
-        # The two frames are two levels of one value, each with its own softmax, and each half of the answer.
+        # The two frames are two levels of one value, each with its own softmax; the result is their mean.
         offsets, logits = offsets_and_logits(jnp.concatenate([history, query], -1), heads, 2, points, self.dtype)
         weights = 0.5 * jax.nn.softmax(logits, -1)
         shapes = (shape, shape)
@@ -70,14 +70,14 @@ class TemporalSelfAttention(nn.Module):
 
 
 class SpatialCrossAttention(nn.Module):
-    """Queries look into the cameras that see their pillars.
+    """Deformable attention of BEV queries to the cameras that see their pillars.
 
     Attributes:
         dim: channels in and out.
-        heads, points: sampling points per head and level, shared out among the anchors of a pillar.
-        capacity: queries that one camera can serve; None lets every camera serve all queries, which gives the same
-            where the capacity suffices and costs as many times more as cameras see a query in vain. Queries beyond it
-            (the last of the grid) do without that camera; their number is sown as the intermediate `overflow`.
+        heads, points: sampling points per head and level, divided among the anchors of a pillar.
+        capacity: most queries per camera, to skip those that a camera does not see; None evaluates all queries in all
+            cameras, with the same result if the capacity suffices. Beyond it, the last queries of the grid do without
+            that camera; their number is stored as the intermediate `overflow`.
         dtype: of the projections.
     """
 
@@ -96,7 +96,7 @@ class SpatialCrossAttention(nn.Module):
         reference: Float[Array, "v q z 2"],
         visible: Bool[Array, "v q z"],
     ) -> Float[Array, "q c"]:
-        """Return the mean of what the cameras that see a query show, without residual.
+        """Return the mean of the attended features over the cameras that see a query, without residual.
 
         Args:
             query: content.
@@ -114,7 +114,7 @@ class SpatialCrossAttention(nn.Module):
         seen = visible.any(-1)
         if self.capacity is None or self.capacity >= queries:
             around = jax.vmap(_around_anchors, in_axes=(0, None))(reference, offsets)
-            # Unseen queries take nothing, so that nothing but zeros flows back through them.
+            # Unseen queries have weight 0, so that their gradients are zero.
             taken = jnp.where(seen[:, :, None, None, None], weights[None], 0.0)
             total = deformable_attention(value, shapes, around, taken).sum(0)
         else:
@@ -132,7 +132,7 @@ class SpatialCrossAttention(nn.Module):
 
 
 def first_seen(seen: Bool[Array, "v q"], capacity: int) -> Int[Array, "v capacity"]:
-    """Return the indices of the first queries that each camera sees, ascending; Q where it sees no more."""
+    """Return the indices of the first queries that each camera sees, ascending, filled up with Q."""
     cameras, queries = seen.shape
     place = jnp.cumsum(seen, 1) - 1
     place = jnp.where(seen, place, capacity)
@@ -144,7 +144,7 @@ def first_seen(seen: Bool[Array, "v q"], capacity: int) -> Int[Array, "v capacit
 def _around_anchors(
     reference: Float[Array, "q z 2"], offsets: Float[Array, "q heads levels p 2"]
 ) -> Float[Array, "q heads levels p 2"]:
-    """Return locations: point p of a head belongs to anchor p modulo Z."""
+    """Return sampling locations; point p of a head belongs to anchor p modulo Z."""
     *lead, points, _ = offsets.shape
     anchors = reference.shape[1]
     split = offsets.reshape(*lead, points // anchors, anchors, 2)

@@ -1,4 +1,4 @@
-"""Multi-scale deformable attention (Deformable DETR), as BEVFormer and TopoNet use it (specs/modules.md section 3)."""
+"""Multi-scale deformable attention (Deformable DETR, Zhu et al. 2021), as BEVFormer and TopoNet use it."""
 
 from __future__ import annotations
 
@@ -52,21 +52,21 @@ class DeformableAttention(nn.Module):
         """Return the attended features, without residual.
 
         Args:
-            query: content plus position; it decides where to look and how much to take.
-            value: features to look at, levels concatenated.
+            query: content plus position; gives sampling offsets and weights.
+            value: features to sample, levels concatenated.
             shapes: (h, w) of each level.
-            reference: where to look, in [0, 1]: (Q, R, D) for all levels together, or (Q, R, levels, D). R = 1 for all
-                heads together, or R = heads, one point for each (LaneSegNet's heads-to-regions). D = 2 is a point
-                (x, y), offsets then count in cells; D = 4 a box (cx, cy, w, h), offsets then count in halves of the
-                box, divided by the number of points (Deformable DETR's refined boxes).
-            valid: cells that hold something; the others give nothing, whatever stands in them.
+            reference: reference points in [0, 1], (Q, R, D) for all levels or (Q, R, levels, D) for each. R = 1 is one
+                for all heads, R = heads one for each (LaneSegNet's heads-to-regions). D = 2 is a point (x, y) with
+                offsets in cells; D = 4 a box (cx, cy, w, h) with offsets in units of half the box, divided by the
+                number of points (Deformable DETR's refined boxes).
+            valid: cells that are not padding; padding may hold anything, NaN included.
 
         Raises:
             ValueError: a reference of another shape.
         """
         offsets, logits = offsets_and_logits(query, self.heads, self.levels, self.points)
         weights = jax.nn.softmax(logits, (-2, -1))
-        # Before the projection too: what stands in padding must not reach the projection's gradient.
+        # Before the projection too: padding must not reach the projection's gradient.
         value = nn.Dense(self.dim, name="value_proj")(_masked(value, valid))
         value = _masked(value, valid).reshape(-1, self.heads, self.dim // self.heads)
         locations = sampling_locations(reference, offsets, shapes)
@@ -77,7 +77,7 @@ class DeformableAttention(nn.Module):
 def offsets_and_logits(
     query: Float[Array, "q c"], heads: int, levels: int, points: int, dtype: Any = None
 ) -> tuple[Float[Array, "q heads levels p 2"], Float[Array, "q heads levels p"]]:
-    """Return where to look and how much to take, in float32, as layers of the module whose method calls this."""
+    """Return sampling offsets and logits in float32, with layers that belong to the calling module."""
     bias = compass_offsets(heads, levels, points).reshape(-1)
     offsets = nn.Dense(
         heads * levels * points * 2,
@@ -94,7 +94,7 @@ def offsets_and_logits(
 
 
 def cell_units(shapes: Sequence[tuple[int, int]]) -> Float[Array, "levels 2"]:
-    """Return the size of a cell of each level, (x, y), where the level is 1."""
+    """Return the size (x, y) of a cell of each level, in units of the level."""
     return jnp.array([(1.0 / w, 1.0 / h) for h, w in shapes], jnp.float32)
 
 
@@ -103,7 +103,7 @@ def sampling_locations(
     offsets: Float[Array, "q heads levels p 2"],
     shapes: Sequence[tuple[int, int]],
 ) -> Float[Array, "q heads levels p 2"]:
-    """Return the locations in [0, 1] that offsets from the references stand for (see `DeformableAttention`).
+    """Return sampling locations in [0, 1] from references and offsets (see `DeformableAttention`).
 
     Raises:
         ValueError: a reference of another shape.

@@ -1,4 +1,4 @@
-"""Feature pyramid network (Lin et al. 2017) as MMDetection builds it (specs/modules.md section 11)."""
+"""Feature pyramid network (Lin et al. 2017) with MMDetection's extra levels (`add_extra_convs="on_output"`)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class FeaturePyramidConfig:
 
     Attributes:
         dim: channels of every level.
-        levels: levels out. More than come in are made by convolutions of stride 2 on the coarsest.
+        levels: levels out; those beyond the input's are convolutions of stride 2 on the coarsest output.
     """
 
     dim: int = 256
@@ -28,7 +28,7 @@ class FeaturePyramidConfig:
 
 
 class FeaturePyramid(nn.Module):
-    """Features of a backbone's stages in, levels of one width out.
+    """Maps the features of a backbone's stages to levels of one width.
 
     Attributes:
         config: sizes.
@@ -49,7 +49,7 @@ class FeaturePyramid(nn.Module):
             merged[i] = merged[i] + enlarge(merged[i + 1], *merged[i].shape[1:3])
         outputs = [self._conv(3, 1, f"output_{i}")(x) for i, x in enumerate(merged)]
         for i in range(given, levels):
-            # The reference's `relu_before_extra_convs` leaves out the first of them.
+            # MMDetection's `relu_before_extra_convs` has no effect on the first extra level.
             x = outputs[-1] if i == given else nn.relu(outputs[-1])
             outputs.append(self._conv(3, 2, f"output_{i}")(x))
         return outputs

@@ -1,8 +1,8 @@
 """TopoNet's scene graph: messages between lanes and from traffic elements to lanes, and the heads that predict edges.
 
-Reference: specs/modules.md section 5. The edges that a layer passes messages along are the previous layer's own
-predictions, as probabilities without gradient. Rows index lanes; [i, j] means that lane j continues lane i, or that
-element j governs lane i.
+Reference: TopoNet (Li et al. 2023) and its published code. The edges of a layer are the previous layer's predictions,
+as probabilities without gradient. Rows index lanes; [i, j] means that lane j continues lane i, or that element j
+governs lane i.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 @struct.dataclass
 class ElementNodes:
-    """The traffic elements as the scene graph sees them.
+    """Traffic elements as nodes of the scene graph.
 
     Attributes:
         features: (E, C), embedded for the lane decoder.
@@ -35,7 +35,7 @@ class LaneGraphConvolution(nn.Module):
 
     Attributes:
         dim: channels out.
-        edge_weight: e, the share of neighbours (TopoNet: 0.6).
+        edge_weight: e, the weight of neighbours (TopoNet: 0.6).
     """
 
     dim: int
@@ -77,13 +77,13 @@ class ElementGraphConvolution(nn.Module):
 class SceneGraphFeedForward(nn.Module):
     """FFN_SGNN: a feed-forward block whose output passes through the scene graph.
 
-    What comes along the edges from lanes and, where there are any, from traffic elements is joined before `downsample`.
+    Messages from lanes and, if there are any, from traffic elements are concatenated before `downsample`.
 
     Attributes:
         dim: channels.
         hidden: channels inside the feed-forward part.
         edge_weight: see `LaneGraphConvolution`.
-        dropout: of hidden channels, the joined messages and what is added.
+        dropout: probability for hidden channels, messages and the residual branch.
     """
 
     dim: int
@@ -100,9 +100,9 @@ class SceneGraphFeedForward(nn.Module):
         *,
         deterministic: bool = True,
     ) -> Float[Array, "q c"]:
-        """Return x plus what the block adds."""
+        """Return x plus the block's output."""
         drop = lambda name, y: nn.Dropout(self.dropout, name=name)(y, deterministic=deterministic)  # noqa: E731
-        # The reference applies ReLU after the second linear as well (specs section 15, item 7).
+        # TopoNet's code applies ReLU after the second linear layer as well.
         features = drop("expand_dropout", nn.relu(nn.Dense(self.hidden, name="expand")(x)))
         features = drop("contract_dropout", nn.relu(nn.Dense(self.dim, name="contract")(features)))
         received = LaneGraphConvolution(self.dim, self.edge_weight, name="lane_lane")(features, adjacency)
@@ -116,8 +116,8 @@ class SceneGraphFeedForward(nn.Module):
 class RelationshipHead(nn.Module):
     """Scores every ordered pair of two sets: an MLP for each side, then an MLP on the joined pair.
 
-    The first pair layer acts on [a_i | b_j]; it is computed as U a_i + V b_j, which is the same and never builds
-    the joined (A, B, 2 hidden) array.
+    The first pair layer acts on [a_i | b_j]. It is computed as U a_i + V b_j, which is equal and never builds the
+    (A, B, 2 hidden) array.
 
     Attributes:
         hidden: channels of a side after its MLP (TopoNet: 128), twice that in the pair MLP.

@@ -116,9 +116,9 @@ def propagate(
         weights: W of Eq. (1) by hop; -inf excludes an edge type from a hop.
         x: features of the channels side by side, d a multiple of c.
     """
-    shares = jnp.repeat(nn.softmax(weights, -1), x.shape[-1] // weights.shape[1], axis=1).swapaxes(1, 2)
-    for hop, of_hop in enumerate(shares):
-        x = mix(hop, of_hop, x)
+    by_hop = jnp.repeat(nn.softmax(weights, -1), x.shape[-1] // weights.shape[1], axis=1).swapaxes(1, 2)
+    for hop, type_weights in enumerate(by_hop):
+        x = mix(hop, type_weights, x)
     return x
 
 

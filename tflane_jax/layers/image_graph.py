@@ -1,14 +1,15 @@
 """Edge types between the cells of a feature map, applied without their matrices.
 
-A cell hears (rows of the adjacency) from other cells. Edge types are scaled such that the edges into each valid cell
-sum to 1: D^-1 A, known in closed form from which cells are valid. Then so do the edges of every product of edge types,
-and meta-paths need no normalisation. A cell that nobody of an edge type speaks to hears itself, as in FastGTN.
+Rows of an adjacency A are destination cells, columns are source cells. Edge types are scaled so that the edges into
+each valid cell sum to 1: D^-1 A, known in closed form from the validity of the cells. Products of edge types then have
+the same property, so meta-paths need no normalisation. A cell without incoming edges of a type keeps a self-loop, as in
+FastGTN.
 
 * `self`: the cell itself.
 * `up`, `down`, `left`, `right` and the four diagonals: the neighbour on that side, a shift of the map.
 * `row`, `column`: all valid cells of the same row or column, itself included; a mean along an axis.
 
-A cell that is not valid neither hears nor is heard: its row and its column are 0.
+Invalid cells have no edges: their rows and columns of A are 0.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Relation = Literal[
 ]
 Side = tuple[int, int]
 
-# Where the neighbour stands: cells down and to the right.
+# Offset of the neighbour: (cells down, cells to the right).
 SIDES: Mapping[str, Side] = {
     "up": (-1, 0),
     "down": (1, 0),
@@ -43,53 +44,58 @@ AXES: Mapping[str, int] = {"row": 1, "column": 0}
 
 
 def mix_relations(
-    relations: tuple[Relation, ...], shares: Float[Array, "e c"], x: Float[Array, "h w c"], valid: Bool[Array, "h w"]
+    relations: tuple[Relation, ...],
+    type_weights: Float[Array, "e c"],
+    x: Float[Array, "h w c"],
+    valid: Bool[Array, "h w"],
 ) -> Float[Array, "h w c"]:
-    """Return sum_e share_e A_e x, Eq. (1) of the GTN lane paper applied to features; 0 for cells that are not valid.
+    """Return sum_e weight_e A_e x, Eq. (1) of the GTN lane paper applied to features; 0 for invalid cells.
 
-    The gradient is written out: it is a mixture of shifts and means as well, where JAX's is a dozen arrays.
+    The gradient is written out as a mixture of shifts and means; JAX's own would allocate a dozen arrays.
 
     Args:
         relations: edge types, at least one.
-        shares: of each edge type, by feature.
-        x: 0 where not valid, by `jnp.where`, which also stops the gradient: what it is there is not cleared again.
-        valid: cells that hear and are heard.
+        type_weights: weight of each edge type, by feature.
+        x: 0 in invalid cells, set by `jnp.where` so that no gradient flows there either; not cleared again here.
+        valid: cells that have edges.
     """
-    mixed: Array = _mix(relations, shares, x, valid)
+    mixed: Array = _mix(relations, type_weights, x, valid)
     return mixed
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _mix(relations: tuple[Relation, ...], shares, x, valid) -> Array:
-    parts = [share * heard for share, heard in zip(shares[:, None, None], _heard(relations, x, valid), strict=True)]
+def _mix(relations: tuple[Relation, ...], type_weights, x, valid) -> Array:
+    messages = _messages(relations, x, valid)
+    parts = [weight * message for weight, message in zip(type_weights[:, None, None], messages, strict=True)]
     return jnp.where(valid[..., None], sum(parts[1:], parts[0]), 0.0)
 
 
 def _mix_backward(relations, residuals, gradient):
-    shares, x, valid = residuals
+    type_weights, x, valid = residuals
     gradient, back = bordered_sides(relations, gradient, valid, -1)
     by_line = {axis: gradient.sum(axis, keepdims=True) for axis in AXES.values()}
-    to_shares, own, to_x = [], jnp.zeros((1, 1, 1), x.dtype), jnp.zeros_like(x)
-    for relation, share, heard in zip(relations, shares[:, None, None], _heard(relations, x, valid), strict=True):
+    to_weights, own, to_x = [], jnp.zeros((1, 1, 1), x.dtype), jnp.zeros_like(x)
+    messages = _messages(relations, x, valid)
+    for relation, weight, message in zip(relations, type_weights[:, None, None], messages, strict=True):
         if relation in AXES:
             of_line = by_line[AXES[relation]]
-            to_shares.append((of_line * heard).sum((0, 1)))
-            to_x = to_x + _line_weights(valid, AXES[relation], x.dtype)[..., None] * (share * of_line)
+            to_weights.append((of_line * message).sum((0, 1)))
+            to_x = to_x + _line_weights(valid, AXES[relation], x.dtype)[..., None] * (weight * of_line)
             continue
-        to_shares.append((gradient * heard).sum((0, 1)))
+        to_weights.append((gradient * message).sum((0, 1)))
         if relation in SIDES:
-            # Who hears a cell stands on its other side; who has nobody to hear on this side hears itself.
-            to_x = to_x + share * back[SIDES[relation]]
-            share = share * (1.0 - shifted(valid, SIDES[relation]).astype(x.dtype))[..., None]
-        own = own + share
-    return jnp.stack(to_shares), to_x + own * gradient, None
+            # Transpose: gradients come from the opposite neighbour; cells without a neighbour have a self-loop.
+            to_x = to_x + weight * back[SIDES[relation]]
+            weight = weight * (1.0 - shifted(valid, SIDES[relation]).astype(x.dtype))[..., None]
+        own = own + weight
+    return jnp.stack(to_weights), to_x + own * gradient, None
 
 
 _mix.defvjp(lambda relations, *arrays: (_mix(relations, *arrays), arrays), _mix_backward)
 
 
-def _heard(relations, x, valid):
-    """Return A_e x for each edge type; of rows and columns one value for all cells."""
+def _messages(relations, x, valid):
+    """Return A_e x for each edge type; for rows and columns one value per line, to be broadcast."""
     x, near = bordered_sides(relations, x, valid)
 
     def one(relation):
@@ -108,9 +114,9 @@ def _heard(relations, x, valid):
 def bordered_sides(
     relations: tuple[Relation, ...], x: Float[Array, "h w c"], valid: Bool[Array, "h w"], sign: int = 1
 ) -> tuple[Float[Array, "h w c"], dict[Side, Float[Array, "h w c"]]]:
-    """Return x, 0 where not valid, and that shifted by each side of the relations (the other way with sign -1).
+    """Return x with invalid cells set to 0, and its shift for each side of the relations (opposite with sign -1).
 
-    Both are read from one array with a border, x behind a second mask, lest XLA compute x again in every reader.
+    All are slices of one array with a border, and x is masked a second time: otherwise XLA recomputes x in every user.
     """
     x = jnp.where(valid[..., None], x, 0.0)
     sides = tuple(SIDES[relation] for relation in relations if relation in SIDES)
@@ -121,7 +127,7 @@ def bordered_sides(
 
 
 def _line_weights(valid, axis, dtype):
-    """Return one over the number of valid cells along the axis, 0 where a cell is not valid."""
+    """Return 1 / (number of valid cells along the axis) for each cell, 0 for invalid cells."""
     return valid / jnp.maximum(valid.sum(axis, keepdims=True), 1).astype(dtype)
 
 
@@ -132,7 +138,7 @@ def shifted(x: Array, side: Side) -> Array:
 
 
 def neighbours(sides: tuple[Side, ...], x: Float[Array, "h w *c"]) -> tuple[Float[Array, "h w *c"], ...]:
-    """Return `shifted(x, side)` for each side, at most one cell away, several times as fast as one by one."""
+    """Return `shifted(x, side)` for each side, at most one cell away; several times as fast as separate calls."""
     shifts: tuple[Array, ...] = _neighbours(sides, x)
     return shifts
 
@@ -140,13 +146,13 @@ def neighbours(sides: tuple[Side, ...], x: Float[Array, "h w *c"]) -> tuple[Floa
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _neighbours(sides: tuple[Side, ...], x) -> tuple[Array, ...]:
     height, width = x.shape[:2]
-    # The barrier has the border made once; XLA would test for it in every element of what uses the shifts.
+    # The barrier makes XLA pad once; otherwise it tests for the border at every element of every user.
     bordered = lax.optimization_barrier(jnp.pad(x, [(1, 1), (1, 1), *[(0, 0)] * (x.ndim - 2)]))
     return tuple(bordered[1 + down : 1 + down + height, 1 + right : 1 + right + width] for down, right in sides)
 
 
 def _neighbours_backward(sides, _, gradients):
-    # The gradient that JAX writes for a slice of `bordered` costs more than everything else here together.
+    # JAX's own gradient of a slice of `bordered` costs more than all else in this function.
     back = [shifted(gradient, (-down, -right)) for gradient, (down, right) in zip(gradients, sides, strict=True)]
     return (sum(back[1:], back[0]),)
 
@@ -170,16 +176,16 @@ def _box(x):
 
 
 def attend_near(
-    listen: Float[Array, "h w heads"],
-    speak: Float[Array, "h w heads"],
+    destination: Float[Array, "h w heads"],
+    source: Float[Array, "h w heads"],
     value: Float[Array, "h w heads d"],
     valid: Bool[Array, "h w"],
 ) -> tuple[Float[Array, "h w heads d"], Float[Array, "9 h w heads"]]:
     """Attend to the cell and its 8 neighbours; see `attend_along`. Weights: the cell itself first, then `SIDES`."""
     sides = [(0, 0), *SIDES.values()]
-    speaks = jnp.stack([shifted(valid, side) for side in sides])[..., None]
-    scores = jnp.stack([_score(listen, spoken) for spoken in neighbours(tuple(sides), speak)])
-    weights = _softmax(scores, speaks, 0)
+    is_source = jnp.stack([shifted(valid, side) for side in sides])[..., None]
+    scores = jnp.stack([_score(destination, near) for near in neighbours(tuple(sides), source)])
+    weights = _softmax(scores, is_source, 0)
     near = neighbours(tuple(sides), value)
     parts = (w[..., None] * v for w, v in zip(weights, near, strict=True))
     return sum(parts, jnp.zeros_like(value)), weights
@@ -187,36 +193,36 @@ def attend_near(
 
 def attend_along(
     axis: int,
-    listen: Float[Array, "h w heads"],
-    speak: Float[Array, "h w heads"],
+    destination: Float[Array, "h w heads"],
+    source: Float[Array, "h w heads"],
     value: Float[Array, "h w heads d"],
     valid: Bool[Array, "h w"],
 ) -> tuple[Float[Array, "h w heads d"], Float[Array, "lines n n heads"]]:
-    """Attend to the valid cells of the same row (axis 1) or column (axis 0), GAT's way (Wang et al. 2019, Eq. 3).
+    """Attend to the valid cells of the same row (axis 1) or column (axis 0) by GAT's scores (Wang et al. 2019, Eq. 3).
 
     Args:
         axis: along which the cells of a neighbourhood lie.
-        listen, speak: the two halves of a^T [h_i || h_j].
+        destination, source: scores of a cell i and of its neighbour j, the two halves of a^T [h_i || h_j].
         value: finite everywhere.
-        valid: cells that may be heard.
+        valid: cells that may be attended to.
 
     Returns:
-        What each cell hears, and the weights: line, listening cell, speaking cell, head.
+        The attended values, and the weights by (line, destination cell, source cell, head).
     """
     if axis == 0:
-        listen, speak, value, valid = (x.swapaxes(0, 1) for x in (listen, speak, value, valid))
-    weights = _softmax(_score(listen[:, :, None], speak[:, None]), valid[:, None, :, None], 2)
+        destination, source, value, valid = (x.swapaxes(0, 1) for x in (destination, source, value, valid))
+    weights = _softmax(_score(destination[:, :, None], source[:, None]), valid[:, None, :, None], 2)
     out = jnp.einsum("lijh,ljhd->lihd", weights, value)
     return (out.swapaxes(0, 1) if axis == 0 else out), weights
 
 
-def _score(listen, speak):
-    return nn.leaky_relu(listen + speak, 0.2)
+def _score(destination, source):
+    return nn.leaky_relu(destination + source, 0.2)
 
 
-def _softmax(scores, speaks, axis):
-    """Return the softmax over the cells that speak; 0 where none does."""
-    scores = jnp.where(speaks, scores, -jnp.inf)
+def _softmax(scores, is_source, axis):
+    """Return the softmax over the source cells; 0 where there is none."""
+    scores = jnp.where(is_source, scores, -jnp.inf)
     top = lax.stop_gradient(scores.max(axis, keepdims=True, initial=jnp.finfo(scores.dtype).min))
     weights = jnp.exp(scores - top)
     total = weights.sum(axis, keepdims=True)

@@ -1,4 +1,4 @@
-"""Masks of attention: true where a query may attend to a key. The one place that makes them."""
+"""Masks of attention: true where a query may attend to a key. Every mask is made here."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from jaxtyping import Array, Bool, Float
 
 
 def key_mask(valid_keys: Bool[Array, " k"]) -> Bool[Array, "1 k"]:
-    """Return the mask under which every query sees the valid keys."""
+    """Return the mask by which all queries attend to the valid keys."""
     return valid_keys[None, :]
 
 
 def pair_mask(valid_queries: Bool[Array, " q"], valid_keys: Bool[Array, " k"]) -> Bool[Array, "q k"]:
-    """Return the mask under which valid queries see the valid keys, and invalid ones see nothing."""
+    """Return the mask by which valid queries attend to valid keys, and invalid queries to none."""
     return valid_queries[:, None] & valid_keys[None, :]
 
 
 def radius_mask(
     places: Float[Array, "q 2"], lines: Float[Array, "n p 2"], valid: Bool[Array, " n"], radius: float
 ) -> Bool[Array, "q n"]:
-    """Return the mask under which a query sees the valid lines that pass within `radius` of its place.
+    """Return the mask by which a query attends to the valid lines within `radius` of its place.
 
     Args:
         places, lines: in one unit, that of `radius`; lines of at least two points. Invalid ones may hold anything.
@@ -33,24 +33,24 @@ def radius_mask(
     dx, dy = (places[:, None, None, i] - start[None, ..., i] for i in (0, 1))
     sx, sy = (step[None, ..., i] for i in (0, 1))
     square = sx**2 + sy**2
-    share = jnp.clip((dx * sx + dy * sy) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
-    distance = (dx - share * sx) ** 2 + (dy - share * sy) ** 2
+    fraction = jnp.clip((dx * sx + dy * sy) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
+    distance = (dx - fraction * sx) ** 2 + (dy - fraction * sy) ** 2
     return (distance.min(-1) <= radius**2) & valid[None, :]
 
 
 @struct.dataclass
 class SpatialMask:
-    """M_s of TF-Lane (Fig. 5): who sees whom among L lane queries and T traffic instances.
+    """M_s of TF-Lane (Fig. 5): which of L lane queries and T traffic instances attend to which.
 
-    A quadrant is what one fusion module needs, broadcastable to its full size: attention takes it as it is, and the
-    whole (L+T) x (L+T) matrix exists only where `dense` is called. Rows are queries.
+    Each fusion module needs one quadrant, which attention broadcasts to its full size; the whole (L+T) x (L+T) matrix
+    exists only if `dense` is called. Rows are queries.
 
     Attributes:
         lanes: L.
-        lane_lane: (L, L) the host's own mask, or None: all lanes see all.
-        lane_traffic: (1, T) lanes see valid instances.
-        traffic_lane: (T, 1) valid instances see all lanes.
-        traffic_traffic: (T, T) valid instances see valid instances.
+        lane_lane: (L, L) the host's own mask; None allows all pairs of lanes.
+        lane_traffic: (1, T) lanes attend to valid instances.
+        traffic_lane: (T, 1) valid instances attend to all lanes.
+        traffic_traffic: (T, T) valid instances attend to valid instances.
     """
 
     lanes: int = struct.field(pytree_node=False)

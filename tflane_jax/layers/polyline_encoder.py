@@ -1,7 +1,7 @@
 """Polylines to tokens: a sine encoding of their points, and a transformer.
 
-SMERF (Luo et al. 2024; specs/modules.md section 9) makes one token of the points of a line, and lines look at each
-other. Marker fusion (section III-A) lets the points of a line look at each other before one token is made of them.
+SMERF (Luo et al. 2024) makes one token of the points of a line, and the lines attend to each other. In marker fusion
+(section III-A) the points of a line attend to each other, and are then joined to one token.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def temperature_encoding(
     Args:
         coordinates: in [0, 1] across the perception range; others are encoded as well.
         bands: channels of each coordinate, even.
-        temperature: the slowest wave is nearly this many times as long as the fastest.
+        temperature: ratio of the longest to the shortest wavelength, nearly.
         layout: the channels of a coordinate: "blocks" has all sines, then all cosines; "interleaved" has them in turn.
 
     Raises:
@@ -52,7 +52,7 @@ class PolylineEncoderConfig:
         dim: channels of a token.
         layers, heads, hidden, dropout: of the transformer.
         bands, temperature, layout: of the encoding of points; 0 bands leave their coordinates as they are.
-        attend: who looks at whom, "lines" (SMERF) or the "points" of one line (marker fusion).
+        attend: what attends to each other: "lines" (SMERF), or the "points" of one line (marker fusion).
     """
 
     dim: int = 256
@@ -88,8 +88,8 @@ class PolylineEncoder(nn.Module):
 
         Args:
             points: in [0, 1] across the perception range.
-            labels: what else is known of a line, such as its category; k may be 0.
-            valid: what stands in other lines changes nothing.
+            labels: further inputs of a line, such as its one-hot category; k may be 0.
+            valid: of the lines; invalid ones may hold anything.
             deterministic: no dropout; with it, the key `dropout` is needed.
         """
         config, (lines, count) = self.config, points.shape[:2]

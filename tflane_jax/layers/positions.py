@@ -32,16 +32,16 @@ def inverse_sigmoid(x: Float[Array, "*b"], eps: float = 1e-5) -> Float[Array, "*
 def image_sine_encoding(
     valid: Bool[Array, "h w"], bands: int, *, normalise: bool = True, offset: float = 0.0, temperature: float = 1e4
 ) -> Float[Array, "h w f"]:
-    """Return DETR's sine encoding of the cells of a feature map, f = 2 bands: [row | column], sine and cosine in turn.
+    """Return DETR's sine encoding of the cells of a feature map, f = 2 bands: [row | column], each sine, cosine, ...
 
     Rows and columns are counted among valid cells, from 1.
 
     Args:
-        valid: cells that show something.
+        valid: cells that show the image, not padding.
         bands: channels of each axis, even.
         normalise: scale each axis to (0, 2 pi].
-        offset: added to the counts where they are normalised (mmdet: -0.5). Rows and columns without a valid cell then
-            get huge arguments; nothing should look at them.
+        offset: added to the counts if they are normalised (mmdet: -0.5). Rows and columns without a valid cell then
+            get huge arguments; they must be masked.
         temperature: of the frequencies 1 / temperature^(2 floor(i / 2) / bands).
     """
     frequency = temperature ** (-2.0 * (jnp.arange(bands) // 2) / bands)

@@ -1,6 +1,6 @@
-"""ResNet (He et al. 2016) with basic or bottleneck blocks, at any width (specs/modules.md sections 2.2 and 11).
+"""ResNet (He et al. 2016) with basic or bottleneck blocks, at any width.
 
-Strides stand on the 3x3 convolutions ("pytorch style"). Names follow torchvision's: conv1, bn1, layer1_0, ...
+A bottleneck's stride is on its 3x3 convolution, as in torchvision. Names are torchvision's: conv1, bn1, layer1_0, ...
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class ResNetConfig:
         strides: of each stage.
         stem_channels: of the 7x7 convolution with stride 2.
         block: "basic" (ResNet-18, 34) or "bottleneck" (50, 101, 152).
-        frozen_stem_norm: the norm behind the stem never learns. The published LSTR has it so, as the identity but for
+        frozen_stem_norm: the norm after the stem is constant, as in the published LSTR, where it is the identity up to
             its epsilon.
-        frozen_norms: no norm learns (fine-tuning from ImageNet with few images a step).
+        frozen_norms: all norms are constant (fine-tuning from ImageNet with few images per step).
     """
 
     blocks: tuple[int, ...] = (1, 2, 2, 2)
@@ -45,18 +45,17 @@ class ResNetConfig:
     frozen_norms: bool = False
 
 
-RESNET_18 = ResNetConfig((2, 2, 2, 2), (64, 128, 256, 512), (1, 2, 2, 2), 64)
 RESNET_50 = ResNetConfig((3, 4, 6, 3), (64, 128, 256, 512), (1, 2, 2, 2), 64, "bottleneck")
 
 
 class ResNet(nn.Module):
-    """A stack of views in, the features of every stage out.
+    """Maps a stack of views to the features of every stage.
 
     Attributes:
         config: sizes.
-        frozen_stages: parts from the input on that never learn: 1 is the stem, 2 the first stage as well. Their
-            parameters get a gradient of zero, and no time is spent on it.
-        remat: keep only what goes from stage to stage, and compute the rest anew for the gradient.
+        frozen_stages: number of parts, from the input on, that are not trained: 1 is the stem, 2 the first stage too.
+            Their parameters get a gradient of zero at no cost.
+        remat: keep only the features between stages, and recompute the rest for the gradient.
         dtype: of the computation; parameters and statistics are float32.
     """
 
@@ -94,8 +93,8 @@ class ResNet(nn.Module):
 class StemConvolution(nn.Module):
     """The 7x7 convolution with stride 2, without bias.
 
-    Where the image's sides are even, blocks of 2x2 pixels become channels first: the same sums, but with four times the
-    channels and half the size, which takes a quarter less time on a CPU.
+    For images with even sides, blocks of 2x2 pixels first become channels. The sums are the same, with four times the
+    channels at half the size, and take a quarter less time on a CPU.
 
     Attributes:
         channels: out.
@@ -114,7 +113,7 @@ class StemConvolution(nn.Module):
         layout = ("NHWC", "HWIO", "NHWC")
         if h % 2 or w % 2:
             return lax.conv_general_dilated(x, kernel, (2, 2), [(3, 3), (3, 3)], dimension_numbers=layout)
-        # Output i sees rows 2i-3 to 2i+3: blocks i-2 to i+1, of which it leaves out the very first row.
+        # Output i reads rows 2i-3 to 2i+3: blocks i-2 to i+1 without their first row.
         x = x.reshape(v, h // 2, 2, w // 2, 2, c).swapaxes(2, 3).reshape(v, h // 2, w // 2, 4 * c)
         kernel = jnp.pad(kernel, ((1, 0), (1, 0), (0, 0), (0, 0))).reshape(4, 2, 4, 2, c, self.channels)
         kernel = kernel.swapaxes(1, 2).reshape(4, 4, 4 * c, self.channels)
@@ -124,8 +123,8 @@ class StemConvolution(nn.Module):
 def max_pool(x: Float[Array, "v h w c"]) -> Float[Array, "v ho wo c"]:
     """Return the largest value of each 3x3 window, stride 2, padding 1.
 
-    Rows, then columns, by elementwise maxima: the gradient of XLA's own pooling takes five times as long on a CPU. A
-    gradient at a tie is shared among the equal ones.
+    Rows, then columns, by elementwise maxima: the gradient of XLA's own pooling takes five times as long on a CPU. At
+    a tie the gradient is split between the equal values.
     """
     return _pool_along(_pool_along(x, 1), 2)
 

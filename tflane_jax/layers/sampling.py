@@ -1,7 +1,7 @@
-"""Weighted sums of bilinear samples of feature maps: the core of deformable attention (specs/modules.md section 3).
+"""Weighted sums of bilinear samples of feature maps: the core of deformable attention (Zhu et al. 2021).
 
-The formulation is the fastest found for XLA on CPUs, forward and backward (docs/benchmarks.md); what it must avoid is
-writing all samples to memory, loops over small inner axes, and computing one thing anew for every channel.
+The formulation is the fastest found for XLA on CPUs, forward and backward (docs/benchmarks.md). It avoids writing all
+samples to memory, loops over small inner axes, and repeating the same computation for every channel.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def deformable_attention(
 ) -> Float[Array, "*v q heads*d"]:
     """Return the weighted sum of bilinear samples over levels and points, heads concatenated.
 
-    A location outside the level or NaN gives nothing, and gets no gradient.
+    A location outside the level, or NaN, contributes 0 and gets no gradient.
 
     Args:
-        value: levels one after the other along the axis HW; with an axis V before it (cameras), the queries of each
-            look at their own. On a CPU that is faster than `vmap`.
+        value: levels concatenated along the axis HW; with a leading axis V (cameras), each has its own queries. On a
+            CPU that is faster than `vmap`.
         shapes: (h, w) of each level.
         locations: (x, y) in [0, 1].
         weights: they need not sum to one.

@@ -1,6 +1,6 @@
 """Traffic lights and signs in the front view: Deformable DETR with iterative box refinement, TopoNet's TE head.
 
-Reference: specs/modules.md section 5 (Zhu et al. 2021). Features of the front camera, several levels -> encoder -> E
+Reference: Zhu et al. 2021, and TopoNet's published code. Features of the front camera, several levels -> encoder -> E
 queries that look at all levels -> after every decoder layer 13 class logits and a box, in pixels of that camera.
 """
 

@@ -1,17 +1,18 @@
 """Graph encoders in the place of LSTR's transformer encoder (GTN lane paper, section 2.1): GTN, GCN and HAN.
 
 The paper puts Graph Transformer Networks into the encoding layer, compares GCN and HAN, and shares parameters between
-GNN and transformer; it does not say how. Our reading: an encoder layer keeps the transformer's frame (residual, norm,
-feed-forward, residual, norm), and graph convolution on learned meta-paths stands where self-attention stood. The nodes
-are the cells of the feature map, the edge types those of `layers.image_graph`.
+GNN and transformer; it does not say how. Our reading: an encoder layer keeps the transformer's structure (residual,
+norm, feed-forward, residual, norm), and graph convolution on learned meta-paths replaces self-attention. The nodes are
+the cells of the feature map, the edge types those of `layers.image_graph`.
 
-Self-attention is one of the GTN's edge types, similarity: its adjacency comes from the query and key projections of
-features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.
-One set of parameters thus serves both; the GTN adds the selection weights, hops * channels * edge types. With as many
-heads, a layer that selects similarity in one hop and `self` in the others is exactly the transformer's encoder layer.
+Self-attention is one of the GTN's edge types, called similarity: its adjacency comes from the query and key projections
+of features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.
+GNN and transformer thus share their parameters; the GTN adds only the selection weights, hops * channels * edge types.
+With equal numbers of heads, a layer that selects similarity in one hop and `self` in all others is exactly the
+transformer's encoder layer.
 
-A layer costs about what the transformer's does: products of adjacencies are never formed (FastGTN), the other edge
-types are shifts and means, and similarity, one of LSTR's heads for all channels, is offered to the last hop only.
+A layer costs about as much as the transformer's: products of adjacencies are never formed (FastGTN), the other edge
+types are shifts and means, and similarity, with one head for all channels, is offered to the last hop only.
 """
 
 from __future__ import annotations
@@ -45,14 +46,14 @@ class GtnEncoderConfig:
     Attributes:
         layers: encoder layers.
         hops: edges of a meta-path.
-        channels: meta-paths side by side, each with its share of the features.
+        channels: meta-paths; the features are split evenly over them.
         relations: structural edge types to choose from.
-        similarity: attention over all cells as a further edge type, the last: offered to the last hop only, to every
-            hop (an attention product each), or to none, for a purely structural graph.
-        heads: of similarity; one head is shared by all channels and costs least.
+        similarity: attention over all cells as an additional, last edge type: offered to the last hop only, to every
+            hop (each costs an attention), or to none, for a purely structural graph.
+        heads: of similarity; a single head shared by all channels is cheapest.
         head_dim: channels of query and key of a head, as in LSTR's attention.
-        hidden: channels inside the feed-forward part.
-        dropout: of hidden channels and everything that is added to a residual.
+        hidden: hidden channels of the feed-forward network.
+        dropout: probability for hidden channels and each residual branch.
     """
 
     layers: int = 2
@@ -78,7 +79,7 @@ class GtnEncoderConfig:
         return self.similarity == "every_hop" or (self.similarity == "last_hop" and hop == self.hops - 1)
 
     def mixing(self, name: str) -> MetaPathConvolution:
-        """Return what stands for self-attention in a layer."""
+        """Return the module that replaces self-attention in a layer."""
         return MetaPathConvolution(self, name=name)
 
 
@@ -88,8 +89,8 @@ class GcnEncoderConfig:
 
     Attributes:
         layers: encoder layers.
-        hidden: channels inside the feed-forward part.
-        dropout: of hidden channels and everything that is added to a residual.
+        hidden: hidden channels of the feed-forward network.
+        dropout: probability for hidden channels and each residual branch.
     """
 
     layers: int = 2
@@ -97,12 +98,12 @@ class GcnEncoderConfig:
     dropout: float = 0.1
 
     def build(self, dim: int, name: str) -> GraphEncoder:
-        """Return the Linen module; `dim` is what its input has."""
+        """Return the Linen module; the number of channels follows from its input."""
         del dim
         return GraphEncoder(self, name=name)
 
     def mixing(self, name: str) -> NeighbourConvolution:
-        """Return what stands for self-attention in a layer."""
+        """Return the module that replaces self-attention in a layer."""
         return NeighbourConvolution(name=name)
 
 
@@ -115,8 +116,8 @@ class HanEncoderConfig:
         heads: of node-level attention.
         relations: edge types: `near` is the cell and its 8 neighbours, `row` and `column` lie along an axis.
         semantic: channels of semantic-level attention.
-        hidden: channels inside the feed-forward part.
-        dropout: of hidden channels and everything that is added to a residual.
+        hidden: hidden channels of the feed-forward network.
+        dropout: probability for hidden channels and each residual branch.
     """
 
     layers: int = 2
@@ -134,7 +135,7 @@ class HanEncoderConfig:
         return GraphEncoder(self, name=name)
 
     def mixing(self, name: str) -> HeterogeneousAttention:
-        """Return what stands for self-attention in a layer."""
+        """Return the module that replaces self-attention in a layer."""
         return HeterogeneousAttention(self, name=name)
 
 
@@ -155,14 +156,14 @@ class GraphEncoder(nn.Module):
         *,
         deterministic: bool = True,
     ) -> Float[Array, "h w c"]:
-        """Return the memory; cells that are not valid influence nothing and are 0.
+        """Return the encoder output; invalid cells have no influence and are 0.
 
-        Stores of each layer, where a caller asks for it with `mutable="intermediates"`, `relations`: the weights of the
-        edge types, by hop and channel (1 and 1 but for the GTN), and the weights of attention.
+        With `mutable="intermediates"` each layer stores `relations`, the weights of the edge types by hop and channel
+        (1 and 1 except for the GTN), and the weights of its attention.
 
         Args:
-            features, position: of each cell; position tells who is looking for whom, and is not passed on.
-            valid: cells that show something.
+            features, position: of each cell; position encodings enter queries and keys only.
+            valid: cells that show the image, not padding.
             deterministic: no dropout.
         """
         shown = valid[..., None]
@@ -174,7 +175,7 @@ class GraphEncoder(nn.Module):
 
 
 class GraphEncoderLayer(nn.Module):
-    """The transformer's encoder layer with a graph in the place of self-attention."""
+    """The transformer's encoder layer with a graph network in place of self-attention."""
 
     config: GraphEncoderConfig
 
@@ -201,7 +202,7 @@ class GraphEncoderLayer(nn.Module):
 
 
 class MetaPathConvolution(nn.Module):
-    """Graph convolution on learned meta-paths, attention being one of the edge types."""
+    """Graph convolution on learned meta-paths; attention is one of the edge types."""
 
     config: GtnEncoderConfig
 
@@ -209,7 +210,7 @@ class MetaPathConvolution(nn.Module):
     def __call__(
         self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
     ) -> Float[Array, "h w c"]:
-        """Return what is added to x."""
+        """Return the change of x, without the residual."""
         config, dim = self.config, x.shape[-1]
         offered = [config.offers_similarity(hop) for hop in range(config.hops)]
         structural = len(config.relations)
@@ -220,36 +221,36 @@ class MetaPathConvolution(nn.Module):
         mask, width = key_mask(valid.reshape(-1)), config.heads * config.head_dim
         query = key = None
         if any(offered):
-            asking = x + position
-            query, key = (_by_head(nn.Dense(width, name=name)(asking), config.heads) for name in ("query", "key"))
+            placed = x + position
+            query, key = (_by_head(nn.Dense(width, name=name)(placed), config.heads) for name in ("query", "key"))
 
-        def mix(hop, shares, h):
-            structure = shares[:structural]
-            heard = mix_relations(config.relations, structure, h, valid) if structural else jnp.zeros_like(h)
+        def mix(hop, type_weights, h):
+            by_structure = type_weights[:structural]
+            mixed = mix_relations(config.relations, by_structure, h, valid) if structural else jnp.zeros_like(h)
             if not offered[hop] or query is None or key is None:
-                return heard
+                return mixed
             here, _ = bordered_sides(config.relations, h, valid)
             similar = masked_attention(query, key, _by_head(here, config.heads), mask).swapaxes(0, 1).reshape(h.shape)
-            # Cells that are not valid ask too; what they hear must not become a further hop's input.
-            return heard + shares[structural][None, None] * jnp.where(valid[..., None], similar, 0.0)
+            # Invalid cells are queries too; their result must not enter a further hop.
+            return mixed + type_weights[structural][None, None] * jnp.where(valid[..., None], similar, 0.0)
 
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "relations", nn.softmax(weights, -1))
             if query is not None and key is not None:
                 self.sow("intermediates", "probabilities", attention_probabilities(query, key, mask))
         value = jnp.where(valid[..., None], nn.Dense(dim, name="value")(x), 0.0)
-        heard = propagate(mix, weights, value)
-        return nn.Dense(dim, name="output")(heard)
+        propagated = propagate(mix, weights, value)
+        return nn.Dense(dim, name="output")(propagated)
 
 
 class NeighbourConvolution(nn.Module):
-    """ReLU(D^-1/2 (A + I) D^-1/2 x W), Kipf & Welling 2017, Eq. (2). Without queries there is no use for positions."""
+    """ReLU(D^-1/2 (A + I) D^-1/2 x W), Kipf & Welling 2017, Eq. (2). It has no queries, so positions are unused."""
 
     @nn.compact
     def __call__(
         self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
     ) -> Float[Array, "h w c"]:
-        """Return what is added to x."""
+        """Return the change of x, without the residual."""
         del position
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "relations", jnp.ones((1, 1, 1), x.dtype))
@@ -265,33 +266,33 @@ class HeterogeneousAttention(nn.Module):
     def __call__(
         self, x: Float[Array, "h w c"], position: Float[Array, "h w c"], valid: Bool[Array, "h w"]
     ) -> Float[Array, "h w c"]:
-        """Return what is added to x."""
+        """Return the change of x, without the residual."""
         config, (height, width, dim) = self.config, x.shape
         # All cells are nodes of one type, hence one transformation (Wang et al. 2019, Eq. 1).
         transform = nn.Dense(dim, name="value")
         value = transform(x).reshape(height, width, config.heads, dim // config.heads)
-        asking = (x + position).reshape(height * width, dim)
+        placed = (x + position).reshape(height * width, dim)
         # a^T [W h_i || W h_j] of every edge type and head in one product (Eq. 2-3).
-        halves = nn.Dense(2 * len(config.relations) * config.heads, use_bias=False, name="scores")(asking)
+        halves = nn.Dense(2 * len(config.relations) * config.heads, use_bias=False, name="scores")(placed)
         halves = halves.reshape(height, width, len(config.relations), 2, config.heads)
-        heard = []
+        by_type = []
         for i, relation in enumerate(config.relations):
-            listen, speak = halves[:, :, i, 0], halves[:, :, i, 1]
+            destination, source = halves[:, :, i, 0], halves[:, :, i, 1]
             if relation == "near":
-                out, weights = attend_near(listen, speak, value, valid)
+                out, weights = attend_near(destination, source, value, valid)
             else:
-                out, weights = attend_along(AXES[relation], listen, speak, value, valid)
-            heard.append(nn.elu(out.reshape(height, width, dim)))  # Eq. (4)
+                out, weights = attend_along(AXES[relation], destination, source, value, valid)
+            by_type.append(nn.elu(out.reshape(height, width, dim)))  # Eq. (4)
             if self.is_mutable_collection("intermediates"):
                 self.sow("intermediates", f"{relation}_probabilities", weights)
         # beta = softmax of mean_i q^T tanh(W z_i + b) (Eq. 7-9), over valid cells.
         summary, question = nn.Dense(config.semantic, name="semantic"), nn.Dense(1, use_bias=False, name="question")
         count = jnp.maximum(valid.sum(), 1).astype(x.dtype)
-        asked = jnp.stack([jnp.where(valid, question(jnp.tanh(summary(z)))[..., 0], 0.0).sum() for z in heard])
-        shares = nn.softmax(asked / count)
+        asked = jnp.stack([jnp.where(valid, question(jnp.tanh(summary(z)))[..., 0], 0.0).sum() for z in by_type])
+        type_weights = nn.softmax(asked / count)
         if self.is_mutable_collection("intermediates"):
-            self.sow("intermediates", "relations", shares[None, None])
-        return sum((shares[i] * z for i, z in enumerate(heard)), jnp.zeros_like(x))
+            self.sow("intermediates", "relations", type_weights[None, None])
+        return sum((type_weights[i] * z for i, z in enumerate(by_type)), jnp.zeros_like(x))
 
 
 def _choices(offered: list[bool], structural: int) -> Bool[Array, "hops 1 e"]:

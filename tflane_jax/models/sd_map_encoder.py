@@ -1,4 +1,4 @@
-"""SMERF (Luo et al. 2024): an SD map as tokens, to which BEV queries attend; specs/modules.md section 9.
+"""SMERF (Luo et al. 2024): an SD map as tokens, to which BEV queries attend.
 
 The tokens are made once a frame and fused in every layer of the BEV encoder, behind the cameras.
 """
@@ -129,7 +129,7 @@ class SdMapEncoder(nn.Module):
 
 
 class SdMapFusion(nn.Module):
-    """BEV queries look at the lines of the map: masked attention, residual, norm."""
+    """Masked attention of BEV queries to the lines of the map, residual, norm."""
 
     config: SdMapModuleConfig
 

@@ -21,12 +21,12 @@ import jax.numpy as jnp
 
 from benchmarks.timing import Compiled, compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import load_config
-from tflane_jax.datasets.loading import for_training, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.scene import Example
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -52,14 +52,16 @@ def paper_size_tasks() -> dict[str, LaneGraphTask]:
     decoder = LaneDecoderConfig(dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed")
     model = TopoNetConfig(encoder=EvidenceEncoderConfig(dim=64, cell=1), decoder=decoder)
     module = TrafficFlowModuleConfig(width=128, heads=8)
-    with_traffic = dataclasses.replace(model, traffic_flow=TrafficFlowConfig(module=module))
+    with_traffic = dataclasses.replace(
+        model, priors=replace(model.priors, traffic_flow=TrafficFlowConfig(module=module))
+    )
     return {"baseline": LaneGraphTask(model), "+TFM": LaneGraphTask(with_traffic)}
 
 
 def examples() -> Example:
     """Return a batch of examples of the built-in world, on the device."""
     dataset = ProceduralDataset(ProceduralConfig(split="val", scenes=BATCH // 4))
-    return jax.tree.map(jnp.asarray, for_training(load_arrays(dataset, progress=False)))
+    return jax.tree.map(jnp.asarray, load_arrays(dataset, parts=TRAINING_PARTS, progress=False))
 
 
 def inference(batch: Example, seconds: float) -> dict[str, Any]:

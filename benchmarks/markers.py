@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from benchmarks.timing import compile_jax, machine, markdown_table, measure, save
 from tflane_jax.config import load_config
-from tflane_jax.datasets.loading import for_training, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -31,7 +31,7 @@ def run(out: Path, seconds: float = 20.0) -> dict[str, Any]:
     source = config.data.source("val")
     assert isinstance(source, ProceduralConfig)
     one_scene = ProceduralConfig("val", scenes=1, world=source.world, example=source.example)
-    frames = for_training(load_arrays(ProceduralDataset(one_scene), progress=False))
+    frames = load_arrays(ProceduralDataset(one_scene), parts=TRAINING_PARTS, progress=False)
     frame = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), frames)
     compiled = {}
     for name, ablation in MODELS.items():

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.training.provenance import provenance
-from tflane_jax.training.run_folder import write_json
 
 Program = Callable[[], Any]
 
@@ -111,6 +111,5 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def save(out: Path, name: str, record: dict[str, Any], table: str) -> None:
     """Write `name`.json and `name`.md into the folder `out`."""
-    out.mkdir(parents=True, exist_ok=True)
     write_json(out / f"{name}.json", record)
-    (out / f"{name}.md").write_text(table + "\n", encoding="utf-8")
+    write_text(out / f"{name}.md", table + "\n")

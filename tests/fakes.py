@@ -8,10 +8,10 @@ from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.scene import (
     Areas,
     CameraViews,
+    CenterlinePrediction,
     ElementPrediction,
     Example,
     LaneGraph,
-    LanePrediction,
     TrafficElements,
     TrafficFlow,
 )
@@ -98,14 +98,14 @@ def empty_example() -> Example:
     )
 
 
-def fake_prediction(seed: int = 0, *, queries: int = 6) -> LanePrediction:
+def fake_prediction(seed: int = 0, *, queries: int = 6) -> CenterlinePrediction:
     """Return a prediction whose first two lanes are sure and linked."""
     rng = np.random.default_rng([seed, 1])
     logits = np.full((queries, 1), -4.0, np.float32)
     logits[:2] = 2.0
     links = np.full((queries, queries), -3.0, np.float32)
     links[:1, 1:2] = 3.0
-    return LanePrediction(rng.uniform(-20, 20, (queries, POINTS, 3)).astype(np.float32), logits, links)
+    return CenterlinePrediction(rng.uniform(-20, 20, (queries, POINTS, 3)).astype(np.float32), logits, links)
 
 
 def fake_elements(seed: int = 0, *, elements: int = 3, queries: int = 6) -> ElementPrediction:

@@ -24,7 +24,9 @@ CONFIG = '''"""A tiny model for the tests of the command line."""
 from dataclasses import replace
 
 from tflane_jax.config import EvaluationConfig, RunConfig
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -33,7 +35,7 @@ from tflane_jax.training.schedule import OptimConfig
 
 def get_config():
     return RunConfig(
-        task=LaneGraphTask(TopoNetConfig(traffic_flow=TrafficFlowConfig(TrafficFlowPriorConfig(max_instances=4)))),
+        task=LaneGraphTask(TopoNetConfig(priors=PriorsConfig(traffic_flow=TrafficFlowConfig(TrafficFlowPriorConfig(max_instances=4))))),
         optim=OptimConfig(lr=0.01, warmup_steps=1),
         training=TrainingConfig(steps=4, batch_size=2, log_every=2, eval_every=2, checkpoint_every=2),
         evaluation=EvaluationConfig(batch_size=2, pictures=1),
@@ -70,8 +72,7 @@ def fakes():
     with pytest.MonkeyPatch.context() as patch:
         for function in (init, loss, predict):
             patch.setattr(LaneGraphTask, function.__name__, function)
-        for module in ("tasks.lane_graph_system", "commands.predict_lanes"):
-            patch.setattr(f"tflane_jax.{module}.open_dataset", open_fake)
+        patch.setattr("tflane_jax.datasets.sources.open_dataset", open_fake)
         yield
 
 
@@ -240,7 +241,7 @@ def test_help_of_a_config_lists_its_settings(config, capsys):
     assert main(["train", "--config", str(config), "--help"]) == 0
     said = capsys.readouterr().out
     assert "--overwrite" in said
-    assert "task.model.traffic_flow.prior.max_instances = 4\n" in said
+    assert "task.model.priors.traffic_flow.prior.max_instances = 4\n" in said
 
 
 def test_every_command_has_help(capsys):

@@ -9,8 +9,8 @@ import pytest
 
 from tests.shared import shared_path
 from tflane_jax.cli import main
+from tflane_jax.files.tusimple import read_predictions, read_truth
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
-from tflane_jax.scoring.tusimple import read_predictions, read_truth
 
 pytest.importorskip("cv2")
 

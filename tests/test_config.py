@@ -17,11 +17,13 @@ from tflane_jax.config_io import from_json, settings, to_json, to_text
 from tflane_jax.errors import UserError
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 GOLDEN = Path(__file__).parent / "golden_configs"
-FLOW = RunConfig(task=LaneGraphTask(TopoNetConfig(traffic_flow=TrafficFlowConfig())))
+FLOW = RunConfig(task=LaneGraphTask(TopoNetConfig(priors=PriorsConfig(traffic_flow=TrafficFlowConfig()))))
 
 
 def shipped() -> dict[str, str]:
@@ -131,8 +133,8 @@ def test_settings_that_a_file_lacks_take_their_defaults():
         (["--optim.lr=1e-3", "--training.seeds", "4", "5"], {"optim.lr": 1e-3, "training.seeds": (4, 5)}),
         (["--training.init-from", "runs/a"], {"training.init_from": "runs/a"}),
         (
-            ["--task.model.traffic_flow.prior.top_instances", "0"],
-            {"task.model.traffic_flow.prior.top_instances": 0},
+            ["--task.model.priors.traffic_flow.prior.top_instances", "0"],
+            {"task.model.priors.traffic_flow.prior.top_instances": 0},
         ),
         (["--data.world.severity", "1"], {"data.world.severity": 1.0}),
     ],
@@ -149,10 +151,10 @@ def test_parts_are_switched_on_and_off():
         "0.2",
         "--data.example.markers",
         "default",
-        "--task.model.markers.memory",
+        "--task.model.priors.markers.memory",
         "None",
-        "--task.model.traffic-flow=None",
-        "--task.model.markers",
+        "--task.model.priors.traffic-flow=None",
+        "--task.model.priors.markers",
         "MarkerFusionConfig",
     ]
     config = apply_overrides(FLOW, arguments)
@@ -160,8 +162,13 @@ def test_parts_are_switched_on_and_off():
     assert config.data.example == replace(
         FLOW.data.example, markers=MarkerConfig(simulation=MarkerSimulationConfig(jump=0.2))
     )
-    assert config.task.model == replace(model, traffic_flow=None, markers=MarkerFusionConfig(memory=None))
-    assert apply_overrides(config, ["--task.model.traffic_flow", "default"]).task.model.traffic_flow is not None
+    assert config.task.model == replace(
+        model, priors=replace(model.priors, traffic_flow=None, markers=MarkerFusionConfig(memory=None))
+    )
+    assert (
+        apply_overrides(config, ["--task.model.priors.traffic_flow", "default"]).task.model.priors.traffic_flow
+        is not None
+    )
 
 
 def test_settings_of_other_data_can_be_changed():
@@ -182,8 +189,11 @@ def test_settings_of_other_data_can_be_changed():
         (["--training.steps"], "Missing value"),
         (["--task.losses.matcher", "magic"], "invalid choice 'magic'"),
         (["stray"], "stray"),
-        (["--task.model.markers", "on"], r"--task\.model\.markers takes None, default, MarkerFusionConfig, not 'on'"),
-        (["--task.model.markers"], "takes None, default"),
+        (
+            ["--task.model.priors.markers", "on"],
+            r"--task\.model\.priors\.markers takes None, default, MarkerFusionConfig, not 'on'",
+        ),
+        (["--task.model.priors.markers"], "takes None, default"),
         (["--data", "OpenLaneV2Data"], "OpenLaneV2Data has no defaults for all of its settings"),
     ],
 )
@@ -249,8 +259,8 @@ def test_a_file_comes_before_a_shipped_name(tmp_path, monkeypatch):
         ("host", "did you mean markers/host"),
         ("configs/tf_lane/toponet_tfm.py:abla1", "the shipped configuration is called tf_lane/toponet_tfm"),
         ("xyz", "the package ships .*gtn_lane/lstr, .*tf_lane/toponet_tfm"),
-        ("tf_lane/toponet_tfm:abla", "no ablation abla: did you mean abla"),
-        ("tf_lane/toponet_tfm:xyz", "no ablation xyz: it has abla1, .*abla8"),
+        ("tf_lane/toponet_tfm:abla", "no ablation abla, only abla1, .*; did you mean abla"),
+        ("tf_lane/toponet_tfm:xyz", "no ablation xyz, only abla1, .*abla8$"),
         ("gtn_lane/lstr:xyz", r"has no function ablations\(\)"),
     ],
 )

@@ -7,16 +7,15 @@ import pytest
 from tests.shared import ROOT
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
+from tflane_jax.models.parameters import split_statistics
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params
-from tflane_jax.tasks import system_of
-from tflane_jax.training.task import split_statistics
 
 LSTR = ROOT / "configs" / "gtn_lane" / "lstr.py"
 
 
 def test_lstr_has_the_published_size():
     config = load_config(str(LSTR))
-    example = system_of(config).shapes(config)
+    example = config.task.shapes(config.data)
     learned, _ = split_statistics(shapes_of_params(config.task, example))
     assert sum(parameter_counts(learned).values()) == 765_754
     # 0.582 GMAC (shared specs/modules.md 2.8); what is counted beyond is norms, activations and softmax.

@@ -15,168 +15,42 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from tflane_jax.config_files import find_config, split_reference
 from tflane_jax.config_io import choices, settings, with_setting
-from tflane_jax.datasets.argoverse2 import Argoverse2Config, Keyframes
-from tflane_jax.datasets.augmentation import AugmentationConfig
-from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.datasets.front_views import FrontViewConfig
-from tflane_jax.datasets.openlane_frames import SubsetName
-from tflane_jax.datasets.openlane_v2 import OPENLANE_V2_SIZES, Flavour, OpenLaneV2Config
-from tflane_jax.datasets.photometric import PhotometricConfig
-from tflane_jax.datasets.procedural import ProceduralConfig
-from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.datasets.tusimple import TuSimpleConfig
-from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig
+from tflane_jax.datasets.argoverse2 import LogData
+from tflane_jax.datasets.front_views import FrontViewData
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Data
+from tflane_jax.datasets.procedural import WorldData
+from tflane_jax.datasets.sources import data_classes
+from tflane_jax.datasets.tusimple import TuSimpleData
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
-from tflane_jax.world.simulate import WorldConfig
 
-Split = Literal["train", "val", "test"]
-LaneGraphSource = ProceduralConfig | Argoverse2Config | OpenLaneV2Config
-LaneShapeSource = FrontViewConfig | TuSimpleConfig
-Source = LaneGraphSource | LaneShapeSource
+if TYPE_CHECKING:
+    from tflane_jax.datasets.data_source import SplitData as Data
+else:
+    Data = data_classes()  # JSON and overrides take the classes of `datasets.sources`
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class WorldData:
-    """The built-in world for every split.
-
-    Attributes:
-        train, val, test: number of scenes of each split.
-        world: roads, traffic, tracker.
-        example: what is in an example, and its capacities.
-    """
-
-    train: int = 2000
-    val: int = 100
-    test: int = 200
-    world: WorldConfig = WorldConfig()
-    example: ExampleConfig = ExampleConfig()
-
-    def source(self, split: Split) -> ProceduralConfig:
-        """Return the dataset of a split."""
-        return ProceduralConfig(split, scenes=getattr(self, split), world=self.world, example=self.example)
-
-
-@dataclass(frozen=True)
-class LogData:
-    """Real Argoverse 2 logs.
-
-    Attributes:
-        train, val, test: a log or a folder of logs for each split.
-        keyframes: which moments become examples.
-        openlane: folder of the OpenLane-V2 split files, which name the exact moments.
-        example: what is in an example, and its capacities.
-    """
-
-    train: Path
-    val: Path
-    test: Path
-    keyframes: Keyframes = "openlane_v2"
-    openlane: Path | None = None
-    example: ExampleConfig = ExampleConfig()
-
-    def source(self, split: Split) -> Argoverse2Config:
-        """Return the dataset of a split."""
-        return Argoverse2Config(getattr(self, split), self.keyframes, self.openlane, self.example)
-
-
-@dataclass(frozen=True)
-class OpenLaneV2Data:
-    """OpenLane-V2, or anything in its layout, read from disk while training.
-
-    Attributes:
-        root: folder of the dataset.
-        train, val, test: which split stands for each; the official test split has no annotations.
-        subset, flavour, data_dict, image, example: see `OpenLaneV2Config`.
-        augmentation: of the colours of training images, or None.
-        loading: workers.
-    """
-
-    root: Path
-    train: Split = "train"
-    val: Split = "val"
-    test: Split = "val"
-    subset: SubsetName = "A"
-    flavour: Flavour = "centerline"
-    data_dict: str | None = None
-    image: ImageConfig = TOPONET_SUBSET_A
-    example: ExampleConfig = OPENLANE_V2_SIZES
-    augmentation: PhotometricConfig | None = PhotometricConfig()
-    loading: StreamingConfig = StreamingConfig()
-
-    def source(self, split: Split) -> OpenLaneV2Config:
-        """Return the dataset of a split."""
-        return OpenLaneV2Config(
-            self.root,
-            getattr(self, split),
-            self.subset,
-            self.flavour,
-            self.data_dict,
-            self.image,
-            self.example,
-            self.loading,
-        )
-
-
-@dataclass(frozen=True)
-class FrontViewData:
-    """Front-view images of the built-in world for every split.
-
-    Attributes:
-        train, val, test: number of images of each split.
-        augmentation: of training images, or None.
-    """
-
-    train: int = 4000
-    val: int = 100
-    test: int = 400
-    augmentation: AugmentationConfig | None = AugmentationConfig()
-
-    def source(self, split: Split) -> FrontViewConfig:
-        """Return the dataset of a split."""
-        return FrontViewConfig(split, images=getattr(self, split))
-
-
-@dataclass(frozen=True)
-class TuSimpleData:
-    """TuSimple's images, where the folder exists.
-
-    Attributes:
-        root: folder with clips and label files.
-        train, val, test: which label files each split reads, see `TuSimpleConfig.split`.
-        augmentation: of training images, or None.
-    """
-
-    root: Path
-    train: Literal["train", "val", "test", "all"] = "train"
-    val: Literal["train", "val", "test", "all"] = "val"
-    test: Literal["train", "val", "test", "all"] = "test"
-    augmentation: AugmentationConfig | None = AugmentationConfig()
-
-    def source(self, split: Split) -> TuSimpleConfig:
-        """Return the dataset of a split."""
-        return TuSimpleConfig(str(self.root), getattr(self, split))
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """Evaluation while training and after it.
-
-    Attributes:
-        batch_size: examples predicted at a time; changes no number.
-        pictures: examples of the validation split that are drawn, spread evenly over it.
-    """
-
-    batch_size: int = 16
-    pictures: int = 4
+# Configuration files import the classes of data from here or from their dataset's own file.
+__all__ = [
+    "EvaluationConfig",
+    "FrontViewData",
+    "LogData",
+    "OpenLaneV2Data",
+    "RunConfig",
+    "TuSimpleData",
+    "WorldData",
+    "apply_overrides",
+    "load_ablations",
+    "load_config",
+    "override_names",
+]
 
 
 @dataclass(frozen=True)
@@ -185,7 +59,7 @@ class RunConfig:
 
     Attributes:
         task: model, priors and losses.
-        data: examples, of the kind that the task takes.
+        data: examples of each split, of the kind that the task takes; one of the classes of `datasets.sources`.
         optim: optimiser.
         training: the program.
         evaluation: metrics and pictures.
@@ -193,7 +67,7 @@ class RunConfig:
     """
 
     task: LaneGraphTask | LaneShapeTask = LaneGraphTask()
-    data: WorldData | LogData | OpenLaneV2Data | FrontViewData | TuSimpleData = WorldData()
+    data: Data = WorldData()
     optim: OptimConfig = OptimConfig()
     training: TrainingConfig = TrainingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
@@ -212,8 +86,8 @@ def load_config(reference: str) -> RunConfig:
     ablations = load_ablations(name)
     if ablation not in ablations:
         close = difflib.get_close_matches(ablation, ablations, 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(ablations)}"
-        raise UserError(f"config file {name} has no ablation {ablation}: {hint}")
+        hint = f"; did you mean {' or '.join(close)}?" if close else ""
+        raise UserError(f"config file {name} has no ablation {ablation}, only {', '.join(ablations)}{hint}")
     return ablations[ablation]
 
 

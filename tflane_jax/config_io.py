@@ -1,12 +1,16 @@
 """Configurations (trees of frozen dataclasses) as text, as JSON, and back from JSON.
 
-Reading walks the type hints of the classes that the program expects, so that a file can name settings but never code.
+Reading follows the type hints of the expected classes, so that a file can choose settings but never run code.
+Configurations of older versions go through `migrations.migrate` first.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import enum
+import importlib
+import json
+import pkgutil
 import types
 import typing
 from collections.abc import Iterator
@@ -36,7 +40,7 @@ def to_text(config: Any) -> str:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """Return plain JSON; each configuration's class stands under "class", enumerations by the name of the member."""
+    """Return plain JSON: the name of each configuration's class is its entry "class", enumerations are member names."""
     content = {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
     return {"class": type(config).__name__, **content}
 
@@ -54,7 +58,7 @@ def _plain(value: Any) -> Any:
 def from_json(kind: type[T], content: Any) -> T:
     """Return the configuration of class `kind` that `to_json` wrote.
 
-    Settings that the file does not have take their defaults, so that runs of an older version can be read.
+    Settings that the file lacks take their defaults, so that runs of an older version can be read.
 
     Raises:
         UserError: names the setting that this version does not know or cannot read.
@@ -62,7 +66,58 @@ def from_json(kind: type[T], content: Any) -> T:
     return _dataclass(kind, content, "")
 
 
+def subclasses(kind: type) -> dict[str, type]:
+    """Return the dataclasses that derive from `kind`, by name, with `kind` itself where it stands for something.
+
+    A base class that others fill in (`HostConfig`, `HostLossConfig`) accepts all of them: those of its own package,
+    whose modules are imported to find them, and those of the caller's, as far as they are imported already.
+    """
+    if kind.__module__.startswith("tflane_jax.") and getattr(kind, "open_base", False):
+        package = importlib.import_module(kind.__module__.rpartition(".")[0])
+        for module in pkgutil.iter_modules(package.__path__):
+            importlib.import_module(f"{package.__name__}.{module.name}")
+    found, waiting = {}, [kind]
+    while waiting:
+        each = waiting.pop(0)
+        waiting += each.__subclasses__()
+        found.setdefault(each.__name__, each)
+    return found
+
+
+def added_settings(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
+    """Return a line for each setting that only the second of two configurations (JSON) has, with its value there.
+
+    A new part is one line, which names its class.
+    """
+    lines: list[str] = []
+    for name, value in after.items():
+        if name not in before:
+            shown = value["class"] if isinstance(value, dict) else json.dumps(value)
+            lines.append(f"setting {prefix}{name} is new: default {shown}")
+        elif isinstance(value, dict) and isinstance(before[name], dict):
+            lines += added_settings(before[name], value, f"{prefix}{name}.")
+    return lines
+
+
+def first_difference(there: dict[str, Any], here: dict[str, Any], prefix: str = "") -> str:
+    """Return the first setting in which two configurations (JSON) differ, with both values; "" where none does."""
+    for name in sorted(there.keys() | here.keys()):
+        one, other = there.get(name), here.get(name)
+        if one == other:
+            continue
+        if isinstance(one, dict) and isinstance(other, dict) and one.get("class") == other.get("class"):
+            return first_difference(one, other, f"{prefix}{name}.")
+        return f"{prefix}{name}: {_shown(one)} there, {_shown(other)} here"
+    return ""
+
+
+def _shown(value: Any) -> str:
+    return str(value.get("class", value)) if isinstance(value, dict) else str(value)
+
+
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
+    if isinstance(content, dict) and getattr(kind, "open_base", False):
+        kind = subclasses(kind).get(content.get("class", ""), kind)
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
         raise UserError(f"setting {path or 'at the top'} should be a {kind.__name__}, not {content!r:.80}")
     hints = typing.get_type_hints(kind)
@@ -101,10 +156,10 @@ def _value(hint: Any, content: Any, path: str) -> Any:
 
 
 def choices(config: Any, name: str) -> dict[str, Any]:
-    """Return the nested configurations between which a setting chooses, by the names of their classes.
+    """Return the classes of configurations that a setting can hold, by name.
 
-    "None" is among them where the setting may be absent, and "default" for the first class then. Nothing for a setting
-    that is no such choice, or that `config` does not have.
+    Where the setting may be absent, "None" is among them, and "default" for the first class. Empty for a setting that
+    holds no configuration, or that `config` does not have.
     """
     owner, _, field = name.rpartition(".")
     for part in owner.split(".") if owner else ():
@@ -112,6 +167,8 @@ def choices(config: Any, name: str) -> dict[str, Any]:
     hint = typing.get_type_hints(type(config)).get(field) if dataclasses.is_dataclass(config) else None
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ()
     named = {kind.__name__: kind for kind in kinds if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
+    if isinstance(hint, type) and getattr(hint, "open_base", False):
+        named = {name: kind for name, kind in subclasses(hint).items() if kind is not hint}
     if named and type(None) in kinds:
         return {"None": type(None), "default": next(iter(named.values())), **named}
     return named
@@ -125,7 +182,7 @@ def with_setting(config: T, name: str, value: Any) -> T:
 
 
 def _member(kinds: tuple[Any, ...], content: Any, path: str) -> Any:
-    """Read the member of a union that fits: None, the class that is named, or the first plain type."""
+    """Read the first member of a union that fits: None, the class with the saved name, or a plain type."""
     if content is None and type(None) in kinds:
         return None
     if isinstance(content, dict):

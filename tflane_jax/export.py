@@ -7,7 +7,6 @@ answer = program.call(images)    # (b, 360, 640, 3) uint8 RGB -> {"logits": (b, 
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,9 +19,10 @@ from jax import export
 from jaxtyping import Array, Float, UInt8
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_bytes
+from tflane_jax.models.parameters import Params
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
-from tflane_jax.training.task import Params
 
 PLATFORMS = ("cpu", "cuda")
 Answer = dict[str, Float[Array, "b q c"]]
@@ -35,7 +35,7 @@ def image_program(task: LaneShapeTask, params: Params) -> Callable[[UInt8[Array,
         no_lines = LaneLines(jnp.zeros((0, 1, 2)), jnp.zeros((0, 1), bool), jnp.zeros(0, bool))
 
         def one(image):
-            return task.predict(params, RoadImage(image, jnp.ones(image.shape[:2], bool), no_lines))
+            return task.predict(params, RoadImage(image, jnp.ones(image.shape[:2], bool), no_lines)).curves
 
         answer = jax.vmap(one)(images)
         return {"logits": answer.logits, "curves": answer.curves}
@@ -53,17 +53,7 @@ def export_model(
     (batch,) = export.symbolic_shape("b")
     images = jax.ShapeDtypeStruct((batch, height, width, 3), jnp.uint8)
     content = export.export(jax.jit(image_program(task, params)), platforms=platforms)(images).serialize()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
-    return path
+    return write_bytes(path, content)
 
 
 def load_program(path: Path) -> export.Exported:

@@ -5,6 +5,7 @@ This is the Python side of `tflane train`, `eval` and `predict`; notebooks and t
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 from dataclasses import dataclass, replace
@@ -15,18 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.config import RunConfig, Source
-from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.config import RunConfig
+from tflane_jax.config_io import added_settings, from_json, to_json, to_text
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
-from tflane_jax.tasks import system_of
+from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.migrations import migrate
+from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
-from tflane_jax.training.run_folder import Start, check_start, claimed, read_config, write_json, write_text
+from tflane_jax.training.run_folder import Start, check_start, claimed, read_config
 from tflane_jax.training.schedule import make_optimizer
 from tflane_jax.training.state import TrainState, per_seed
-from tflane_jax.training.task import Params, split_statistics
 
 
 @dataclass(frozen=True)
@@ -52,14 +55,15 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     Raises UserError as `training.loop.train` and the datasets do.
     """
     check_start(folder, start)  # before data is made, which may take long
-    system = system_of(config)
-    data = system.load(config.data.source("train"), progress=progress)
-    system.check(config, data)
-    arrays = system.examples(config, data)
-    validation = system.load(config.data.source("val"), progress=progress)
+    task = config.task
+    _check_metrics(config)
+    data: Any = task.load(config.data.source("train"), progress=progress)
+    task.check(config.data, data)
+    arrays = task.examples(data)
+    validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:
-        return system.evaluate(config.task, params, validation, config.evaluation.batch_size).scores()
+        return task.evaluate(params, validation, config.evaluation).scores()
 
     return train(
         config.task,
@@ -69,17 +73,58 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         optim=config.optim,
         resolved=to_json(config),
         resolved_text=to_text(config),
+        current_form=current_form,
         start=start,
-        prepare=system.prepare(config),
+        prepare=task.prepare(config.data),
         evaluate=evaluate,
         draw=_drawing(config),
         progress=progress,
     )
 
 
+def _check_metrics(config: RunConfig) -> None:
+    """Raise UserError where a setting names a score that the evaluation does not give."""
+    known = config.task.score_names(config.data, config.evaluation)
+    adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
+    named = {"training.best_metric": config.training.best_metric}
+    if adaptive is not None:
+        named["optim.restarts.adaptive.metric"] = adaptive.metric
+    for setting, name in named.items():
+        if name not in known:
+            listed = ", ".join(sorted(score for score in known if "@" not in score))
+            raise UserError(f"{setting} is {name}, which the evaluation does not give: choose one of {listed}")
+
+
+def build_data(source: Any) -> None:
+    """Make the examples of a source that are not in the cache yet; real data need nothing."""
+    build = source_of(source).build
+    if build is not None:
+        build(source, True)
+
+
+def load_test_data(config: RunConfig) -> Any:
+    """Return the examples of a configuration's test split; the last ones asked for stay in memory."""
+    return _loaded(config.data.source("test"), config.task)
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(source: Any, task: Any) -> Any:
+    return task.load(source)
+
+
 def resumable_config(folder: Path) -> RunConfig:
-    """Return the configuration that a run was started with; raises UserError where there is no run."""
-    return from_json(RunConfig, read_config(folder))
+    """Return the configuration that a run was started with; raises UserError if the folder holds no run."""
+    return from_json(RunConfig, migrate(read_config(folder))[0])
+
+
+def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return a saved configuration (JSON) as this version writes it, and a line for each change to tell the user.
+
+    Raises UserError for a setting that this version cannot read.
+    """
+    migrated, notices = migrate(saved)
+    current = to_json(from_json(RunConfig, migrated))
+    return current, notices + added_settings(migrated, current)
 
 
 def open_run(folder: Path, which: Which | None = None) -> Run:
@@ -93,13 +138,16 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: there is no such checkpoint, it is damaged, or of a version that this one cannot read.
     """
     plain = Checkpoints(folder / "checkpoints")
-    config = from_json(RunConfig, plain.manifest(plain.find("last")).config)
+    migrated, notices = migrate(plain.manifest(plain.find("last")).config)
+    for notice in notices:
+        print(notice, file=sys.stderr)
+    config = from_json(RunConfig, migrated)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
     if which is None:
         which = "last" if checkpoints.best_step() is None else "best"
     step = checkpoints.find(which)
     params = per_seed(checkpoints.params(step), config.training.seeds)
-    return Run(str(folder), from_json(RunConfig, checkpoints.manifest(step).config), step, tuple(params))
+    return Run(str(folder), config, step, tuple(params))
 
 
 def open_weights(config: RunConfig) -> Run:
@@ -137,9 +185,7 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
         write_json(folder / "config.json", to_json(config))  # last: from here on the folder holds a run
 
 
-def evaluate_run(
-    run: Run, source: Source, *, task: Any = None, progress: bool = True
-) -> tuple[str, list[dict[str, Any]]]:
+def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = True) -> tuple[str, list[dict[str, Any]]]:
     """Evaluate every seed of a run.
 
     Args:
@@ -152,9 +198,9 @@ def evaluate_run(
         The metric's protocol with its version, and rows for a table: one per group and seed; with several seeds,
         their means and standard deviations (n - 1) follow.
     """
-    system, task = system_of(run.config), run.config.task if task is None else task
-    arrays = system.load(source, progress=progress)
-    every = [system.evaluate(task, params, arrays, run.config.evaluation.batch_size) for params in run.params]
+    task = run.config.task if task is None else task
+    arrays = task.load(source, progress=progress)
+    every = [task.evaluate(params, arrays, run.config.evaluation) for params in run.params]
     seeds = run.config.training.seeds
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:
@@ -164,7 +210,7 @@ def evaluate_run(
             table = {name: np.array([one[name] for one in values]) for name in values[0]}
             rows.append({"lanes of": group, "seed": "mean"} | {k: float(v.mean()) for k, v in table.items()})
             rows.append({"lanes of": group, "seed": "std"} | {k: float(v.std(ddof=1)) for k, v in table.items()})
-    columns = system.columns
+    columns = task.columns
     return every[0].protocol, [{name: row[name] for name in columns if name in row} for row in rows]
 
 
@@ -175,10 +221,10 @@ def _drawing(config: RunConfig) -> Draw | None:
         return None
     from tflane_jax.plots import save_curves
 
-    draw_examples = system_of(config).drawing(config)
+    draw_examples = config.task.drawing(config.data, config.evaluation)
 
     def draw(folder: Path, step: int, params: Params, records: list[Record]) -> None:
         save_curves(folder / "curves.png", records)
-        draw_examples(folder, step, params, records)
+        draw_examples(folder, step, params)
 
     return draw

@@ -17,7 +17,7 @@ from tflane_jax.scene import shapes_of
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
-from tflane_jax.training.task import Task
+from tflane_jax.training.task import Trainable
 
 MIB = 2**20
 
@@ -52,25 +52,25 @@ def parameter_counts(params: Any, depth: int = 1) -> dict[str, int]:
     return counts
 
 
-def shapes_of_params(task: Task, example: Any) -> Any:
+def shapes_of_params(task: Trainable, example: Any) -> Any:
     """Return the shapes of a task's parameters; raises as the model does where an example does not fit it."""
     return jax.eval_shape(task.init, jax.random.key(0), _trained_on(task, example))
 
 
-def _trained_on(task: Task, example: Any) -> Any:
+def _trained_on(task: Trainable, example: Any) -> Any:
     """Return the shapes of what a task trains on: the example, or a clip of them."""
     clip = getattr(task, "clip", 1)
     return example if clip == 1 else shapes_of(example, clip)
 
 
-def prediction_program(task: Task, example: Any, *, compiled: bool = True) -> Program:
+def prediction_program(task: Trainable, example: Any, *, compiled: bool = True) -> Program:
     """Return what one answer costs; `example` holds shapes."""
     lowered = jax.jit(task.predict).lower(shapes_of_params(task, example), example)
     return _program("prediction", 1, lowered, compiled)
 
 
 def training_program(
-    task: Task, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
+    task: Trainable, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
     """Return what a whole update costs: loss, gradient, optimiser, moving average; of clips for a task of clips."""
     example = _trained_on(task, example)

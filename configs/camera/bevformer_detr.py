@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
+from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -22,5 +23,8 @@ def get_config() -> RunConfig:
     assert isinstance(toponet.task, LaneGraphTask)
     assert isinstance(host, TopoNetConfig)
     decoder = replace(host.decoder, refine="fixed")
-    model = BevFormerDetrConfig(host.encoder, decoder, host.elements, denoising=host.denoising)
-    return replace(toponet, task=replace(toponet.task, model=model))
+    model = BevFormerDetrConfig(
+        encoder=host.encoder, range=host.range, decoder=decoder, elements=host.elements, denoising=host.denoising
+    )
+    losses = BevFormerDetrLossConfig(points_weight=0.025, successor_weight=20.0)
+    return replace(toponet, task=LaneGraphTask(model, losses))

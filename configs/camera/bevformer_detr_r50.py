@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
 from tflane_jax.datasets.view_images import BASELINE_LARGE
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.models.bevformer_detr import paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -19,8 +19,9 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 def get_config() -> RunConfig:
     """Return the baseline's configuration."""
     toponet = load_config(str(Path(__file__).with_name("toponet_r50.py")))
-    losses = LaneGraphLossConfig(points_weight=0.0075, control_points=5)
     assert isinstance(toponet.data, OpenLaneV2Data)
     assert isinstance(toponet.task, LaneGraphTask)
-    task = LaneGraphTask(replace(paper_config(control_points=5), encoder=toponet.task.model.encoder), losses)
+    task = LaneGraphTask(
+        replace(paper_config(control_points=5), encoder=toponet.task.model.encoder), BevFormerDetrLossConfig()
+    )
     return replace(toponet, task=task, data=replace(toponet.data, image=BASELINE_LARGE))

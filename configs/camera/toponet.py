@@ -13,7 +13,7 @@ from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.fpn import FeaturePyramidConfig
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.element_decoder import ElementDecoderConfig
@@ -38,16 +38,21 @@ ENCODER = CameraEncoderConfig(
     replace(SMALL_BEVFORMER, grid=GRID, levels=3, cameras=6, capacity=480),
     cells=True,
 )
-DECODER = LaneDecoderConfig(queries=32, range=GRID.range)
-ELEMENTS = ElementDecoderConfig(levels=3)
+MODEL = TopoNetConfig(
+    encoder=ENCODER,
+    range=TRUTH,
+    decoder=LaneDecoderConfig(queries=32),
+    elements=ElementDecoderConfig(levels=3),
+    denoising=DenoisingConfig(),
+)
 
 
 def get_config() -> RunConfig:
     """Return the small camera model."""
     return RunConfig(
         task=LaneGraphTask(
-            TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS, denoising=DenoisingConfig()),
-            LaneGraphLossConfig(successor_weight=20.0),
+            MODEL,
+            TopoNetLossConfig(successor_weight=20.0),
         ),
         data=WorldData(train=600, val=20, test=75, example=ExampleConfig(range=TRUTH, sensor=None, cameras=RIG)),
         optim=OptimConfig(lr=2e-3, warmup_steps=100, optimizer="muon", b2=0.99, clip_norm=5.0),

@@ -16,6 +16,7 @@ from pathlib import Path
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.roads.markers import PlacementConfig
@@ -35,7 +36,7 @@ def get_config() -> RunConfig:
         host.data.example, cameras=replace(host.data.example.cameras, markers=True), markers=MarkerConfig()
     )
     # Denoising speeds up training from random weights; this decoder is trained already.
-    model = replace(host.task.model, denoising=None, markers=SMALL_MARKER_FUSION)
+    model = replace(host.task.model, denoising=None, priors=PriorsConfig(markers=SMALL_MARKER_FUSION))
     return replace(
         host,
         task=replace(host.task, model=model, clip=4),
@@ -52,7 +53,8 @@ def ablations() -> dict[str, RunConfig]:
     markers = SMALL_MARKER_FUSION
 
     def with_markers(changed: MarkerFusionConfig | None) -> RunConfig:
-        return replace(config, task=replace(config.task, model=replace(config.task.model, markers=changed)))
+        model = replace(config.task.model, priors=PriorsConfig(markers=changed))
+        return replace(config, task=replace(config.task, model=model))
 
     return {
         "toponet": with_markers(None),

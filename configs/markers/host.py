@@ -10,11 +10,11 @@ from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
-from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -32,7 +32,7 @@ EXAMPLE = ExampleConfig(markers=MarkerConfig(), sd_map=SdMapConfig(translation=2
 def get_config() -> RunConfig:
     """Return TopoNet."""
     return RunConfig(
-        task=LaneGraphTask(TopoNetConfig(denoising=DenoisingConfig()), LaneGraphLossConfig(successor_weight=20.0)),
+        task=LaneGraphTask(TopoNetConfig(denoising=DenoisingConfig()), TopoNetLossConfig(successor_weight=20.0)),
         data=WorldData(train=1000, val=15, test=100, world=WORLD, example=EXAMPLE),
         optim=OptimConfig(lr=2e-3, warmup_steps=100, optimizer="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=2500, batch_size=4, eval_every=2500),
@@ -43,7 +43,6 @@ def ablations() -> dict[str, RunConfig]:
     """Return BEVFormer-DETR, the host without a graph."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
-    model = BevFormerDetrConfig(
-        config.task.model.encoder, LaneDecoderConfig(refine="fixed"), None, denoising=DenoisingConfig()
-    )
-    return {"bevformer_detr": replace(config, task=replace(config.task, model=model))}
+    model = BevFormerDetrConfig(encoder=config.task.model.encoder, elements=None, denoising=DenoisingConfig())
+    losses = BevFormerDetrLossConfig(points_weight=0.025, successor_weight=20.0)
+    return {"bevformer_detr": replace(config, task=LaneGraphTask(model, losses))}

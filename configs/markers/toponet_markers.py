@@ -11,11 +11,13 @@ without a prior. The rows differ only in the prior. A clip has four frames, half
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
-from tflane_jax.models.toponet import TrafficFlowConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 MARKERS = SMALL_MARKER_FUSION
@@ -50,13 +52,13 @@ def ablations() -> dict[str, RunConfig]:
     return table_1 | table_2 | table_3 | table_4 | beyond
 
 
-def _tuned(host: str = "host", **priors: object) -> RunConfig:
+def _tuned(host: str = "host", **priors: Any) -> RunConfig:
     """Return the fine-tuning of a host with priors."""
     path = str(Path(__file__).with_name("host.py"))
     config = load_config(path if host == "host" else f"{path}:{host}")
     assert isinstance(config.task, LaneGraphTask)
     # Denoising speeds up training from random weights; this decoder is trained already.
-    model = replace(config.task.model, denoising=None, **priors)
+    model = replace(config.task.model, denoising=None, priors=PriorsConfig(**priors))
     return replace(
         config,
         task=replace(config.task, model=model, clip=4),

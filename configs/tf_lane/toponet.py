@@ -10,7 +10,7 @@ occluded/DET_l 9.3 +- 1.8 (docs/tf_lane.md).
 from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -24,7 +24,7 @@ def get_config() -> RunConfig:
     loss, which is a mean over all pairs of queries.
     """
     return RunConfig(
-        task=LaneGraphTask(losses=LaneGraphLossConfig(successor_weight=20.0)),
+        task=LaneGraphTask(losses=TopoNetLossConfig(successor_weight=20.0)),
         data=WorldData(train=1000, val=25, test=150),
         optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),

@@ -10,8 +10,13 @@ import dataclasses
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, load_config
-from tflane_jax.models.toponet import TrafficFlowConfig
-from tflane_jax.models.traffic_flow_module import ALL_FUSIONS, LANE_FUSIONS, TrafficFlowModuleConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.traffic_flow_module import (
+    ALL_FUSIONS,
+    LANE_FUSIONS,
+    TrafficFlowConfig,
+    TrafficFlowModuleConfig,
+)
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 
 
@@ -48,5 +53,5 @@ def _data(instances: int, tolerance: int) -> RunConfig:
 
 def _with_traffic_flow(traffic_flow: TrafficFlowConfig) -> RunConfig:
     baseline = load_config(str(Path(__file__).with_name("toponet.py")))
-    model = dataclasses.replace(baseline.task.model, traffic_flow=traffic_flow)
+    model = dataclasses.replace(baseline.task.model, priors=PriorsConfig(traffic_flow=traffic_flow))
     return dataclasses.replace(baseline, task=dataclasses.replace(baseline.task, model=model))

@@ -2,15 +2,19 @@
 
 import dataclasses
 import json
+import re
 
 import pytest
 
 from tests.models.cases import BASELINE
-from tflane_jax.ablations.compare import Job, _Worker, compare
+from tflane_jax.ablations.compare import compare
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.workers import Worker, _cores, worker_threads
 from tflane_jax.config import EvaluationConfig, RunConfig, WorldData
 from tflane_jax.errors import UserError
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.provenance import read_provenance, thread_setting
 from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.simulate import WorldConfig
 
@@ -24,12 +28,27 @@ CONFIG = RunConfig(
 
 
 def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
-    with _Worker(0, 1) as worker:
-        worker.begin(Job(CONFIG, tmp_path / "runs" / "seed_0"))
+    job = Job(CONFIG, tmp_path / "runs" / "seed_0")
+    with Worker(0, 1) as worker:
+        worker.begin(job)
         worker._process.kill()
         worker._process.join()
-        with pytest.raises(UserError, match=r"seed_0 failed: its messages are in .*seed_0\.log"):
-            worker.check()
+        failure = worker.check()
+        assert worker.job is None
+    assert failure is not None
+    assert re.search(r"seed_0 failed: its messages are in .*seed_0\.log", str(failure))
+    assert "killed by SIGKILL" in str(failure)
+    assert "killed by SIGKILL" in job.log.read_text()
+
+
+@pytest.mark.parametrize(("available", "parallel", "each"), [(8, 2, 4), (3, 2, 1), (2, 5, 1), (4, 1, 4)])
+def test_all_workers_have_the_same_number_of_cores(monkeypatch, available, parallel, each):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 10 + available)))
+    cores = [_cores(slot, parallel) for slot in range(parallel)]
+    assert {len(some) for some in cores} == {each}
+    assert worker_threads(parallel) == thread_setting(each)
+    used = [core for some in cores for core in some]
+    assert len(set(used)) == min(len(used), available)
 
 
 @pytest.mark.slow
@@ -42,6 +61,8 @@ def test_two_workers_train_all_runs_and_name_the_one_that_failed(tmp_path, monke
     scores = json.loads((out / "scores.json").read_text())
     assert {name: len(values) for name, values in scores.items()} == {"one": 3, "other": 3}
     assert len(list(out.glob("*/seed_*/config.json"))) == len(list(out.glob("*/seed_*.log"))) == 6
+    (start,) = read_provenance(out / "one" / "seed_0")
+    assert start["threads"] == worker_threads(2)
 
     broken = {"one": dataclasses.replace(CONFIG, optim=OptimConfig(warmup_steps=1000))}
     with pytest.raises(UserError, match=r"seed_0 failed: its messages are in .*seed_0\.log"):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.ablations.comparison import Variant, compact, summarise
+from tflane_jax.ablations.statistics import holm
 from tflane_jax.errors import UserError
 
 
@@ -42,3 +43,11 @@ def test_of_errors_less_is_better():
     (_, row) = summarise(variants, ["all/DET_l"], errors=["all/DET_l"])
     assert row["seeds better"] == "2 of 3"
     assert row["difference"] == pytest.approx(-0.05 / 3)
+
+
+def test_p_values_are_corrected_for_all_tests_of_the_table():
+    variants = [variant("base", 0.1, 0.2, 0.3), variant("a", 0.2, 0.35, 0.4), variant("b", 0.1, 0.3, 0.2)]
+    rows = [row for row in summarise(variants, ["all/DET_l", "occluded/DET_l"]) if "p" in row]
+    assert [row["p (Holm)"] for row in rows] == holm([row["p"] for row in rows])
+    assert len(rows) == 4
+    assert min(row["p (Holm)"] for row in rows) == pytest.approx(4 * min(row["p"] for row in rows))

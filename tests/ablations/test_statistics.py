@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tflane_jax.ablations.statistics import paired_difference
+from tflane_jax.ablations.statistics import holm, paired_difference
 
 
 def test_against_the_formula():
@@ -44,3 +44,27 @@ def test_equal_numbers_say_nothing():
 def test_nothing_to_pair(a, b):
     with pytest.raises(ValueError, match="as many numbers"):
         paired_difference(a, b)
+
+
+def test_holm_by_hand():
+    # Holm's own arithmetic: 4 x 0.01, 3 x 0.02, then 2 x 0.02 and 1 x 0.05, each at least as large as the one before.
+    assert holm([0.02, 0.05, 0.01, 0.02]) == pytest.approx([0.06, 0.06, 0.04, 0.06])
+    assert holm([0.5, 0.9]) == [1.0, 1.0]
+    assert holm([0.03]) == [0.03]
+    assert holm([]) == []
+
+
+def test_holm_rejects_what_the_step_down_procedure_rejects():
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        p = rng.choice([0.001, 0.01, 0.02, 0.03, 0.04, 0.2, 0.9], size=rng.integers(1, 8))
+        left, rejected = list(np.argsort(p, kind="stable")), set()
+        while left and p[left[0]] <= 0.05 / len(left):
+            rejected.add(int(left.pop(0)))
+        assert {i for i, q in enumerate(holm(p)) if q <= 0.05} == rejected
+
+
+def test_tests_that_could_not_be_made_do_not_count():
+    corrected = holm([0.01, math.nan, 0.04])
+    assert math.isnan(corrected[1])
+    assert [corrected[0], corrected[2]] == pytest.approx([0.02, 0.04])

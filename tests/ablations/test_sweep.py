@@ -12,7 +12,6 @@ from tflane_jax.ablations.sweep import runs_below, sweep
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
 from tflane_jax.runs import save_weights
-from tflane_jax.tasks import system_of
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
@@ -21,7 +20,7 @@ def folder(tmp_path_factory):
     """Two untrained models, the first with two seeds."""
     root = tmp_path_factory.mktemp("runs")
     other = dataclasses.replace(BASELINE, decoder=dataclasses.replace(BASELINE.decoder, queries=5))
-    example = jax.tree.map(jax.numpy.zeros_like, system_of(CONFIG).shapes(CONFIG))
+    example = jax.tree.map(jax.numpy.zeros_like, CONFIG.task.shapes(CONFIG.data))
     for path, model, seed in (("one/seed_0", BASELINE, 0), ("one/seed_1", BASELINE, 1), ("other", other, 0)):
         config = dataclasses.replace(CONFIG, task=LaneGraphTask(model))
         save_weights(config, config.task.init(jax.random.key(seed), example), root / path)
@@ -47,6 +46,8 @@ def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
     assert again.read_text().splitlines()[2].split("|")[1:-1] == [" data.world.severity ", " model ", " all/recall "]
     with pytest.raises(UserError, match="no metric all/wit, only all/DET_l, "):
         sweep(one, "data.world.severity", ["0"], tmp_path / "again", metrics=["all/wit"])
+    with pytest.raises(UserError, match="none is best: ask for `last`"):  # runs of no steps were never evaluated
+        sweep(one, "data.world.severity", ["0"], tmp_path / "again", which="best")
     first = json.loads(again.with_suffix(".json").read_text())["meta"]["scores"]["one"][0][0]
     assert first == content["meta"]["scores"]["one"][0][0]
 

@@ -26,11 +26,11 @@ ENCODER = CameraEncoderConfig(
 )
 ELEMENTS = ElementDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24)
 DECODER = LaneDecoderConfig(dim=16, heads=4, layers=2, queries=8, hidden=24, relation=128, refine="fixed")
-TOPONET = TopoNetConfig(ENCODER, DECODER, elements=ELEMENTS)
+TOPONET = TopoNetConfig(encoder=ENCODER, decoder=DECODER, elements=ELEMENTS)
 BASELINE = BevFormerDetrConfig(
-    ENCODER,
-    LaneDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24, relation=128, refine="fixed"),
-    ELEMENTS,
+    encoder=ENCODER,
+    decoder=LaneDecoderConfig(dim=16, heads=4, layers=2, queries=6, hidden=24, relation=128, refine="fixed"),
+    elements=ELEMENTS,
     control_points=5,
 )
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from unittest import mock
 
 import numpy as np
+import pytest
 
 _FUNCTIONS = {
     "torch._utils": (
@@ -173,3 +174,14 @@ def write_legacy(path, obj, *, version=1001):
     raw = b"".join((len(s.data) // s.item).to_bytes(8, "little") + s.data for s in storages.values())
     path.write_bytes(head + data + pickle.dumps(list(storages), 2) + raw)
     return path
+
+
+GRID = np.arange(24, dtype=np.float32).reshape(4, 6)
+both_formats = pytest.mark.parametrize("write", [write_zip, write_legacy])
+
+
+def assert_state(got, expected):
+    assert list(got) == list(expected)
+    for name, value in expected.items():
+        assert (got[name].dtype, got[name].shape) == (value.dtype, value.shape), name
+        np.testing.assert_array_equal(got[name], value, err_msg=name)

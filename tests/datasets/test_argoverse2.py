@@ -9,16 +9,8 @@ import numpy as np
 import pytest
 
 from tests.shared import shared_path
-from tflane_jax.datasets.argoverse2 import (
-    ANNOTATIONS,
-    CATEGORIES,
-    POSES,
-    Argoverse2Config,
-    Argoverse2Dataset,
-    check_log,
-    find_logs,
-    load_log,
-)
+from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, CATEGORIES, POSES, check_log, find_logs, load_log
 from tflane_jax.datasets.argoverse2_map import line_type
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example, traffic_flow

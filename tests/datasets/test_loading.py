@@ -4,7 +4,7 @@ import pytest
 
 from tests.fakes import FakeConfig, FakeDataset, UnevenDataset
 from tflane_jax.datasets.cache import cached
-from tflane_jax.datasets.loading import TRAINING_PARTS, count, for_training, keep, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example, stack_examples
 
@@ -27,7 +27,7 @@ def assert_same(a, b):
 
 def test_arrays_are_the_examples_stacked(dataset):
     arrays = load(dataset)
-    assert count(arrays) == 5
+    assert len(arrays.has_previous) == 5
     assert_same(arrays, stack_examples([FakeDataset(FakeConfig()).example(i) for i in range(5)]))
 
 
@@ -42,7 +42,7 @@ def test_parts_that_are_not_asked_for_are_dropped(dataset):
 
 
 def test_training_keeps_what_a_model_sees_and_the_lanes(dataset):
-    arrays = for_training(load(dataset))
+    arrays = keep(load(dataset), TRAINING_PARTS)
     assert_same(arrays, load(dataset, parts=TRAINING_PARTS))
     assert arrays.bev is not None
     assert arrays.traffic_flow is not None

@@ -127,7 +127,7 @@ def test_a_jpeg_looks_the_same(tmp_path):
 
 
 def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("tflane_jax.commands.data_export.open_dataset", lambda source: DriveDataset())
+    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda source: DriveDataset())
     (tmp_path / "config.py").write_text("from tflane_jax.config import RunConfig as get_config")
     command = ["data", "export", "--config", str(tmp_path / "config.py"), "--out", str(tmp_path / "out")]
     assert main([*command, "--splits", "val", "test", "--data.val", "5"]) == 0

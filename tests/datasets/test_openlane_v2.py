@@ -13,9 +13,10 @@ from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tests.fakes import FakeConfig, FakeDataset
 from tests.shared import shared_path
 from tflane_jax.cli import build_parser
-from tflane_jax.commands.sources import lane_graph_source
+from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
+from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_frames import list_frames
@@ -32,8 +33,6 @@ from tflane_jax.datasets.view_images import (
 )
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import project
-from tflane_jax.tasks import system_of
-from tflane_jax.training.batches import batches
 
 SIZES = ExampleConfig(lanes=5, segments=4, areas=2, elements=3)
 NATIVE = ImageConfig(divisor=16)
@@ -223,24 +222,26 @@ def test_it_is_training_data(whole):
         whole, val="train", subset="B", image=NATIVE, example=SIZES, loading=StreamingConfig(threads=2, ahead=2)
     )
     config = RunConfig(data=data)
-    system = system_of(config)
-    loaded = system.load(data.source("train"))
+    task = config.task
+    loaded = task.load(data.source("train"))
     assert isinstance(loaded, Streamed)
-    shapes = system.shapes(config)
-    plain, coloured = (next(batches(loaded, (0,), range(1), 2, prepare)) for prepare in (None, system.prepare(config)))
+    shapes = task.shapes(config.data)
+    plain, coloured = (
+        next(batches(loaded, (0,), range(1), 2, prepare)) for prepare in (None, task.prepare(config.data))
+    )
     assert plain.cameras.image.shape == (2, *shapes.cameras.image.shape)
     assert plain.segments.valid.shape == (2, 0)  # not a training part
     assert (plain.cameras.image != coloured.cameras.image).any()
     np.testing.assert_array_equal(plain.lanes.points, coloured.lanes.points)
     nothing = RunConfig(data=OpenLaneV2Data(whole, augmentation=None))
-    assert system.prepare(nothing) is None
+    assert task.prepare(nothing.data) is None
     assert data.augmentation == PhotometricConfig()
 
 
 def test_the_command_line_names_it(whole):
     def chosen(*arguments, config=None):
         options = build_parser().parse_args(["eval", "run", "--split", "val", *arguments])
-        return lane_graph_source(config or RunConfig(), options)
+        return chosen_source(config or RunConfig(), options)
 
     source = chosen("--data", "openlane-v2", "--root", str(whole))
     assert (source.root, source.split, source.subset, source.image) == (whole, "val", "B", TOPONET_SUBSET_B)
@@ -253,18 +254,18 @@ def test_the_command_line_names_it(whole):
 
 def test_a_world_too_large_for_memory_is_streamed(tmp_path, monkeypatch):
     kept = cached(FakeDataset(FakeConfig(5)), root=tmp_path, workers=1, progress=False)
-    monkeypatch.setattr("tflane_jax.tasks.lane_graph_system.open_dataset", lambda source, progress: kept)
-    system, source = system_of(RunConfig()), RunConfig().data.source("train")
-    whole = system.load(source)
-    monkeypatch.setattr("tflane_jax.tasks.lane_graph_system.IN_MEMORY", 1000)
-    large = system.load(source)
+    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda source, progress: kept)
+    task, source = RunConfig().task, RunConfig().data.source("train")
+    whole = task.load(source)
+    monkeypatch.setattr("tflane_jax.datasets.loading.IN_MEMORY", 1000)
+    large = task.load(source)
     assert isinstance(large, Streamed)
     for one, other in zip(*(batches(data, (3,), range(4), 2) for data in (whole, large)), strict=True):
         jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def test_shapes_need_no_data():
-    shapes = system_of(RunConfig()).shapes(RunConfig(data=OpenLaneV2Data(Path("nowhere"))))
+    shapes = RunConfig().task.shapes(RunConfig(data=OpenLaneV2Data(Path("nowhere"))).data)
     assert shapes.cameras.image.shape == (7, 800, 1024, 3)
     assert shapes.traffic_elements.lane.shape == (128, 48)
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.fakes import BrokenDataset, FakeConfig, FakeDataset
+from tflane_jax.datasets.batches import batches, first_example, ordered_batches
 from tflane_jax.datasets.loading import keep, load_arrays
 from tflane_jax.datasets.streaming import Request, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
-from tflane_jax.training.batches import batches, first_example, ordered_batches
 
 PARTS = ("lanes", "traffic_elements")
 SIZE, BATCH = 7, 3

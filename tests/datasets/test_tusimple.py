@@ -9,9 +9,11 @@ import pytest
 
 from tests.shared import shared_path
 from tflane_jax.datasets.base import TruncationWarning
-from tflane_jax.datasets.tusimple import ROWS, TuSimpleConfig, TuSimpleDataset, lane_lines, load_road_images, row_lanes
+from tflane_jax.datasets.lane_rows import ROWS, lane_lines, row_lanes
+from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset, load_road_images
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 
 ROWS_48 = ROWS[8:]
 
@@ -195,7 +197,7 @@ def test_real_frames_agree_with_their_labels():
         assert lines.valid.sum() == (truth.x >= 0).any(1).sum()
         found = row_lanes(lines)
         metrics.update(RowLanes(found.x[:, np.searchsorted(ROWS, truth.rows)]), truth)
-    # One frame labels an absent lane, which no prediction can find (specs/data_formats.md section 5, record 3).
+    # One frame labels a lane without points, which no prediction can find.
     scores = metrics.compute()
     assert scores["FP"] == 0.0
     assert scores["FN"] == pytest.approx(0.025)

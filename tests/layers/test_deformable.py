@@ -5,46 +5,43 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.golden import (
-    assert_gradients_close,
-    assert_outputs_close,
-    case_id,
-    golden_modules,
-    load_module_case,
-    named_gradients,
-)
+from tests.golden import batch_leading, case_id, golden_modules, implemented, load_module_case, options
+from tests.golden_compare import compare
 from tflane_jax.layers.deformable import DeformableAttention, compass_offsets, sampling_locations
 
 
 @pytest.mark.golden
 @pytest.mark.parametrize("path", golden_modules("custom_msda_decoder*") + golden_modules("msda_module*"), ids=case_id)
 def test_module_matches_the_reference(path):
-    case = load_module_case(path)
-    shapes = [tuple(int(n) for n in row) for row in case.inputs.pop("spatial_shapes")]
-    padded = case.inputs.pop("key_padding_mask", np.zeros(case.inputs["value"].shape[1::-1], bool))
-    sizes = case.meta["config"]
-    module = DeformableAttention(sizes["embed_dims"], sizes["num_heads"], sizes["num_points"], sizes["num_levels"])
+    check(load_module_case(path))
 
-    def scalar(torch_params, arrays):
+
+def check(case):
+    sizes = options(case, "dim", "heads", "points")
+    implemented(case, value_proj_ratio=[1.0, 1])
+    shapes = [tuple(int(n) for n in row) for row in case.inputs["spatial_shapes"]]
+    module = DeformableAttention(sizes.dim, sizes.heads, sizes.points, len(shapes))
+    batch, length = batch_leading(case, case.inputs["value"]).shape[:2]
+    padded = case.inputs.get("key_padding_mask", np.zeros((batch, length), bool)).astype(bool)
+
+    def outputs(torch_params, inputs):
         params = {
             name: {"kernel": torch_params[f"{name}.weight"].T, "bias": torch_params[f"{name}.bias"]}
             for name in ("sampling_offsets", "attention_weights", "value_proj", "output_proj")
         }
 
-        def one(query, position, value, reference, padded):
+        def one(query, position, value, identity, reference, padded):
             attended = module.apply({"params": params}, query + position, value, shapes, reference[:, None], ~padded)
-            return query + attended
+            # The reference adds the query, without its position, unless it is given another identity.
+            return identity + attended
 
-        # The reference puts the batch second, and adds the query back itself.
-        out = jax.vmap(one, in_axes=(1, 1, 1, 0, 0), out_axes=1)(
-            arrays["query"], arrays["query_pos"], arrays["value"], arrays["reference_points"], padded
-        )
-        return (out * case.weights["output"]).sum(), out
+        query = inputs["query"]
+        position, identity = inputs.get("query_pos", jnp.zeros_like(query)), inputs.get("identity", query)
+        sequences = (batch_leading(case, array) for array in (query, position, inputs["value"], identity))
+        out = jax.vmap(one)(*sequences, inputs["reference_points"], padded)
+        return {"output": batch_leading(case, out)}
 
-    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
-    (_, out), (by_param, by_input) = step(case.params, case.inputs)
-    assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
-    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+    compare(case, outputs)
 
 
 @pytest.mark.parametrize("queries", [0, 1])

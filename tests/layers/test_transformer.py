@@ -1,72 +1,97 @@
-"""Transformer layers against PyTorch's numbers, and what padding and dropout do to them."""
+"""Transformer layers against PyTorch's numbers."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.golden import (
-    assert_gradients_close,
-    assert_outputs_close,
-    case_id,
-    golden_modules,
-    load_module_case,
-    named_gradients,
-)
+from tests.golden import batch_leading, case_id, golden_modules, implemented, load_module_case, options
+from tests.golden_compare import compare
 from tflane_jax.convert.lstr import decoder_layer_params, encoder_layer_params
-from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
+
+# The fixtures' names of PyTorch's masks.
+SELF_MASK = {"torch_encoder_layer": ("src_mask", "attn_mask", "mask"), "torch_decoder_layer": ("tgt_mask",)}
+SELF_PADDING = {
+    "torch_encoder_layer": ("kpm", "src_key_padding_mask", "key_padding_mask"),
+    "torch_decoder_layer": ("tkp", "tkpm", "tgt_key_padding_mask"),
+}
+MEMORY_MASK, MEMORY_PADDING = ("memory_mask", "mm"), ("mkp", "mkpm", "memory_key_padding_mask")
 
 
 def layer_config(case):
-    config = case.meta["config"]
-    return TransformerConfig(config["heads"], config["ff"], dropout=0.0, norm_first=config["norm_first"])
+    found = options(case, "heads", activation="relu", norm_first=False)
+    implemented(case, activation=["relu", "gelu"], layer_norm_eps=[1e-5], bias=[True])
+    (hidden,) = case.params["linear1.bias"].shape
+    return TransformerConfig(found.heads, hidden, 0.0, norm_first=found.norm_first, activation=found.activation)
 
 
-def compare(case, apply):
-    """Compare `apply`(torch parameters, inputs) -> output over the batch, and its gradients, with the reference."""
+def allowed(case, mask_names, padding_names, batch, queries, keys, heads):
+    """Return which query may attend to which key, (B, H, Q, K), from torch's masks: true or -inf blocks."""
+    pairs = np.ones((batch, heads, queries, keys), bool)
+    for name in (*mask_names, *padding_names):
+        if name not in case.inputs:
+            continue
+        mask = case.inputs[name]
+        if mask.dtype.kind == "f":
+            if not np.isin(mask, (0.0, -np.inf)).all():
+                pytest.fail(f"{case.meta['name']}: {name} adds numbers to the logits, which our layers do not")
+            mask = np.isneginf(mask)
+        if name in padding_names:
+            mask = mask.reshape(batch, 1, 1, keys)
+        elif mask.ndim == 3:
+            mask = mask.reshape(batch, heads, queries, keys)
+        pairs = pairs & ~mask.astype(bool)
+    return pairs
 
-    def scalar(torch_params, arrays):
-        out = apply(torch_params, arrays)
-        return (out * case.weights["output"]).sum(), out
 
-    floats = {name: value for name, value in case.inputs.items() if value.dtype == np.float32}
-    others = {name: value for name, value in case.inputs.items() if name not in floats}
-    step = jax.jit(jax.value_and_grad(lambda p, x: scalar(p, x | others), argnums=(0, 1), has_aux=True))
-    (_, out), (by_param, by_input) = step(case.params, floats)
-    assert_outputs_close({"output": out}, {"output": case.outputs["output"]})
-    assert_gradients_close(named_gradients(by_param, by_input), case.gradients)
+def known_inputs(case, names):
+    if unknown := sorted(case.inputs.keys() - set(names)):
+        pytest.fail(f"{case.meta['name']}: inputs that the test does not read: {', '.join(unknown)}")
+
+
+def check_encoder_layer(case):
+    config, kind = layer_config(case), "torch_encoder_layer"
+    known_inputs(case, ("src", *SELF_MASK[kind], *SELF_PADDING[kind]))
+    batch, length = batch_leading(case, case.inputs["src"]).shape[:2]
+    pairs = allowed(case, SELF_MASK[kind], SELF_PADDING[kind], batch, length, length, config.heads)
+
+    def outputs(torch_params, inputs):
+        variables = {"params": encoder_layer_params(torch_params)}
+        one = lambda x, mask: EncoderLayer(config).apply(variables, x, jnp.zeros_like(x), mask)  # noqa: E731
+        return {"output": batch_leading(case, jax.vmap(one)(batch_leading(case, inputs["src"]), pairs))}
+
+    compare(case, outputs)
+
+
+def check_decoder_layer(case):
+    config, kind = layer_config(case), "torch_decoder_layer"
+    known_inputs(case, ("tgt", "memory", *SELF_MASK[kind], *SELF_PADDING[kind], *MEMORY_MASK, *MEMORY_PADDING))
+    (batch, queries), keys = (batch_leading(case, case.inputs["tgt"]).shape[:2], case.inputs["memory"])
+    keys = batch_leading(case, keys).shape[1]
+    among = allowed(case, SELF_MASK[kind], SELF_PADDING[kind], batch, queries, queries, config.heads)
+    across = allowed(case, MEMORY_MASK, MEMORY_PADDING, batch, queries, keys, config.heads)
+
+    def outputs(torch_params, inputs):
+        variables = {"params": decoder_layer_params(torch_params)}
+
+        def one(x, memory, mask, memory_mask):
+            positions = jnp.zeros_like(x), jnp.zeros_like(memory)
+            return DecoderLayer(config).apply(variables, x, memory, *positions, mask, memory_mask)
+
+        arrays = (batch_leading(case, inputs[name]) for name in ("tgt", "memory"))
+        return {"output": batch_leading(case, jax.vmap(one)(*arrays, among, across))}
+
+    compare(case, outputs)
 
 
 @pytest.mark.golden
 @pytest.mark.parametrize("path", golden_modules("torch_encoder_layer*"), ids=case_id)
 def test_encoder_layer_matches_pytorch(path):
-    case = load_module_case(path)
-    layer = EncoderLayer(layer_config(case))
-
-    def apply(torch_params, arrays):
-        variables = {"params": encoder_layer_params(torch_params)}
-        position = jnp.zeros(arrays["src"].shape[1:])
-        one = lambda x, padded: layer.apply(variables, x, position, key_mask(~padded))  # noqa: E731
-        return jax.vmap(one)(arrays["src"], arrays["kpm"])
-
-    compare(case, apply)
+    check_encoder_layer(load_module_case(path))
 
 
 @pytest.mark.golden
 @pytest.mark.parametrize("path", golden_modules("torch_decoder_layer*"), ids=case_id)
 def test_decoder_layer_matches_pytorch(path):
-    case = load_module_case(path)
-    layer = DecoderLayer(layer_config(case))
-
-    def apply(torch_params, arrays):
-        variables = {"params": decoder_layer_params(torch_params)}
-
-        def one(x, memory, padded):
-            at_queries, at_memory = jnp.zeros_like(x), jnp.zeros_like(memory)
-            mask = ~arrays["tgt_mask"]
-            return layer.apply(variables, x, memory, at_queries, at_memory, mask, key_mask(~padded))
-
-        return jax.vmap(one)(arrays["tgt"], arrays["memory"], arrays["mkp"])
-
-    compare(case, apply)
+    check_decoder_layer(load_module_case(path))

@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig, cell_loss, lane_shape_loss, lane_shape_targets
-from tflane_jax.scene import LaneLines, LaneShapePrediction
+from tflane_jax.scene import CurvePrediction, LaneLines
 
 LINES, POINTS, QUERIES, LAYERS = 4, 9, 7, 2
 
@@ -27,7 +27,7 @@ def predictions(seed=1, batch=2):
     rng = np.random.default_rng(seed)
     logits = rng.normal(size=(batch, LAYERS, QUERIES, 2))
     curves = rng.normal([0.4, 0.9, 0.0, 0.2, 0.0, 0.5, 0.0, 0.0], 0.1, (batch, LAYERS, QUERIES, 8))
-    return LaneShapePrediction(jnp.asarray(logits, jnp.float32), jnp.asarray(curves, jnp.float32))
+    return CurvePrediction(jnp.asarray(logits, jnp.float32), jnp.asarray(curves, jnp.float32))
 
 
 def value_and_gradient(prediction, truth):
@@ -100,7 +100,7 @@ def test_a_perfect_prediction_costs_nothing_but_doubt():
         curves[0, 0, i] = [*targets.extent[0, i], 0, -1, 0, 0, slopes[i], slopes[i] * v - u]
     logits = np.tile(np.array([9.0, -9.0], np.float32), (1, 1, QUERIES, 1))
     logits[0, 0, :2] *= -1
-    value, terms, _ = value_and_gradient(LaneShapePrediction(jnp.asarray(logits), jnp.asarray(curves)), truth)
+    value, terms, _ = value_and_gradient(CurvePrediction(jnp.asarray(logits), jnp.asarray(curves)), truth)
     assert float(value) < 1e-4
     assert float(terms["matching/lanes"]) == 2
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
 
-from tests.losses.test_lane_graph import BATCH, LAYERS, QUERIES, focal, make_case
+from tests.losses.test_toponet import BATCH, LAYERS, QUERIES, focal, make_case
 from tflane_jax.geometry.bezier import bezier_fit
 from tflane_jax.losses.costs import generalised_iou
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss, matching_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig, lane_graph_loss, matching_cost
 from tflane_jax.scene import ElementPrediction, Prediction, TrafficElements, stack_examples
 
 ELEMENTS, FOUND = 3, 4
@@ -91,9 +91,9 @@ def loop_terms(prediction, lanes, elements, layer):
                 truth = elements.box[b, owner[q]]
                 boxes += np.abs(shares(box[q], SIZES[b]) - shares(truth, SIZES[b])).sum()
                 apart += 1 - overlap(box[q], truth)
-        one = jax.tree.map(lambda leaf, b=b: leaf[b], (prediction.lanes, lanes))
+        one = jax.tree.map(lambda leaf, b=b: leaf[b], (prediction.centerlines, lanes))
         visible = np.flatnonzero(lanes.valid[b])
-        lane_cost = np.asarray(matching_cost(*one, LaneGraphLossConfig()))[layer][:, visible]
+        lane_cost = np.asarray(matching_cost(*one, TopoNetLossConfig()))[layer][:, visible]
         lane_of = {q: visible[j] for j, q in assign(lane_cost).items()}
         relation = np.asarray(found.lane_logits[b, layer - LAYERS], np.float64)
         for q in range(QUERIES):
@@ -107,22 +107,22 @@ def loop_terms(prediction, lanes, elements, layer):
 @pytest.mark.parametrize("counts", [(2, 3, 0), (1, 1, 1), (0, 0, 0)])
 def test_terms_match_plain_loops(counts):
     prediction, lanes, elements = make_elements(1, counts, related=LAYERS)
-    (total, report), _ = value_and_gradient(prediction, lanes, elements, SIZES, LaneGraphLossConfig())
+    (total, report), _ = value_and_gradient(prediction, lanes, elements, SIZES, TopoNetLossConfig())
     layers = [loop_terms(prediction, lanes, elements, layer) for layer in range(LAYERS)]
     for name, expected in zip(("class", "box", "iou", "lane"), layers[-1], strict=True):
         assert float(report[f"element_{name}"]) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
-    alone = lane_graph_loss(prediction.replace(elements=None), lanes, LaneGraphLossConfig())[0]
+    alone = lane_graph_loss(prediction.replace(elements=None), lanes, TopoNetLossConfig())[0]
     assert float(total - alone) == pytest.approx(np.sum(layers), rel=1e-4)
     assert float(report["matching/elements"]) == pytest.approx(np.mean(counts))
 
 
 def test_topology_of_the_last_layer_alone():
     prediction, lanes, elements = make_elements(2, (2, 3, 1), related=1)
-    (_, report), gradient = value_and_gradient(prediction, lanes, elements, SIZES, LaneGraphLossConfig())
+    (_, report), gradient = value_and_gradient(prediction, lanes, elements, SIZES, TopoNetLossConfig())
     assert float(report["element_lane"]) == pytest.approx(loop_terms(prediction, lanes, elements, 1)[3], rel=1e-4)
     assert gradient.elements.lane_logits.shape == (BATCH, 1, QUERIES, FOUND)
     whole, _, _ = make_elements(2, (2, 3, 1), related=LAYERS)
-    (_, all_layers), _ = value_and_gradient(whole, lanes, elements, SIZES, LaneGraphLossConfig())
+    (_, all_layers), _ = value_and_gradient(whole, lanes, elements, SIZES, TopoNetLossConfig())
     assert float(all_layers["successor"]) == pytest.approx(float(report["successor"]), rel=1e-6)
 
 
@@ -134,15 +134,15 @@ def test_padding_changes_nothing():
         attribute=np.where(hole, -7, elements.attribute).astype(np.int32),
         lane=elements.lane | hole[:, None, :] | ~lanes.valid[:, :, None],
     )
-    clean, soiled = (value_and_gradient(prediction, lanes, e, SIZES, LaneGraphLossConfig()) for e in (elements, dirty))
+    clean, soiled = (value_and_gradient(prediction, lanes, e, SIZES, TopoNetLossConfig()) for e in (elements, dirty))
     jax.tree.map(np.testing.assert_array_equal, clean, soiled)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(clean))
 
 
 def test_control_points_are_compared_where_asked_for():
     prediction, lanes, _ = make_elements(4, (0, 0, 0), related=LAYERS)
-    one = jax.tree.map(lambda leaf: leaf[0], (prediction.lanes, lanes))
-    config = LaneGraphLossConfig(class_weight=0.0, points_weight=1.0, control_points=3)
+    one = jax.tree.map(lambda leaf: leaf[0], (prediction.centerlines, lanes))
+    config = TopoNetLossConfig(class_weight=0.0, points_weight=1.0, control_points=3)
     cost = matching_cost(*one, config)
     fit = bezier_fit(one[1].points.shape[1], 3)
     expected = np.abs(fit @ np.asarray(one[0].points[1, 2]) - fit @ one[1].points[4]).sum()
@@ -162,4 +162,4 @@ def test_overlap_of_boxes(shift):
 def test_missing_truth_is_an_error():
     prediction, lanes, _ = make_elements(5, (1, 1, 1), related=LAYERS)
     with pytest.raises(ValueError, match="needs the true ones"):
-        lane_graph_loss(prediction, lanes, LaneGraphLossConfig())
+        lane_graph_loss(prediction, lanes, TopoNetLossConfig())

@@ -8,7 +8,7 @@ import pytest
 
 from tests.shared import shared_path
 from tflane_jax.cli import main
-from tflane_jax.datasets.argoverse2 import load_log
+from tflane_jax.datasets.argoverse2_log import load_log
 from tflane_jax.datasets.marker_observations import markers_of
 from tflane_jax.geometry import transform_points
 from tflane_jax.markers.store import load_store

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from tests.shared import shared_root
 from tflane_jax.errors import UserError
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.metrics.tusimple import (
     LSTR_TIME_LIMIT,
-    RowLanes,
     TuSimpleMetrics,
     line_accuracy,
     pixel_thresholds,

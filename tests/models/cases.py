@@ -15,8 +15,9 @@ from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.models.traffic_flow_module import TrafficFlowModuleConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
 
@@ -26,9 +27,11 @@ BASELINE = TopoNetConfig(
 )
 WITH_TRAFFIC = dataclasses.replace(
     BASELINE,
-    traffic_flow=TrafficFlowConfig(
-        prior=TrafficFlowPriorConfig(max_instances=5),
-        module=TrafficFlowModuleConfig(width=8, heads=2, bands=3),
+    priors=PriorsConfig(
+        traffic_flow=TrafficFlowConfig(
+            prior=TrafficFlowPriorConfig(max_instances=5),
+            module=TrafficFlowModuleConfig(width=8, heads=2, bands=3),
+        ),
     ),
 )
 
@@ -81,7 +84,10 @@ CAMERA_TOPONET = dataclasses.replace(
     decoder=dataclasses.replace(BASELINE.decoder, refine="fixed", dropout=0.1),
 )
 CAMERA_DETR = BevFormerDetrConfig(
-    CAMERA, dataclasses.replace(CAMERA_TOPONET.decoder, points=11), ELEMENTS, control_points=5
+    encoder=CAMERA,
+    decoder=dataclasses.replace(CAMERA_TOPONET.decoder, points=11),
+    elements=ELEMENTS,
+    control_points=5,
 )
 
 

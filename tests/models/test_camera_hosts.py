@@ -14,16 +14,15 @@ from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example,
 from tests.parameters import random_params
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig
+from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
+from tflane_jax.models.parameters import split_statistics
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import TrafficFlow, stack_examples
-from tflane_jax.tasks import system_of
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.training.task import split_statistics
 
 TASKS = {
     "toponet": LaneGraphTask(CAMERA_TOPONET),
-    "detr": LaneGraphTask(CAMERA_DETR, LaneGraphLossConfig(points_weight=0.0075, control_points=5)),
+    "detr": LaneGraphTask(CAMERA_DETR, BevFormerDetrLossConfig()),
 }
 
 
@@ -72,11 +71,11 @@ def batch_of(*examples):
 
 def test_predicts_lanes_elements_and_both_topologies(fitted):
     answer = fitted.predict(make_camera_example())
-    chex.assert_shape(answer.lanes.points, (6, 11, 3))
-    chex.assert_shape(answer.lanes.successor_logits, (6, 6))
+    chex.assert_shape(answer.centerlines.points, (6, 11, 3))
+    chex.assert_shape(answer.centerlines.successor_logits, (6, 6))
     chex.assert_shape(answer.elements.box, (5, 2, 2))
     chex.assert_shape(answer.elements.lane_logits, (6, 5))
-    assert np.abs(np.asarray(answer.lanes.points)[..., 0]).max() <= 51.2
+    assert np.abs(np.asarray(answer.centerlines.points)[..., 0]).max() <= 51.2
     centre = np.asarray(answer.elements.box).mean(1)
     assert ((centre >= 0) & (centre <= [96, 64])).all()
     other = fitted.predict(make_camera_example(1))
@@ -196,14 +195,14 @@ def test_a_stream_equals_the_scan_over_its_sequence(toponet):
     same(scanned, (memory, jax.tree.map(lambda *leaves: jnp.stack(leaves), *answers)))
     # The third frame begins a scene, so it forgets; the fourth remembers.
     same(answers[2], toponet.predict(frames[2]))
-    assert not np.array_equal(answers[3].lanes.points, toponet.predict(frames[3]).lanes.points)
+    assert not np.array_equal(answers[3].centerlines.points, toponet.predict(frames[3]).centerlines.points)
 
 
 def test_nobody_there_is_no_traffic_flow(toponet):
     example = make_camera_example(10)
     absent = example.replace(traffic_flow=TrafficFlow.empty(*example.traffic_flow.valid.shape))
     answer = toponet.predict(absent)
-    assert not np.array_equal(answer.lanes.points, toponet.predict(example).lanes.points)
+    assert not np.array_equal(answer.centerlines.points, toponet.predict(example).centerlines.points)
     # The part that nobody reaches does not matter.
     other = {**toponet.params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, toponet.params["temporal_encoder"])}
     same(answer, toponet.step(other, toponet.task.start(), absent)[1])
@@ -230,6 +229,6 @@ def test_a_camera_that_sees_too_many_cells_is_named_before_training():
     encoder = CAMERA_TOPONET.encoder
     tight = dataclasses.replace(encoder, bev=dataclasses.replace(encoder.bev, capacity=1))
     task = dataclasses.replace(config.task, model=dataclasses.replace(CAMERA_TOPONET, encoder=tight))
-    system_of(config).check(config, examples)
+    config.task.check(config.data, examples)
     with pytest.raises(UserError, match="`capacity` of BevFormerConfig is 1"):
-        system_of(config).check(dataclasses.replace(config, task=task), examples)
+        task.check(config.data, examples)

@@ -8,8 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.models.cases import BASELINE
+from tflane_jax.geometry import BevGrid
 from tflane_jax.models.lane_decoder import PointwiseRefinement, directions, smooth_basis
 from tflane_jax.models.lane_queries import spread_lanes
+
+RANGE = BevGrid().range
 
 
 @pytest.mark.parametrize("points", [2, 3, 11, 20])
@@ -46,9 +49,9 @@ def test_pointwise_refinement_starts_at_zero_and_looks_only_where_the_point_is()
     config = BASELINE.decoder
     rng = np.random.default_rng(0)
     queries = jnp.asarray(rng.normal(size=(config.queries, config.dim)), jnp.float32)
-    reference = jnp.asarray(spread_lanes(config))
+    reference = jnp.asarray(spread_lanes(config, RANGE))
     bev = jnp.asarray(rng.normal(size=(6, 10, 5)), jnp.float32)
-    module = PointwiseRefinement(config)
+    module = PointwiseRefinement(config, RANGE)
     params = jax.jit(module.init)(jax.random.key(0), queries, reference, bev)
     apply = jax.jit(module.apply)
     np.testing.assert_array_equal(apply(params, queries, reference, bev), 0.0)

@@ -10,10 +10,10 @@ import pytest
 from tests.models.cases import BASELINE, make_example
 from tests.parameters import random_params
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_denoising_losses
+from tflane_jax.losses.toponet import TopoNetLossConfig, lane_denoising_losses
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
-from tflane_jax.scene import LaneGraph, LanePrediction, stack_examples
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 RANGE = PerceptionRange()
@@ -71,22 +71,24 @@ def test_a_query_belongs_to_its_own_lane():
     lanes = jax.tree.map(lambda leaf: leaf[None], curve())
     lanes.successor[0, 0, 1] = True
     truth = np.nan_to_num(lanes.points)[:, None, None, :4]  # four queries, five slots
-    perfect = LanePrediction(
+    perfect = CenterlinePrediction(
         points=jnp.asarray(truth),
         logits=jnp.where(jnp.arange(4) < 3, 20.0, -20.0)[None, None, None, :, None],
         successor_logits=jnp.where(lanes.successor[:, None, None, :4, :4], 20.0, -20.0),
     )
-    losses = lane_denoising_losses(perfect, lanes, LaneGraphLossConfig())
+    losses = lane_denoising_losses(perfect, lanes, TopoNetLossConfig())
     assert all(float(term.sum()) < 1e-6 for term in losses.values())
     swapped = perfect.replace(points=perfect.points[:, :, :, [1, 0, 2, 3]])
     # Lanes 0 and 1 lie three metres apart, and there are three.
-    points = lane_denoising_losses(swapped, lanes, LaneGraphLossConfig(points_weight=1.0))["points"]
+    points = lane_denoising_losses(swapped, lanes, TopoNetLossConfig(points_weight=1.0))["points"]
     np.testing.assert_allclose(points, 2 * 33.0 / 3, rtol=1e-5)
 
 
 HOSTS = {
     "toponet": replace(BASELINE, decoder=replace(BASELINE.decoder, layers=1)),
-    "detr": BevFormerDetrConfig(BASELINE.encoder, replace(BASELINE.decoder, layers=1, refine="fixed"), None),
+    "detr": BevFormerDetrConfig(
+        encoder=BASELINE.encoder, decoder=replace(BASELINE.decoder, layers=1, refine="fixed"), elements=None
+    ),
 }
 
 

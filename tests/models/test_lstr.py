@@ -8,17 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.golden import (
-    assert_gradients_close,
-    assert_outputs_close,
-    case_id,
-    golden_modules,
-    load_module_case,
-    named_gradients,
-)
+from tests.golden import case_id, golden_modules, load_module_case, numbered, options
+from tests.golden_compare import assert_outputs_close, compare
 from tests.shared import shared_path, shared_root
 from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset
+from tflane_jax.evaluation.lane_shapes import detected, pixel_points, row_lanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.layers.transformer import TransformerConfig
@@ -30,10 +25,9 @@ from tflane_jax.losses.lane_shape import (
     matching_cost,
 )
 from tflane_jax.matching import match
-from tflane_jax.metrics.image_lanes import detected, pixel_points, row_lanes
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.lstr import LstrConfig, TransformerEncoderConfig, normalise
-from tflane_jax.scene import LaneShapePrediction, stack_examples
+from tflane_jax.scene import CurvePrediction, stack_examples
 
 PUBLISHED = LstrConfig(backbone=ResNetConfig(frozen_stem_norm=True))
 pytestmark = pytest.mark.golden
@@ -43,22 +37,24 @@ def of_kind(kind):
     return [path for path in golden_modules("lstr_*") if path.stem.startswith(f"lstr_{kind}")]
 
 
-def tiny_config(config):
-    layer = TransformerConfig(config["heads"], config["ff"], dropout=0.0)
-    backbone = ResNetConfig(
-        tuple(config["layers"]), tuple(config["dims"]), stem_channels=config["dims"][0], frozen_stem_norm=True
-    )
-    encoder = TransformerEncoderConfig(config["enc"], layer)
-    return LstrConfig(backbone, config["attn"], encoder, config["dec"], layer, config["q"])
+def tiny_config(case):
+    sizes = options(case, "attn", "dec", "dims", "enc", "hidden", "heads", "layers", "q")
+    layer = TransformerConfig(sizes.heads, sizes.hidden, dropout=0.0)
+    backbone = ResNetConfig(tuple(sizes.layers), tuple(sizes.dims), stem_channels=sizes.dims[0], frozen_stem_norm=True)
+    encoder = TransformerEncoderConfig(sizes.enc, layer)
+    return LstrConfig(backbone, sizes.attn, encoder, sizes.dec, layer, sizes.q)
 
 
 @pytest.mark.parametrize("path", of_kind("tiny"), ids=case_id)
 def test_network_matches_the_reference(path):
-    case = load_module_case(path)
-    train = case.meta["mode"] == "train"
-    model = tiny_config(case.meta["config"]).build()
+    check_network(load_module_case(path))
 
-    def scalar(torch_params, images):
+
+def check_network(case):
+    train = options(case, mode="eval").mode == "train"
+    model = tiny_config(case).build()
+
+    def outputs(torch_params, inputs):
         variables = convert_lstr(torch_params).variables
 
         def one(image, padded):
@@ -71,21 +67,20 @@ def test_network_matches_the_reference(path):
                 rngs={"dropout": jax.random.key(0)},
             )
 
-        prediction, state = jax.vmap(one, axis_name=BATCH_AXIS)(images, case.inputs["masks"])
+        images = jnp.asarray(inputs["images"])
+        masks = inputs.get("masks", np.zeros(case.inputs["images"][:, :1].shape, np.float32))
+        prediction, state = jax.vmap(one, axis_name=BATCH_AXIS)(images, masks)
         layers = state["intermediates"]["encoder"]
-        attention = layers[max(layers)]["self_attention"]["probabilities"][0].mean(1)
-        outs = named(prediction) | {"enc_attn": attention}
-        return sum((case.weights[name] * out).sum() for name, out in outs.items()), (outs, state["batch_stats"])
+        last = max(layers, key=lambda name: int(name.rpartition("_")[-1]))
+        attention = layers[last]["self_attention"]["probabilities"][0].mean(1)
+        return named(prediction) | {"enc_attn": attention}, state["batch_stats"]
 
-    step = jax.jit(jax.value_and_grad(scalar, argnums=(0, 1), has_aux=True))
-    (total, (outs, statistics)), (by_param, by_input) = step(case.params, case.inputs["images"])
-    assert_outputs_close(outs | {"grad_scalar": total}, {k: v for k, v in case.outputs.items() if "bn_after" not in k})
-    assert_gradients_close(named_gradients(by_param, {"images": by_input}), case.gradients)
     after = {name.removeprefix("bn_after/"): v for name, v in case.outputs.items() if name.startswith("bn_after/")}
-    wanted = convert_lstr(after).variables["batch_stats"]
-    statistics = dict(statistics["backbone"])
+    statistics = dict(compare(case, outputs, ignore={f"bn_after/{name}" for name in after})["backbone"])
     statistics.pop("bn1")
-    for place, value in jax.tree.leaves_with_path(statistics) if train else []:
+    wanted = convert_lstr(after).variables["batch_stats"]
+    assert bool(after) <= train
+    for place, value in jax.tree.leaves_with_path(statistics) if after else []:
         expected = wanted["backbone"]
         for key in place:
             expected = expected[key.key]
@@ -123,7 +118,10 @@ def test_published_weights_match_the_reference(path):
         rgb = jnp.asarray(case.inputs["resized_bgr_u8"][None, ..., ::-1])
         valid = jnp.ones(rgb.shape[:3], bool)
         images = normalise(rgb, valid)
-        strided = np.asarray(images).transpose(0, 3, 1, 2)[:, :, ::8, ::8]
+        steps = (n // m for n, m in zip(images.shape[1:3], case.inputs["images_s"].shape[2:], strict=True))
+        strided = np.asarray(images).transpose(0, 3, 1, 2)[
+            (slice(None), slice(None), *(slice(None, None, s) for s in steps))
+        ]
         np.testing.assert_allclose(strided, case.inputs["images_s"], rtol=1e-6, atol=1e-6)
     prediction = predict(PUBLISHED, published_weights(), images, valid)
     outs = named(prediction)
@@ -133,13 +131,15 @@ def test_published_weights_match_the_reference(path):
         one = jax.tree.map(lambda leaf, b=b: np.asarray(leaf)[b, -1], prediction)
         found = detected(one)
         np.testing.assert_array_equal(found, case.outputs["results"][b, :, 0] == 1)
-        for heights in (48, 56):
-            rows = case.inputs[f"h_samples_{heights}"]
+        for name in numbered(case.inputs, r"h_samples_(\d+)"):
+            heights, rows = name.removeprefix("h_samples_"), case.inputs[name]
             ours = row_lanes(one, rows, height=720, width=1280).x
             expected = case.outputs[f"b{b}.tusimple_x_h{heights}"]
             np.testing.assert_array_equal(ours == -2, expected == -2)
             np.testing.assert_allclose(ours, expected, atol=0.05)  # pixels
-        for height in (720, 360):
+        counted = numbered(case.outputs, rf"b{b}\.pixel_count_(\d+)")
+        assert counted
+        for height in (int(name.rpartition("_")[-1]) for name in counted):
             lanes = pixel_points(one, height=height, width=height * 16 // 9)
             counts = case.outputs[f"b{b}.pixel_count_{height}"]
             assert [len(lane) for lane in lanes] == counts.tolist()
@@ -149,18 +149,22 @@ def test_published_weights_match_the_reference(path):
 
 @pytest.mark.parametrize("path", of_kind("matcher"), ids=case_id)
 def test_costs_assignments_and_losses_match_the_reference(path):
-    case = load_module_case(path)
+    check_losses(load_module_case(path))
+
+
+def check_losses(case):
     weights = {name: case.meta["weight_dict"][f"loss_{name}"] for name in ("ce", "curves", "lowers")}
     config = LaneShapeLossConfig(weights["ce"], weights["curves"], weights["lowers"], shared_horizon=False)
-    targets = stacked_targets([case.inputs[f"targets.{b}"] for b in range(len(case.meta["counts"]))])
-    layers = ("aux0", "main")
-    prediction = LaneShapePrediction(
+    targets = stacked_targets([case.inputs[name] for name in numbered(case.inputs, r"targets\.(\d+)")])
+    earlier = (name.removesuffix(".pred_logits") for name in numbered(case.inputs, r"aux(\d+)\.pred_logits"))
+    layers = (*earlier, "main")
+    prediction = CurvePrediction(
         *(jnp.stack([case.inputs[f"{layer}.pred_{part}"] for layer in layers], 1) for part in ("logits", "curves"))
     )
     lane_weight = lane_weights(targets, targets.valid)
     cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, lane_weight)
     assignment = match(cost, targets.valid[:, None])
-    for b, count in enumerate(case.meta["counts"]):
+    for b, count in enumerate(np.asarray(targets.valid).sum(1).tolist()):
         for i, layer in enumerate(layers):
             expected = case.outputs[f"{layer}.cost.{b}"]
             np.testing.assert_allclose(cost[b, i, :, :count], expected, rtol=1e-4, atol=1e-4)
@@ -221,7 +225,7 @@ def test_the_ten_real_frames_give_the_originals_points():
     metrics = TuSimpleMetrics()
     for i in range(len(dataset)):
         ours = jax.tree.map(lambda leaf, i=i: leaf[i, -1], prediction)
-        theirs = LaneShapePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
+        theirs = CurvePrediction(reference["pred_logits"][i], reference["pred_curves"][i])
         truth = dataset.truth(i)
         found, expected = (row_lanes(one, truth.rows, height=720, width=1280) for one in (ours, theirs))
         np.testing.assert_array_equal(found.x == -2, expected.x == -2)

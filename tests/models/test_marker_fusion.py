@@ -20,7 +20,6 @@ from tflane_jax.models.marker_fusion import (
     MarkerTokens,
     fusion_gate,
     fusion_mask,
-    guide_frame,
 )
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.priors.marker_memory import MarkerMemoryConfig
@@ -37,7 +36,14 @@ CONFIG = MarkerFusionConfig(
     heads=2,
     memory=MarkerMemoryConfig(frames=3, decay=0.5, threshold=0.05),
 )
-HOST = LaneGraphTask(replace(BASELINE, markers=CONFIG))
+
+
+def lanes_of(example):
+    """Return what the markers of a frame on its own tell."""
+    return CONFIG.build(BASELINE.spec).observe(example, None)[0]
+
+
+HOST = LaneGraphTask(replace(BASELINE, priors=replace(BASELINE.priors, markers=CONFIG)))
 PLAIN = LaneGraphTask(BASELINE)
 POSE = np.array([[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)
 
@@ -87,20 +93,20 @@ def test_who_never_sees_a_marker_is_the_host_without_markers(params, step):
         same(step(params, HOST.start(), seeing(markers, has_previous=np.asarray(False)))[1], expected)
         same(jax.jit(HOST.predict)(params, seeing(markers)), expected)
     guided = step(params, HOST.start(), seeing(observed()))[1]
-    assert not np.array_equal(guided.lanes.points, expected.lanes.points)
+    assert not np.array_equal(guided.centerlines.points, expected.centerlines.points)
 
 
 def test_cameras_may_have_markers_too():
     model = replace(CAMERA_TOPONET, decoder=replace(CAMERA_TOPONET.decoder, dropout=0.0))
-    plain, host = LaneGraphTask(model), LaneGraphTask(replace(model, markers=CONFIG))
+    plain, host = LaneGraphTask(model), LaneGraphTask(replace(model, priors=replace(model.priors, markers=CONFIG)))
     example = make_camera_example()
     params = random_params(host.init, example)
     expected = jax.jit(plain.predict)(without_markers(params), example)
     predict = jax.jit(host.predict)
     same(predict(params, example.replace(markers=observed(valid=False, garbage=np.nan))), expected)
     guided = predict(params, example.replace(markers=observed()))
-    assert not np.array_equal(guided.lanes.points, expected.lanes.points)
-    assert np.isfinite(guided.lanes.points).all()
+    assert not np.array_equal(guided.centerlines.points, expected.centerlines.points)
+    assert np.isfinite(guided.centerlines.points).all()
 
 
 def test_every_layer_of_the_bev_encoder_has_a_fusion_of_its_own():
@@ -113,11 +119,13 @@ def test_every_layer_of_the_bev_encoder_has_a_fusion_of_its_own():
 def test_traffic_markers_and_a_map_guide_one_model_together():
     rng = np.random.default_rng(3)
     sd_map = SdMap(rng.uniform(-20, 20, (3, 11, 2)).astype(np.float32), np.zeros(3, np.int32), np.ones(3, bool))
-    every = LaneGraphTask(replace(WITH_TRAFFIC, markers=CONFIG, sd_map=SMALL_SD_MAP))
+    every = LaneGraphTask(
+        replace(WITH_TRAFFIC, priors=replace(WITH_TRAFFIC.priors, markers=CONFIG, sd_map=SMALL_SD_MAP))
+    )
     seen = seeing(observed()).replace(sd_map=sd_map)
     params = random_params(every.init, seen)
     predict = jax.jit(every.predict)
-    whole = predict(params, seen).lanes.points
+    whole = predict(params, seen).centerlines.points
     assert np.isfinite(whole).all()
     absent = {
         "markers": seen.markers.replace(valid=np.zeros_like(seen.markers.valid)),
@@ -125,7 +133,7 @@ def test_traffic_markers_and_a_map_guide_one_model_together():
         "traffic_flow": jax.tree.map(np.zeros_like, seen.traffic_flow),
     }
     for name, nothing in absent.items():
-        assert not np.array_equal(predict(params, seen.replace(**{name: nothing})).lanes.points, whole), name
+        assert not np.array_equal(predict(params, seen.replace(**{name: nothing})).centerlines.points, whole), name
 
 
 def test_padding_may_hold_nan(params, step):
@@ -170,7 +178,7 @@ def test_a_gap_is_bridged_as_long_as_the_bank_remembers(params, step):
     for frame in gap:
         memory, answer = step(params, memory, frame)
         alone = step(params, HOST.start(), frame)[1]
-        differs.append(not np.array_equal(answer.lanes.points, alone.lanes.points))
+        differs.append(not np.array_equal(answer.centerlines.points, alone.centerlines.points))
     assert differs == [True, True, False]
 
 
@@ -185,7 +193,7 @@ def fused(config, guide, bev, position):
 def test_the_gate_is_the_confidence_and_its_variants():
     rng = np.random.default_rng(0)
     bev, position = (jnp.asarray(rng.normal(size=(5, 8)), jnp.float32) for _ in range(2))
-    near, far = (guide_frame(seeing(observed(d)), None, CONFIG)[0] for d in (10.0, 80.0))
+    near, far = (lanes_of(seeing(observed(d))) for d in (10.0, 80.0))
     np.testing.assert_allclose([near.gate, far.gate], np.exp([-0.25, -2.0]), rtol=1e-5)
     out, variables, tokens = fused(CONFIG, near, bev, position)
     variables = jax.tree.map(np.asarray, variables)
@@ -223,7 +231,7 @@ def test_a_fusion_that_begins_silent_leaves_the_host_as_it_was_trained():
 
 
 def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
-    guide, config = guide_frame(seeing(observed()), None, CONFIG)[0], replace(CONFIG, radius=1.0, norm="query")
+    guide, config = lanes_of(seeing(observed())), replace(CONFIG, radius=1.0, norm="query")
     start = guide.points[int(np.argmax(guide.valid)), 0]
     mask = fusion_mask(guide, guide.valid, jnp.stack([start, start + 500.0]), config)
     np.testing.assert_array_equal(mask.any(1), [True, False])
@@ -237,8 +245,8 @@ def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
 @pytest.mark.parametrize("encoding", ["sine", "transformer", "mlp"])
 @pytest.mark.parametrize("connectivity", [False, True])
 def test_tokens_are_scaled_and_belong_to_their_lane(encoding, connectivity):
-    module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity), BASELINE.decoder.range)
-    guide = guide_frame(seeing(observed()), None, CONFIG)[0]
+    module = MarkerTokens(replace(CONFIG, encoding=encoding, connectivity=connectivity), BASELINE.spec.bev_range)
+    guide = lanes_of(seeing(observed()))
     variables = random_params(module.init, guide)
     tokens = np.asarray(module.apply(variables, guide))
     assert tokens.shape == (4, 8)

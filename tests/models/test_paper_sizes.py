@@ -36,8 +36,8 @@ def test_toponet_is_as_large_as_the_reference():
     assert count(params) == TOPONET_LANES
 
     assert memory.bev.features.shape == MAP.shape
-    assert answer.lanes.points.shape == (6, 200, 11, 3)
-    assert answer.lanes.successor_logits.shape == (6, 200, 200)
+    assert answer.centerlines.points.shape == (6, 200, 11, 3)
+    assert answer.centerlines.successor_logits.shape == (6, 200, 200)
     assert answer.elements.box.shape == (6, 100, 2, 2)
     assert answer.elements.lane_logits.shape == (6, 200, 100)
 
@@ -49,9 +49,9 @@ def test_baseline_is_as_large_as_the_reference(control_points, expected):
         lambda key, bev: module.init_with_output(key, bev, method=module.decode), jax.random.key(0), MAP
     )
     assert count(variables["params"]) == expected + RELATIONS
-    assert answer.lanes.points.shape == (6, 100, 11, 3)
+    assert answer.centerlines.points.shape == (6, 100, 11, 3)
     # Topology of the last layer alone.
-    assert answer.lanes.successor_logits.shape == (1, 100, 100)
+    assert answer.centerlines.successor_logits.shape == (1, 100, 100)
 
 
 def test_lanes_may_move_at_the_papers_sizes_too():
@@ -61,4 +61,4 @@ def test_lanes_may_move_at_the_papers_sizes_too():
     answer, _ = jax.eval_shape(
         lambda key, bev: module.init_with_output(key, bev, method=module.decode), jax.random.key(0), MAP
     )
-    assert answer.lanes.points.shape == (6, 200, 11, 3)
+    assert answer.centerlines.points.shape == (6, 200, 11, 3)

@@ -11,6 +11,7 @@ import pytest
 from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import TrafficFlow
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -18,7 +19,10 @@ MODELS = {
     "baseline": BASELINE,
     "traffic": WITH_TRAFFIC,
     "every layer": dataclasses.replace(
-        WITH_TRAFFIC, traffic_flow=dataclasses.replace(WITH_TRAFFIC.traffic_flow, insert="every_layer")
+        WITH_TRAFFIC,
+        priors=PriorsConfig(
+            traffic_flow=dataclasses.replace(WITH_TRAFFIC.priors.traffic_flow, insert="every_layer"),
+        ),
     ),
     "fixed": dataclasses.replace(WITH_TRAFFIC, decoder=dataclasses.replace(WITH_TRAFFIC.decoder, refine="fixed")),
 }
@@ -31,7 +35,7 @@ def fitted():
     for name, config in MODELS.items():
         task = LaneGraphTask(model=config)
         params = random_params(task.init, make_example(), spread=0.2)
-        out[name] = task, params, jax.jit(lambda p, e, t=task: t.predict(p, e).lanes)
+        out[name] = task, params, jax.jit(lambda p, e, t=task: t.predict(p, e).centerlines)
     return out
 
 
@@ -93,7 +97,7 @@ def test_batch_is_a_vmap(fitted, name):
     task, params, predict = fitted[name]
     examples = [make_example(s, instances=s) for s in (0, 3, 9)]
     batch = jax.tree.map(lambda *x: np.stack(x), *examples)
-    together = jax.jit(jax.vmap(lambda p, e: task.predict(p, e).lanes, in_axes=(None, 0)))(params, batch)
+    together = jax.jit(jax.vmap(lambda p, e: task.predict(p, e).centerlines, in_axes=(None, 0)))(params, batch)
     for i, example in enumerate(examples):
         alone = predict(params, example)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=2e-4, atol=2e-4), alone, together)

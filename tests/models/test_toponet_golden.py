@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.golden import assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.golden import case_id, golden_modules, load_module_case
+from tests.golden_compare import assert_outputs_close
 from tests.models.golden_lanes import (
     bev_maps,
+    by_layer,
     check,
     check_matching,
     decoder_config,
@@ -16,16 +18,17 @@ from tests.models.golden_lanes import (
     truth,
 )
 from tflane_jax.convert.toponet import toponet_lane_params
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, element_lane_loss, lane_losses, matching_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig, element_lane_loss, lane_losses, matching_cost
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.toponet import TopoNet, TopoNetConfig
 from tflane_jax.scene import TrafficElements, stack_examples
 
 
-def element_truth(case, lanes, capacity=3):
+def element_truth(case, lanes):
     """Return the fixture's lane-element relations, and the assignment of elements that it was made with."""
     layers, images = case.inputs["te_feats"].shape[:2]
+    capacity = 1 + max(case.inputs[f"gt_lcte.{image}"].shape[1] for image in range(images))
     elements, query = [], np.zeros((images, layers, capacity), np.int32)
     for image in range(images):
         relation, one = case.inputs[f"gt_lcte.{image}"], TrafficElements.empty(capacity, lanes)
@@ -41,11 +44,13 @@ def element_truth(case, lanes, capacity=3):
 @pytest.mark.golden
 @pytest.mark.parametrize("path", golden_modules("toponet_head*"), ids=case_id)
 def test_lane_head_matches_the_reference(path):
-    case = load_module_case(path)
-    sizes, weights = case.meta["config"], LaneGraphLossConfig()
-    decoder = decoder_config(sizes, sizes["n_points"])
+    check_head(load_module_case(path))
+
+
+def check_head(case):
+    decoder, weights = decoder_config(case), TopoNetLossConfig()
     module = TopoNet(TopoNetConfig(decoder=decoder))
-    lanes = truth(case, sizes["n_points"])
+    lanes = truth(case)
     elements, found = element_truth(case, lanes.valid.shape[1])
 
     def outputs(torch_params, inputs):
@@ -63,32 +68,32 @@ def test_lane_head_matches_the_reference(path):
         prediction, queries = jax.vmap(one, in_axes=(0, 1, 1))(
             bev_maps(case, inputs["bev_feats"]), inputs["te_feats"], logits
         )
-        cost = jax.vmap(lambda p, g: matching_cost(p, g, weights))(prediction.lanes, lanes)
+        cost = jax.vmap(lambda p, g: matching_cost(p, g, weights))(prediction.centerlines, lanes)
         assignment = match(cost, lanes.valid[:, None])
-        terms = lane_losses(prediction.lanes, assignment, lanes, weights)
+        terms = lane_losses(prediction.centerlines, assignment, lanes, weights)
         terms["lcte"] = element_lane_loss(prediction.elements, assignment, found, lanes, elements, weights)
         out = layers_first(
             {
-                "all_cls_scores": prediction.lanes.logits,
-                "all_lanes_preds": prediction.lanes.points,
-                "all_lclc_preds": prediction.lanes.successor_logits[..., None],
+                "all_cls_scores": prediction.centerlines.logits,
+                "all_lanes_preds": prediction.centerlines.points,
+                "all_lclc_preds": prediction.centerlines.successor_logits[..., None],
                 "all_lcte_preds": prediction.elements.lane_logits[..., None],
                 "history_states": queries,
             }
         )
         names = {"lane_cls": "class", "lane_reg": "points", "lclc_rel": "successor", "lcte_rel": "lcte"}
         for name, term in names.items():
-            out |= {f"loss.loss_{name}": terms[term][1], f"loss.d0.loss_{name}": terms[term][0]}
+            out |= by_layer(f"loss_{name}", terms[term])
         return out, (cost, assignment, prediction)
 
-    cost, assignment, prediction = check(case, outputs, {name: case.inputs[name] for name in ("bev_feats", "te_feats")})
+    cost, assignment, prediction = check(case, outputs)
     check_matching(case, cost, assignment)
     for image in range(len(lanes.valid)):
         answer = jax.tree.map(lambda leaf, i=image: leaf[i, -1], prediction)
         decoded = {
-            "lanes": answer.lanes.points.reshape(sizes["num_query"], -1),
-            "scores": answer.lanes.scores,
-            "lclc": jax.nn.sigmoid(answer.lanes.successor_logits),
+            "lanes": answer.centerlines.points.reshape(decoder.queries, -1),
+            "scores": answer.centerlines.scores,
+            "lclc": jax.nn.sigmoid(answer.centerlines.successor_logits),
             "lcte": jax.nn.sigmoid(answer.elements.lane_logits),
         }
         expected = {name: case.outputs[f"decoded.{image}.{name}"] for name in decoded}

@@ -10,6 +10,7 @@ import pytest
 
 from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
@@ -32,7 +33,9 @@ def apply(module, params, *arguments):
 
 def tokens(seed=0, instances=4, **prior):
     flow = make_flow(seed, instances=instances)
-    return jax.tree.map(jnp.asarray, select_traffic_flow(flow, dataclasses.replace(PRIOR, **prior)))
+    return jax.tree.map(
+        jnp.asarray, select_traffic_flow(flow, dataclasses.replace(PRIOR, **prior), PerceptionRange(), BevGrid().range)
+    )
 
 
 def spatial(config, seed=0, valid=None, lane_mask=None):
@@ -98,7 +101,7 @@ def test_valid_instances_are_seen():
 def test_point_queries_keep_the_original():
     """Eq. (3): I(Q_type) is 1 for point queries and 0 for instance queries."""
     module, params, arguments = spatial(CONFIG)
-    point = SpatialEncoder(dataclasses.replace(CONFIG, query_type="point"), DIM)
+    point = SpatialEncoder(CONFIG, DIM, "point")
     difference = apply(point, params, *arguments) - apply(module, params, *arguments)
     np.testing.assert_allclose(difference, arguments[0], atol=1e-6)
 

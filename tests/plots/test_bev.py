@@ -5,7 +5,7 @@ from tests.fakes import POINTS, empty_example, fake_example, fake_prediction
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import box_corners, draw_evidence, draw_lanes, draw_prediction, draw_scene, draw_traffic
 from tflane_jax.plots.figure import new_figure
-from tflane_jax.scene import LanePrediction
+from tflane_jax.scene import CenterlinePrediction
 
 # A submodule is an attribute of its package only once something has imported it.
 agg = pytest.importorskip("matplotlib.backends.backend_agg")
@@ -119,7 +119,7 @@ def test_prediction_shows_sure_lanes_and_their_links(ax):
 def test_few_queries_are_drawn(ax, queries):
     logits = np.full((queries, 1), 3.0, np.float32)
     points = np.zeros((queries, POINTS, 3), np.float32)
-    draw_prediction(ax, LanePrediction(points, logits, np.full((queries, queries), -1.0)))
+    draw_prediction(ax, CenterlinePrediction(points, logits, np.full((queries, queries), -1.0)))
     assert len(lines(ax)) == queries
 
 

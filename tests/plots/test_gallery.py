@@ -71,7 +71,7 @@ def test_a_failed_save_keeps_the_old_picture(tmp_path, monkeypatch):
     path.write_bytes(b"old")
     figure, _ = new_figure()
     monkeypatch.setattr(figure, "savefig", lambda *_, **__: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(UserError, match=r"a\.png: disk full"):
         save_figure(figure, path)
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 1

@@ -1,6 +1,7 @@
 """The SD-map prior: coordinates, labels, padding, numpy against jit, the reference's numbers."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +11,13 @@ import pytest
 from tests.golden import case_id, golden_modules, load_module_case
 from tflane_jax.datasets.geojson import CATEGORIES
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
+from tflane_jax.priors.sd_map import SdMapPriorConfig
+from tflane_jax.priors.sd_map import sd_map_tokens as tokens_within
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.world.roads.sd_map import pack_lines
 
-CONFIG = SdMapPriorConfig(PerceptionRange((-40.0, 40.0), (-20.0, 20.0)), categories=8)
+CONFIG = SdMapPriorConfig(categories=8)
+sd_map_tokens = functools.partial(tokens_within, bev_range=PerceptionRange((-40.0, 40.0), (-20.0, 20.0)))
 EVERYWHERE = PerceptionRange((-1e4, 1e4), (-1e4, 1e4))
 
 

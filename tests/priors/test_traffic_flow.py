@@ -1,6 +1,7 @@
 """The traffic-flow prior: thresholds, weights, selection, padding, numpy against jit."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, ego_centric_weight, select_traffic_flow
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, ego_centric_weight
+from tflane_jax.priors.traffic_flow import select_traffic_flow as select_within
 from tflane_jax.scene import TrafficFlow
 
 CONFIG = TrafficFlowPriorConfig(max_instances=6)
+REGION, BEV = PerceptionRange(), BevGrid().range
+select_traffic_flow = functools.partial(select_within, region=REGION, bev_range=BEV)
 
 
 def make_flow(seed: int = 0, instances: int = 12, frames: int = 20, capacity: int = 16) -> TrafficFlow:
@@ -89,7 +94,7 @@ def test_normalised_coordinates_span_the_bev():
     flow = make_flow(5)
     metres = select_traffic_flow(flow, dataclasses.replace(CONFIG, coordinates="metres"))
     unit = select_traffic_flow(flow, CONFIG)
-    back = CONFIG.bev_range.denormalise(unit.position)
+    back = BEV.denormalise(unit.position)
     np.testing.assert_allclose(back[unit.frame_valid], metres.position[unit.frame_valid], atol=1e-4)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
 from tests.parameters import random_params
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneShapeHeads, nearest, normalise, shrink
@@ -17,7 +18,6 @@ from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
-from tflane_jax.training.task import STATISTICS
 
 ENCODERS = {
     "transformer": None,
@@ -81,19 +81,19 @@ def is_key(leaf):
 
 
 def test_predicts_one_class_and_one_curve_for_each_query(fitted):
-    answer = fitted.predict(fitted.params, road_image(0))
+    answer = fitted.predict(fitted.params, road_image(0)).curves
     assert answer.logits.shape == (5, 2)
     assert answer.curves.shape == (5, 8)
     # k'', f'', m'' and n' belong to the image.
     assert np.ptp(answer.curves[:, 2:6], axis=0).max() < 1e-6
-    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).logits)
+    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).curves.logits)
 
 
 def test_what_stands_in_padding_changes_nothing(fitted):
     clean, soiled = (padded(road_image(0), fill) for fill in (0, 200))
     answer = fitted.predict(fitted.params, clean)
     jax.tree.map(np.testing.assert_array_equal, answer, fitted.predict(fitted.params, soiled))
-    assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(0)).logits)
+    assert not np.array_equal(answer.curves.logits, fitted.predict(fitted.params, road_image(0)).curves.logits)
 
     # The optimiser's first moment is the gradient, scaled.
     (state, metrics), other = (fitted.updated(pair(example)) for example in (clean, soiled))

@@ -18,7 +18,7 @@ from tflane_jax.training.adaptive import AdaptiveConfig, Memory, check_adaptive,
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.restarts import RestartsConfig
 
-RULE = AdaptiveConfig(threshold=0.1, share=0.5, max_extensions=1, grace=0.25, patience=2)
+RULE = AdaptiveConfig(threshold=0.1, fraction=0.5, max_extensions=1, grace=0.25, patience=2)
 
 
 def verdicts(values, *, config=RULE, length=100, every=10, number=0, memory=None, left=1000):
@@ -89,7 +89,7 @@ def test_no_restart_near_the_end_of_the_run(left, verdict):
     [
         {"threshold": 1.0},
         {"threshold": -0.1},
-        {"share": 1.5},
+        {"fraction": 1.5},
         {"extend": -1.0},
         {"extend": math.inf},
         {"max_extensions": -1},
@@ -108,7 +108,7 @@ def test_settings_that_cannot_work_are_named(change):
 # ---------------------------------------------------------------------------------------------------------------------
 # Whole runs
 
-ADAPTIVE = AdaptiveConfig(threshold=0.0, share=0.6, grace=0.0, patience=1, shrink=0.5)
+ADAPTIVE = AdaptiveConfig(threshold=0.0, fraction=0.6, grace=0.0, patience=1, shrink=0.5)
 CYCLES = RestartsConfig(cycle_steps=8, factor=1.5, floor=0.05, adaptive=ADAPTIVE)
 FREQUENT = dataclasses.replace(CONFIG, eval_every=3, log_every=1, keep_checkpoints=40)
 CYCLIC = dataclasses.replace(OPTIM, restarts=CYCLES)

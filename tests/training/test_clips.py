@@ -11,15 +11,16 @@ import pytest
 from tests.models.cases import BASELINE, CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG, observed, seeing
 from tests.parameters import random_params
+from tflane_jax.datasets.clips import as_clips
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.evaluate import Sightings, evaluate_lanes, predictions
+from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
+from tflane_jax.evaluation.predict import predict_examples, predictions
 from tflane_jax.scene import shapes_of, stack_examples
 from tflane_jax.summary import parameter_counts, shapes_of_params, training_program
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.tasks.lane_graph_system import clips, predict_examples
 from tflane_jax.training.schedule import OptimConfig
 
-ALONE = LaneGraphTask(replace(BASELINE, markers=CONFIG))
+ALONE = LaneGraphTask(replace(BASELINE, priors=replace(BASELINE.priors, markers=CONFIG)))
 CLIPS = replace(ALONE, clip=3)
 
 
@@ -41,13 +42,13 @@ def params():
 
 def test_clips_keep_the_order_and_stay_within_scenes():
     frames = scenes()
-    cut = clips(frames, 3)
+    cut = as_clips(frames, 3)
     assert cut.lanes.points.shape == (2, 3, *frames.lanes.points.shape[1:])
     np.testing.assert_array_equal(cut.bev[1, 2], frames.bev[5])
     for length in (2, 4):
         with pytest.raises(UserError, match="do not split into clips"):
-            clips(frames, length)
-    clips(scenes(length=4), 2)
+            as_clips(frames, length)
+    as_clips(scenes(length=4), 2)
 
 
 def test_the_loss_of_clips_is_that_of_their_frames_with_what_was_remembered(params):
@@ -55,19 +56,19 @@ def test_the_loss_of_clips_is_that_of_their_frames_with_what_was_remembered(para
     unseen = jax.tree.map(jnp.asarray, scenes(sight=(False,)))
     of_clips, of_frames = jax.jit(CLIPS.loss), jax.jit(ALONE.loss)
     # Without a marker there is nothing to remember.
-    together, terms = of_clips(params, clips(unseen, 3), key)
+    together, terms = of_clips(params, as_clips(unseen, 3), key)
     apart, each = of_frames(params, unseen, key)
     np.testing.assert_allclose(together, apart, rtol=1e-5)
     assert terms.keys() == each.keys()
     seen = jax.tree.map(jnp.asarray, scenes())
-    assert abs(float(of_clips(params, clips(seen, 3), key)[0] - of_frames(params, seen, key)[0])) > 1e-4
+    assert abs(float(of_clips(params, as_clips(seen, 3), key)[0] - of_frames(params, seen, key)[0])) > 1e-4
 
 
 def test_gradients_reach_the_encoder_through_what_is_remembered(params):
     # Nothing but the memory shows the last two frames a marker; the first frame's loss is taken away.
     examples = scenes(count=1)
     examples.lanes.valid[0] = False
-    batch = jax.tree.map(jnp.asarray, clips(examples, 3))
+    batch = jax.tree.map(jnp.asarray, as_clips(examples, 3))
     gradient = jax.jit(jax.grad(lambda p: CLIPS.loss(p, batch, jax.random.key(0))[0]))(params)
     assert np.abs(gradient["marker_tokens"]["lines"]["out"]["kernel"]).max() > 0
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
@@ -79,10 +80,10 @@ def test_evaluation_streams_through_scenes(params, batch_size):
     step, memory, expected = jax.jit(ALONE.step), ALONE.start(), []
     for i in range(6):
         memory, answer = step(params, memory, jax.tree.map(lambda leaf, i=i: leaf[i], frames))
-        expected.append(answer.lanes.points)
-    found = [answer.lanes.points for _, answer in predictions(CLIPS, params, frames, batch_size)]
+        expected.append(answer.centerlines.points)
+    found = [answer.centerlines.points for _, answer in predictions(CLIPS, params, frames, batch_size)]
     np.testing.assert_array_equal(np.concatenate(found), np.stack(expected))
-    alone = [answer.lanes.points for _, answer in predictions(ALONE, params, frames, batch_size)]
+    alone = [answer.centerlines.points for _, answer in predictions(ALONE, params, frames, batch_size)]
     differs = [not np.allclose(a, b, atol=1e-3) for a, b in zip(np.concatenate(alone), expected, strict=True)]
     assert differs == [False, True, True] * 2
 
@@ -90,11 +91,11 @@ def test_evaluation_streams_through_scenes(params, batch_size):
 def test_single_frames_of_a_stream_are_drawn_with_what_is_remembered(params):
     frames = scenes()
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(6)]
-    (found,) = [answer.lanes.points for _, answer in predictions(CLIPS, params, frames, 6)]
-    examples, lanes, elements = predict_examples(CLIPS, params, SimpleNamespace(example=each.__getitem__), [5, 1, 3])
-    np.testing.assert_array_equal(lanes.points, found[[5, 1, 3]])
+    (found,) = [answer.centerlines.points for _, answer in predictions(CLIPS, params, frames, 6)]
+    examples, answer = predict_examples(CLIPS, params, SimpleNamespace(example=each.__getitem__), [5, 1, 3])
+    np.testing.assert_array_equal(answer.centerlines.points, found[[5, 1, 3]])
     np.testing.assert_array_equal(examples.bev, frames.bev[[5, 1, 3]])
-    assert elements is None
+    assert answer.elements is None
 
 
 def test_a_summary_of_clips_needs_one_frame(params):
@@ -103,7 +104,7 @@ def test_a_summary_of_clips_needs_one_frame(params):
 
 
 def test_a_clip_initialises_as_a_frame(params):
-    clip = jax.tree.map(lambda leaf: leaf[0], clips(scenes(), 3))
+    clip = jax.tree.map(lambda leaf: leaf[0], as_clips(scenes(), 3))
     shapes = jax.eval_shape(CLIPS.init, jax.random.key(0), clip)
     assert jax.tree.map(lambda leaf: leaf.shape, shapes) == jax.tree.map(lambda leaf: leaf.shape, params)
 

@@ -14,9 +14,9 @@ import pytest
 from tests.shared import ROOT
 from tests.training.stub import LineDataset, LineTask, line_arrays
 from tests.training.stub_run import CONFIG, OPTIM, RESOLVED, run, score
+from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
-from tflane_jax.training.batches import batch_indices
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.loop import train
 from tflane_jax.training.records import read_records

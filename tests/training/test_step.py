@@ -7,7 +7,7 @@ import optax
 import pytest
 
 from tests.training.stub import LineTask, line_arrays
-from tflane_jax.training.batches import batch_indices
+from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, per_seed

@@ -1,1 +1,1 @@
-"""Comparing configurations over seeds, and the statistics that say what a difference is worth."""
+"""Comparisons of configurations over seeds and test sets, with paired statistics."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.ablations.statistics import paired_difference
+from tflane_jax.ablations.statistics import holm, paired_difference
 from tflane_jax.errors import UserError
 
 Scores = dict[str, float]
-"""Metrics by "group/name", as `systems.Evaluation.scores` returns them."""
+"""Metrics by "group/name", as `tasks.Evaluation.scores` returns them."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Variant:
 
     Attributes:
         name: of the row.
-        scores: of each seed, in one order for all variants.
+        scores: of each seed. For paired tests, entry i of all variants comes from the same seed.
     """
 
     name: str
@@ -33,10 +33,12 @@ def summarise(
 ) -> list[dict[str, Any]]:
     """Return one row for each variant and metric: mean, standard deviation, and the difference to the first variant.
 
+    "p" is that of the paired t-test, "p (Holm)" the same corrected for all tests in the rows.
+
     Args:
-        variants: the first one is what the others are compared with.
+        variants: the first one is the control.
         metrics: names as in `Scores`.
-        errors: those of them of which less is better.
+        errors: metrics where lower is better.
 
     Raises:
         UserError: variants have different numbers of seeds, so that nothing can be paired.
@@ -55,13 +57,16 @@ def summarise(
                 test = paired_difference(values, control)
                 row |= {"difference": test.mean, "std of difference": test.std, "p": test.p_value}
                 better = paired_difference(control, values).better if metric in errors else test.better
-                row["seeds better"] = f"{better} of {test.seeds}"
+                row["p (Holm)"], row["seeds better"] = None, f"{better} of {test.seeds}"
             rows.append(row)
+    tested = [row for row in rows if "p" in row]
+    for row, corrected in zip(tested, holm([row["p"] for row in tested]), strict=True):
+        row["p (Holm)"] = corrected
     return rows
 
 
 def compact(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[str, str]]:
-    """Return one row for each variant with "mean +- std" in percent, the way papers print tables."""
+    """Return one row for each variant with "mean ± std" in percent, as papers print tables."""
     rows = []
     for variant in variants:
         row = {"model": variant.name}

@@ -1,8 +1,9 @@
-"""What a difference over a few seeds is worth."""
+"""Paired tests over seeds, and the correction of p-values for several tests."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +12,14 @@ from jaxtyping import Float
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Treatment less control, seed by seed.
+    """Treatment minus control, seed by seed.
 
     Attributes:
         mean: of the differences.
-        std: of the differences, n - 1; NaN for a single seed.
-        p_value: two-sided paired t-test of "no difference"; NaN for a single seed.
-        better: in how many seeds the treatment is above the control.
-        seeds: how many there are.
+        std: of the differences, with n - 1; NaN for a single seed.
+        p_value: of the two-sided paired t-test for no difference; NaN for a single seed.
+        better: number of seeds in which the treatment is above the control.
+        seeds: number of seeds.
     """
 
     mean: float
@@ -29,9 +30,9 @@ class PairedDifference:
 
 
 def paired_difference(treatment: Float[np.ndarray, " s"], control: Float[np.ndarray, " s"]) -> PairedDifference:
-    """Return how treatment and control differ; entry i of both comes from the same seed.
+    """Return the difference between treatment and control; entry i of both comes from the same seed.
 
-    Raises ValueError for unequal lengths or none at all.
+    Raises ValueError for unequal lengths or empty input.
     """
     from scipy.stats import ttest_rel
 
@@ -43,8 +44,26 @@ def paired_difference(treatment: Float[np.ndarray, " s"], control: Float[np.ndar
     if n == 1:
         std = p_value = math.nan
     elif np.ptp(difference) == 0.0:
-        # The t statistic is 0 / 0 or infinite: equal numbers say nothing, a constant shift says all.
+        # The t statistic is 0 / 0 for equal numbers and infinite for a constant shift.
         std, p_value = 0.0, 1.0 if mean == 0.0 else 0.0
     else:
         std, p_value = float(difference.std(ddof=1)), float(ttest_rel(treatment, control).pvalue)
     return PairedDifference(mean, std, p_value, int((difference > 0).sum()), n)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values corrected for several tests by Holm's step-down procedure (Holm 1979).
+
+    With the m p-values in ascending order, p_(i) becomes max_{j <= i} min(1, (m - j + 1) p_(j)), i and j from 1. The
+    probability of any false rejection at level a is then at most a, whatever the dependence between the tests.
+
+    Args:
+        p_values: NaN, a test that could not be made, stays NaN and does not count in m.
+    """
+    values = np.asarray(p_values, float)
+    tested = np.flatnonzero(~np.isnan(values))
+    order = tested[np.argsort(values[tested], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    corrected = np.full(values.shape, math.nan)
+    corrected[order] = np.maximum.accumulate(np.minimum(factors * values[order], 1.0))
+    return corrected.tolist()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tflane_jax.commands.sources import chosen_source, limited_task, opened, source_name
+from tflane_jax.commands.sources import chosen_source, limited_task, opened
 from tflane_jax.config_io import to_json
+from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import evaluate_run
@@ -18,7 +19,7 @@ def run(options: argparse.Namespace) -> int:
     configure_jax()
     trained, rest = opened(options)
     if rest:
-        raise UserError(f"tflane eval takes one run, {rest[0]} is too many")
+        raise UserError(f"tflane eval takes one run: leave {rest[0]} out")
     source = chosen_source(trained.config, options)
     protocol, rows = evaluate_run(trained, source, task=limited_task(trained, options))
 

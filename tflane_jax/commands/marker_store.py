@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tflane_jax.datasets.argoverse2 import load_log
+from tflane_jax.datasets.argoverse2_log import load_log
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.errors import UserError
 from tflane_jax.markers.store import load_store, save_store

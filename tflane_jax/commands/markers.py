@@ -20,6 +20,7 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
 from tflane_jax.files.images import list_photos, opencv, read_image
 from tflane_jax.geometry.cameras import project
 from tflane_jax.markers.curves import CurveConfig, measure, save_error_curves, summarise
@@ -27,7 +28,6 @@ from tflane_jax.markers.detection import DetectedMarkers, DetectorConfig, detect
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily
-from tflane_jax.training.run_folder import write_json
 from tflane_jax.world.render.camera import camera_pose
 
 _AXES = np.array([(255, 40, 40), (40, 200, 40), (60, 90, 255)])

@@ -1,4 +1,4 @@
-"""`tflane predict`: what it writes is said in `predict_lanes` (lanes around the vehicle) and `predict_images`."""
+"""`tflane predict`; `predict_lanes` (lanes around the vehicle) and `predict_images` describe the files written."""
 
 from __future__ import annotations
 

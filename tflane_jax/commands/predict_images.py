@@ -3,10 +3,10 @@
 Photos: predictions.json, and one picture for each photo:
     {"model", "step", "photos": [{"file", "width", "height", "picture",
      "lanes": [{"score", "points": [[column, row], ...]}, ...]}, ...]}
-    with points in pixels of the photo, from the lane's upper end to its lower one, lanes from left to right.
+    Points are in pixels of the photo, from the upper end of a lane to the lower one; lanes go from left to right.
 
-Examples of a split: pictures.png, and predictions.json and truth.json in TuSimple's form (one record a line), which
-`tflane score tusimple` takes.
+Examples of a split: pictures.png, and predictions.json and truth.json in TuSimple's format (one record a line), which
+`tflane score tusimple` reads.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from tflane_jax.commands.sources import lane_shape_source, make_folder
+from tflane_jax.commands.sources import chosen_source, make_folder
+from tflane_jax.datasets import sources
+from tflane_jax.datasets.photos import PhotoCamera, fit_photo
 from tflane_jax.errors import UserError
-from tflane_jax.files.images import PhotoCamera, fit_photo, list_photos, read_image
-from tflane_jax.metrics import image_lanes
-from tflane_jax.metrics.tusimple import RowLanes
+from tflane_jax.evaluation import lane_shapes
+from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.files.images import list_photos, read_image
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.plots.images import predicted_lines, save_photo, save_road_images
 from tflane_jax.runs import Run
 from tflane_jax.scene import LaneLines, RoadImage, stack_examples
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_shape_system import found_lanes, name_of, open_images, predict, truth_of
-from tflane_jax.training.run_folder import write_json, write_text
+from tflane_jax.tasks.lane_shape import found_lanes, predict_curves
 
 
 def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
@@ -45,11 +47,11 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
         fitted = fit_photo(photo, camera)
         example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
-        answer = jax.tree.map(lambda leaf: leaf[0], predict(trained.config.task, trained.params[0], stacked))
+        answer = jax.tree.map(lambda leaf: leaf[0], predict_curves(trained.config.task, trained.params[0], stacked))
         lanes = fitted.placement.to_photo(predicted_lines(answer))
-        # A lane goes on beyond the picture's edge; what lies outside it is neither drawn nor written.
+        # Predicted lanes may leave the picture; points outside it are neither drawn nor written.
         inside = [_inside(lane, photo.shape) for lane in lanes]
-        scores = image_lanes.lane_scores(answer)[image_lanes.left_to_right(answer)]
+        scores = lane_shapes.lane_scores(answer)[lane_shapes.left_to_right(answer)]
         found = [
             {"score": float(s), "points": np.round(lane, 2).tolist()}
             for s, lane in zip(scores, inside, strict=True)
@@ -67,25 +69,25 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
 
 
 def predict_split(trained: Run, options: argparse.Namespace) -> int:
-    """Find the lanes in images of a dataset, beside their truth."""
-    dataset = open_images(lane_shape_source(trained.config, options))
+    """Find the lanes in some images of a split; write them beside the true ones."""
+    dataset = sources.open_dataset(chosen_source(trained.config, options))
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
-    answers = predict(trained.config.task, trained.params[0], examples)
+    answers = predict_curves(trained.config.task, trained.params[0], examples)
     make_folder(options.out)
     predictions, truths = [], []
     for i, index in enumerate(indices):
-        truth = truth_of(dataset, index)
+        truth = dataset.truth(index)
         found = found_lanes(jax.tree.map(lambda leaf, i=i: leaf[i], answers), truth)
-        name = name_of(dataset, index)
+        name = dataset.info(index).scene
         truths.append({"raw_file": name, "lanes": _plain(truth), "h_samples": np.asarray(truth.rows).tolist()})
         predictions.append({"raw_file": name, "lanes": _plain(found), "run_time": 0.0})
     for name, rows in (("predictions.json", predictions), ("truth.json", truths)):
         write_text(options.out / name, "".join(json.dumps(row) + "\n" for row in rows))
     title = f"{Path(trained.name).name}, step {trained.step}"
-    names = [name_of(dataset, index) for index in indices]
+    names = [dataset.info(index).scene for index in indices]
     save_road_images(options.out / "pictures.png", examples, {title: answers}, titles=names)
     print(f"{len(indices)} images written to {options.out}: predictions.json, truth.json, pictures.png")
     return 0
@@ -102,7 +104,7 @@ def _inside(lane: Float[np.ndarray, "p 2"], shape: tuple[int, ...]) -> Float[np.
 
 
 def _picture_names(photos: list[Path]) -> list[str]:
-    """Return a name for each photo's picture; photos of one name in different folders get numbers."""
+    """Return a file name for each photo's picture; photos of the same name in different folders get numbers."""
     seen: dict[str, int] = {}
     names: list[Any] = []
     for photo in photos:

@@ -1,21 +1,21 @@
 """`tflane predict` for lanes around the vehicle: predictions as arrays, as plain JSON, and as pictures.
 
 predictions.npz, arrays over F frames and Q queries:
-    points (F, Q, P, 3) metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1, [f, i, j] lane j
-    continues lane i; scene (F,) and timestamp_ns (F,), where the frame comes from. A model of traffic elements adds,
-    over E queries, box (F, E, 2, 2) corners in pixels of the front image, attribute_score (F, E, 13) and element_lane
-    (F, Q, E), [f, i, e] element e governs lane i, 0 to 1.
+    points (F, Q, P, 3), metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1: [f, i, j] is the score
+    that lane j continues lane i; scene (F,) and timestamp_ns (F,) name the frame. A model with traffic elements adds,
+    over E element queries, box (F, E, 2, 2), corners in pixels of the front image; attribute_score (F, E, 13); and
+    element_lane (F, Q, E), 0 to 1: [f, i, e] is the score that element e governs lane i.
 truth.npz, the true lanes of the same frames over G slots:
     points (F, G, P, 3), successor (F, G, G), valid (F, G), visibility (F, G), scene and timestamp_ns. `tflane score`
-    takes the two.
+    reads both files.
 
-predictions.json, lanes from `threshold` on, best first:
+predictions.json, lanes with a score of at least `threshold`, best first:
     {"run", "step", "seed", "threshold", "frames": [{"source", "scene", "timestamp_ns",
      "lanes": [{"query", "score", "points": [[x, y, z], ...]}, ...],
      "successors": [{"from": position in lanes, "to": position in lanes, "score"}, ...],
      "elements": [{"query", "score", "attribute", "box": [[left, top], [right, bottom]]}, ...],
      "governs": [{"element": position in elements, "lane": position in lanes, "score"}, ...]}, ...]}
-    with the relations whose score is at least 0.5; the last two where the model predicts traffic elements.
+    Relations have a score of at least 0.5. "elements" and "governs" exist if the model predicts traffic elements.
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
 
-from tflane_jax.commands.sources import lane_graph_source, limited_task, make_folder
+from tflane_jax.commands.sources import chosen_source, limited_task, make_folder
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.predict import predict_examples
+from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_graph_system import open_dataset, predict_examples, titles
-from tflane_jax.training.run_folder import write_json
+from tflane_jax.tasks.lane_graph import titles
 
 _RELATION_THRESHOLD = 0.5
 
@@ -43,12 +45,13 @@ _RELATION_THRESHOLD = 0.5
 def predict(trained: Run, options: argparse.Namespace) -> int:
     """Predict some examples of a split with the first seed and write everything into --out."""
     task = limited_task(trained, options) or trained.config.task
-    source = lane_graph_source(trained.config, options)
-    dataset = open_dataset(source)
+    source = chosen_source(trained.config, options)
+    dataset = sources.open_dataset(source)
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
     indices = spread(len(dataset), options.count)
-    examples, lanes, elements = predict_examples(task, trained.params[0], dataset, indices)
+    examples, answer = predict_examples(task, trained.params[0], dataset, indices)
+    lanes, elements = answer.centerlines, answer.elements
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
     successor = expit(lanes.successor_logits)
@@ -135,6 +138,6 @@ def _relations(scores: Float[np.ndarray, "a b"], first: str, second: str) -> lis
 
 
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    temporary = path.with_name(f".{path.stem}.tmp.npz")
-    np.savez_compressed(temporary, **arrays)  # pyright: ignore[reportArgumentType]
-    temporary.replace(path)
+    # An open file, because numpy appends .npz to any other name.
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

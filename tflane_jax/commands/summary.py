@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
-from tflane_jax.tasks import system_of
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -17,7 +16,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     configure_jax()
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)
-    example = system_of(config).shapes(config)
+    example = config.task.shapes(config.data)
     params = shapes_of_params(config.task, example)
     counts = parameter_counts(params, options.depth)
     total = sum(counts.values())

@@ -19,5 +19,13 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if len(models) < len(pairs):
         raise UserError("two of the folders have the same name: write NAME=FOLDER to tell them apart")
     configure_jax()
-    sweep(models, options.setting, options.values, options.out, overrides, metrics=options.metrics)
+    sweep(
+        models,
+        options.setting,
+        options.values,
+        options.out,
+        overrides,
+        metrics=options.metrics,
+        which=options.checkpoint,
+    )
     return 0

@@ -13,10 +13,10 @@ from tflane_jax.convert.renaming import Converted, Rule, below, convert, renamed
 from tflane_jax.geometry.namespace import AnyArray
 
 FEATURE_PYRAMID: tuple[Rule, ...] = (
-    (r"lateral_convs\.(\d)\.conv\.weight", r"lateral_\1/kernel", "conv"),
-    (r"lateral_convs\.(\d)\.conv\.bias", r"lateral_\1/bias", "vector"),
-    (r"fpn_convs\.(\d)\.conv\.weight", r"output_\1/kernel", "conv"),
-    (r"fpn_convs\.(\d)\.conv\.bias", r"output_\1/bias", "vector"),
+    (r"lateral_convs\.(\d+)\.conv\.weight", r"lateral_\1/kernel", "conv"),
+    (r"lateral_convs\.(\d+)\.conv\.bias", r"lateral_\1/bias", "vector"),
+    (r"fpn_convs\.(\d+)\.conv\.weight", r"output_\1/kernel", "conv"),
+    (r"fpn_convs\.(\d+)\.conv\.bias", r"output_\1/bias", "vector"),
 )
 IMAGE_ENCODER: tuple[Rule, ...] = (
     *below(r"img_backbone\.", "backbone", RESNET),
@@ -29,13 +29,13 @@ SPATIAL_ATTENTION: tuple[Rule, ...] = (
     (r"output_proj\.(weight|bias)", r"output_proj/\1", "linear"),
 )
 ENCODER: tuple[Rule, ...] = (
-    *below(r"layers\.(\d)\.attentions\.0\.", r"layer_\1/temporal_attention", TEMPORAL_ATTENTION),
-    *below(r"layers\.(\d)\.attentions\.1\.", r"layer_\1/spatial_attention", SPATIAL_ATTENTION),
-    (r"layers\.(\d)\.ffns\.0\.layers\.0\.0\.(weight|bias)", r"layer_\1/expand/\2", "linear"),
-    (r"layers\.(\d)\.ffns\.0\.layers\.1\.(weight|bias)", r"layer_\1/contract/\2", "linear"),
-    (r"layers\.(\d)\.norms\.0\.(weight|bias)", r"layer_\1/temporal_norm/\2", "norm"),
-    (r"layers\.(\d)\.norms\.1\.(weight|bias)", r"layer_\1/spatial_norm/\2", "norm"),
-    (r"layers\.(\d)\.norms\.2\.(weight|bias)", r"layer_\1/feed_forward_norm/\2", "norm"),
+    *below(r"layers\.(\d+)\.attentions\.0\.", r"layer_\1/temporal_attention", TEMPORAL_ATTENTION),
+    *below(r"layers\.(\d+)\.attentions\.1\.", r"layer_\1/spatial_attention", SPATIAL_ATTENTION),
+    (r"layers\.(\d+)\.ffns\.0\.layers\.0\.0\.(weight|bias)", r"layer_\1/expand/\2", "linear"),
+    (r"layers\.(\d+)\.ffns\.0\.layers\.1\.(weight|bias)", r"layer_\1/contract/\2", "linear"),
+    (r"layers\.(\d+)\.norms\.0\.(weight|bias)", r"layer_\1/temporal_norm/\2", "norm"),
+    (r"layers\.(\d+)\.norms\.1\.(weight|bias)", r"layer_\1/spatial_norm/\2", "norm"),
+    (r"layers\.(\d+)\.norms\.2\.(weight|bias)", r"layer_\1/feed_forward_norm/\2", "norm"),
 )
 BEV_CONSTRUCTER: tuple[Rule, ...] = (
     *below(r"encoder\.", "encoder", ENCODER),

@@ -15,16 +15,17 @@ import jax.numpy as jnp
 from tflane_jax.convert.renaming import Converted, below, check_fits, convert, renamed_params
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.models.lstr import LstrConfig
-from tflane_jax.training.task import STATISTICS, Params
+from tflane_jax.models.parameters import Params
 
 RESNET = (
     (r"(conv\d)\.weight", r"\1/kernel", "conv"),
     (r"bn1\.(weight|bias|running_mean|running_var)", r"bn1/\1", "norm"),
-    (r"layer(\d)\.(\d)\.(conv\d)\.weight", r"layer\1_\2/\3/kernel", "conv"),
-    (r"layer(\d)\.(\d)\.(bn\d)\.(\w+)", r"layer\1_\2/\3/\4", "norm"),
-    (r"layer(\d)\.(\d)\.downsample\.0\.weight", r"layer\1_\2/downsample_conv/kernel", "conv"),
-    (r"layer(\d)\.(\d)\.downsample\.1\.(\w+)", r"layer\1_\2/downsample_bn/\3", "norm"),
+    (r"layer(\d+)\.(\d+)\.(conv\d)\.weight", r"layer\1_\2/\3/kernel", "conv"),
+    (r"layer(\d+)\.(\d+)\.(bn\d)\.(\w+)", r"layer\1_\2/\3/\4", "norm"),
+    (r"layer(\d+)\.(\d+)\.downsample\.0\.weight", r"layer\1_\2/downsample_conv/kernel", "conv"),
+    (r"layer(\d+)\.(\d+)\.downsample\.1\.(\w+)", r"layer\1_\2/downsample_bn/\3", "norm"),
 )
 _ATTENTION = (
     (r"self_attn\.in_proj_(weight|bias)", r"self_attention/\1", "packed"),

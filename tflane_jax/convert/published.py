@@ -6,9 +6,9 @@ from pathlib import Path
 
 from tflane_jax.convert.lstr import load_lstr
 from tflane_jax.convert.toponet import load_host
+from tflane_jax.models.parameters import Params
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
-from tflane_jax.training.task import Params
 
 
 def load_weights(path: Path, task: LaneShapeTask | LaneGraphTask) -> tuple[Params, list[dict[str, str]]]:

@@ -27,9 +27,9 @@ SD_MAP_ENCODER: tuple[Rule, ...] = (
 )
 # Before BEVFormer's rules: the norm of the map stands between the cameras' and the last.
 SMERF_CONSTRUCTER: tuple[Rule, ...] = (
-    *below(r"encoder\.layers\.(\d)\.attentions\.2\.", r"encoder/layer_\1/sd_map_\1", CROSS_ATTENTION),
-    (r"encoder\.layers\.(\d)\.norms\.2\.(weight|bias)", r"encoder/layer_\1/sd_map_\1/norm/\2", "norm"),
-    (r"encoder\.layers\.(\d)\.norms\.3\.(weight|bias)", r"encoder/layer_\1/feed_forward_norm/\2", "norm"),
+    *below(r"encoder\.layers\.(\d+)\.attentions\.2\.", r"encoder/layer_\1/sd_map_\1", CROSS_ATTENTION),
+    (r"encoder\.layers\.(\d+)\.norms\.2\.(weight|bias)", r"encoder/layer_\1/sd_map_\1/norm/\2", "norm"),
+    (r"encoder\.layers\.(\d+)\.norms\.3\.(weight|bias)", r"encoder/layer_\1/feed_forward_norm/\2", "norm"),
     *BEV_CONSTRUCTER,
 )
 

@@ -20,11 +20,12 @@ from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, conv
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.parameters import Params
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import CameraViews, Example
-from tflane_jax.training.task import STATISTICS, Params
 
 _DEFORMABLE = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
 _ATTENTION = (
@@ -45,8 +46,8 @@ SCENE_GRAPH: tuple[Rule, ...] = (
     (r"downsample\.(weight|bias)", r"downsample/\1", "linear"),
 )
 RELATIONSHIP: tuple[Rule, ...] = (
-    (r"MLP_o1\.layers\.(\d)\.(weight|bias)", r"mlp_first/linear_\1/\2", "linear"),
-    (r"MLP_o2\.layers\.(\d)\.(weight|bias)", r"mlp_second/linear_\1/\2", "linear"),
+    (r"MLP_o1\.layers\.(\d+)\.(weight|bias)", r"mlp_first/linear_\1/\2", "linear"),
+    (r"MLP_o2\.layers\.(\d+)\.(weight|bias)", r"mlp_second/linear_\1/\2", "linear"),
     (r"classifier\.layers\.0\.(weight|bias)", r"pair/\1", "pair"),
     (r"classifier\.layers\.1\.(weight|bias)", r"pair_hidden/\1", "linear"),
     (r"classifier\.layers\.2\.(weight|bias)", r"pair_out/\1", "linear"),
@@ -60,16 +61,16 @@ _LANE_LAYER: tuple[Rule, ...] = (
     (r"norms\.1\.(weight|bias)", r"bev_attention_norm/\1", "norm"),
 )
 _LANE_HEADS: tuple[Rule, ...] = (
-    (r"cls_branches\.(\d)\.0\.(weight|bias)", r"heads_\1/class_0/\2", "linear"),
-    (r"cls_branches\.(\d)\.1\.(weight|bias)", r"heads_\1/class_norm_0/\2", "norm"),
-    (r"cls_branches\.(\d)\.3\.(weight|bias)", r"heads_\1/class_1/\2", "linear"),
-    (r"cls_branches\.(\d)\.4\.(weight|bias)", r"heads_\1/class_norm_1/\2", "norm"),
-    (r"cls_branches\.(\d)\.6\.(weight|bias)", r"heads_\1/class_out/\2", "linear"),
-    (r"reg_branches\.(\d)\.0\.(weight|bias)", r"heads_\1/points/linear_0/\2", "linear"),
-    (r"reg_branches\.(\d)\.2\.(weight|bias)", r"heads_\1/points/linear_1/\2", "linear"),
-    (r"reg_branches\.(\d)\.4\.(weight|bias)", r"heads_\1/points/linear_2/\2", "linear"),
+    (r"cls_branches\.(\d+)\.0\.(weight|bias)", r"heads_\1/class_0/\2", "linear"),
+    (r"cls_branches\.(\d+)\.1\.(weight|bias)", r"heads_\1/class_norm_0/\2", "norm"),
+    (r"cls_branches\.(\d+)\.3\.(weight|bias)", r"heads_\1/class_1/\2", "linear"),
+    (r"cls_branches\.(\d+)\.4\.(weight|bias)", r"heads_\1/class_norm_1/\2", "norm"),
+    (r"cls_branches\.(\d+)\.6\.(weight|bias)", r"heads_\1/class_out/\2", "linear"),
+    (r"reg_branches\.(\d+)\.0\.(weight|bias)", r"heads_\1/points/linear_0/\2", "linear"),
+    (r"reg_branches\.(\d+)\.2\.(weight|bias)", r"heads_\1/points/linear_1/\2", "linear"),
+    (r"reg_branches\.(\d+)\.4\.(weight|bias)", r"heads_\1/points/linear_2/\2", "linear"),
 )
-_LAYER = r"transformer\.decoder\.layers\.(\d)\."
+_LAYER = r"transformer\.decoder\.layers\.(\d+)\."
 TOPONET_LANES: tuple[Rule, ...] = (
     _QUERIES,
     _REFERENCE,
@@ -77,10 +78,10 @@ TOPONET_LANES: tuple[Rule, ...] = (
     *below(_LAYER + r"ffns\.0\.", r"layer_\1/scene_graph", SCENE_GRAPH),
     (_LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/scene_graph_norm/\2", "norm"),
     *_LANE_HEADS,
-    *below(r"lclc_branches\.(\d)\.", r"heads_\1/successor", RELATIONSHIP),
-    *below(r"lcte_branches\.(\d)\.", r"heads_\1/element_lane", RELATIONSHIP),
-    (r"te_embed_branches\.(\d)\.0\.0\.(weight|bias)", r"element_embedding_\1/expand/\2", "linear"),
-    (r"te_embed_branches\.(\d)\.1\.(weight|bias)", r"element_embedding_\1/contract/\2", "linear"),
+    *below(r"lclc_branches\.(\d+)\.", r"heads_\1/successor", RELATIONSHIP),
+    *below(r"lcte_branches\.(\d+)\.", r"heads_\1/element_lane", RELATIONSHIP),
+    (r"te_embed_branches\.(\d+)\.0\.0\.(weight|bias)", r"element_embedding_\1/expand/\2", "linear"),
+    (r"te_embed_branches\.(\d+)\.1\.(weight|bias)", r"element_embedding_\1/contract/\2", "linear"),
 )
 BASELINE_LANES: tuple[Rule, ...] = (
     _QUERIES,
@@ -90,7 +91,7 @@ BASELINE_LANES: tuple[Rule, ...] = (
     (_LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/feed_forward_norm/\2", "norm"),
     *_LANE_HEADS,
 )
-_ENCODER = r"transformer\.encoder\.layers\.(\d)\."
+_ENCODER = r"transformer\.encoder\.layers\.(\d+)\."
 ELEMENTS: tuple[Rule, ...] = (
     (r"transformer\.level_embeds", "level", "vector"),
     (r"query_embedding\.weight", "queries", "vector"),
@@ -105,10 +106,10 @@ ELEMENTS: tuple[Rule, ...] = (
     (_LAYER + r"norms\.0\.(weight|bias)", r"decoder_\1/attended/norm/\2", "norm"),
     (_LAYER + r"norms\.1\.(weight|bias)", r"decoder_\1/crossed/norm/\2", "norm"),
     (_LAYER + r"norms\.2\.(weight|bias)", r"decoder_\1/fed/norm/\2", "norm"),
-    (r"cls_branches\.(\d)\.(weight|bias)", r"class_\1/\2", "linear"),
-    (r"reg_branches\.(\d)\.0\.(weight|bias)", r"box_\1/hidden/linear_0/\2", "linear"),
-    (r"reg_branches\.(\d)\.2\.(weight|bias)", r"box_\1/hidden/linear_1/\2", "linear"),
-    (r"reg_branches\.(\d)\.4\.(weight|bias)", r"box_\1/out/\2", "linear"),
+    (r"cls_branches\.(\d+)\.(weight|bias)", r"class_\1/\2", "linear"),
+    (r"reg_branches\.(\d+)\.0\.(weight|bias)", r"box_\1/hidden/linear_0/\2", "linear"),
+    (r"reg_branches\.(\d+)\.2\.(weight|bias)", r"box_\1/hidden/linear_1/\2", "linear"),
+    (r"reg_branches\.(\d+)\.4\.(weight|bias)", r"box_\1/out/\2", "linear"),
 )
 
 

@@ -1,4 +1,4 @@
-"""What every dataset offers, and the sizes of the examples that it makes."""
+"""What every dataset offers, the names of splits, and the sizes of an `Example`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
@@ -14,20 +15,23 @@ from tflane_jax.world.bev.sensor import BevSensorConfig
 from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
 
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
 
 @dataclass(frozen=True)
 class ExampleConfig:
     """Sizes and ranges of an `Example`.
 
-    The capacities hold the two Argoverse 2 logs at hand with room to spare (58 lane segments, 28 centerlines, 11
-    areas, 39 instances near the vehicle); what does not fit is left out, farthest first, with a
+    The default capacities suit Argoverse 2: the largest counts in two of its logs were 58 lane segments, 28
+    centerlines, 11 areas and 39 road users near the vehicle. What does not fit is left out, farthest first, with a
     `TruncationWarning`.
 
     Attributes:
-        range: in which lanes, areas and elements are truth.
+        range: region in which lanes, areas and elements are ground truth.
         sensor: bird's-eye-view evidence; None leaves it out.
-        cameras: ring of cameras of the built-in world; None leaves them out. With cameras the traffic elements are
-            those that the first one sees, with their boxes in its image, as OpenLane-V2 annotates them.
+        cameras: camera ring of the built-in world; None leaves it out. With cameras, the traffic elements are those
+            visible in the first camera, with their boxes in its image, as in OpenLane-V2.
         markers: fiducial-marker prior with simulated detections (marker paper, section IV-A); None leaves it out.
         lanes, lane_points: merged centerlines and points on each.
         segments, segment_points: lane segments and points on each.
@@ -35,7 +39,7 @@ class ExampleConfig:
         history: frames N of traffic flow before the key frame.
         tracks: instances K of traffic flow.
         elements: traffic lights and signs.
-        bike_lanes: whether lanes closed to motor vehicles are truth.
+        bike_lanes: whether bicycle lanes are ground truth.
         sd_map: coarse map of the roads of the built-in world; None leaves it out.
     """
 
@@ -57,12 +61,12 @@ class ExampleConfig:
 
     @property
     def ground(self) -> PerceptionRange:
-        """The ground that rasters of the example cover, and that pictures of it are drawn on."""
+        """The ground area that the rasters of an example and its pictures cover."""
         return BevGrid().range if self.sensor is None else self.sensor.grid.range
 
 
 class TruncationWarning(UserWarning):
-    """Something in range found no room in an example."""
+    """An example has more items in range than its capacity; some were left out."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,8 @@ class FrameInfo:
     global_from_ego: np.ndarray
 
 
-class Source(Protocol):
-    """Indexed examples of one task as numpy arrays without a batch axis, all of one shape."""
+class IndexedExamples(Protocol):
+    """Indexed examples of one kind as numpy arrays without a batch axis, all of the same shapes."""
 
     name: str
 
@@ -100,9 +104,21 @@ class Source(Protocol):
         ...
 
 
-class Dataset(Source, Protocol):
-    """Indexed examples of what is around the vehicle."""
+class Dataset(IndexedExamples, Protocol):
+    """Lane graphs around the vehicle."""
 
     def example(self, index: int) -> Example:
         """Return one example; the same index always gives the same bits."""
+        ...
+
+
+class RoadImageDataset(IndexedExamples, Protocol):
+    """Front-view images with their lane lines."""
+
+    def example(self, index: int) -> RoadImage:
+        """Return one image with its lane lines; the same index always gives the same bits."""
+        ...
+
+    def truth(self, index: int) -> RowLanes:
+        """Return the labels of one image for TuSimple's metric: x in pixels at fixed rows."""
         ...

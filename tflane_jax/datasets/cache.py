@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 
 import tflane_jax
-from tflane_jax.datasets.base import FrameInfo, Source
+from tflane_jax.datasets.base import FrameInfo, IndexedExamples
 from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
 from tflane_jax.errors import UserError
@@ -36,7 +36,7 @@ from tflane_jax.scene import Example
 _SOURCES = ("scene", "geometry", "world", "markers", "datasets")
 
 
-class Cacheable(Source, Protocol):
+class Cacheable(IndexedExamples, Protocol):
     """A dataset that its configuration describes completely, and that can be sent to worker processes
     (pickle)."""
 
@@ -93,7 +93,7 @@ def fingerprint(dataset: Cacheable) -> str:
     return digest.hexdigest()
 
 
-def _kind(dataset: Source) -> str:
+def _kind(dataset: IndexedExamples) -> str:
     return f"{type(dataset).__module__}.{type(dataset).__qualname__}"
 
 

@@ -1,21 +1,26 @@
-"""Front views of the built-in world as a dataset: endless, seeded, without a download.
+"""Front views of the built-in world as a dataset of road images: endless, seeded, without a download.
 
-One integer is one image with its lane lines; each split owns a range of integers, so that training, validation and
-test images are disjoint by construction.
+One integer names one image with its lane lines. Each split owns a range of integers, so training, validation and test
+images are disjoint by construction.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Literal
 
+import jax
 import numpy as np
 
-from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.augmentation import AugmentationConfig
+from tflane_jax.datasets.base import FrameInfo, Split
 from tflane_jax.datasets.cache import cached
+from tflane_jax.datasets.data_source import Choice, DataSource
+from tflane_jax.datasets.lane_rows import LabelledImages, row_lanes
 from tflane_jax.datasets.leaves import image_from_leaves
 from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
 from tflane_jax.errors import UserError
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 from tflane_jax.world.front_view.views import FrontWorldConfig, front_view
@@ -27,21 +32,21 @@ class FrontViewConfig:
 
     Attributes:
         split: train owns the scene ids [0, 1e8), val [1e8, 2e8), test [2e8, 3e8).
-        images: number of images, one a scene.
-        first: scenes of the split to skip.
-        world: camera, road, traffic, weather, and the `severity` of it all (0 to 1).
+        images: number of images, one per scene.
+        first: number of scenes to skip at the start of the split's range.
+        world: camera, road, traffic, weather, and one `severity` of them all (0 to 1).
     """
 
-    split: Literal["train", "val", "test"] = "train"
+    split: Split = "train"
     images: int = 4000
     first: int = 0
     world: FrontWorldConfig = FrontWorldConfig()
 
 
 class FrontViewDataset:
-    """Road images made when they are asked for.
+    """Road images made on request.
 
-    Raises UserError where the images do not lie in the split's range of ids.
+    Raises UserError for images outside the split's range of ids.
     """
 
     def __init__(self, config: FrontViewConfig):
@@ -60,8 +65,12 @@ class FrontViewDataset:
         """Return one image with its lane lines."""
         return front_view(self.scene_id(index), self.config.world)
 
+    def truth(self, index: int) -> RowLanes:
+        """Return the lane lines of one image for TuSimple's metric, in pixels of a TuSimple image (720 x 1280)."""
+        return row_lanes(self.example(index).lines)
+
     def info(self, index: int) -> FrameInfo:
-        """Return where one image comes from; a front view has a frame of its own and no time."""
+        """Return where one image comes from; a front view has no time and no pose."""
         return FrameInfo("front-views", f"front-{self.scene_id(index):09d}", 0, np.eye(4))
 
     def scene_id(self, index: int) -> int:
@@ -72,7 +81,7 @@ class FrontViewDataset:
 
 
 class _StoredViews(FrontViewDataset):
-    """The same images as they are kept on disk: without the mask, which is true everywhere."""
+    """The same images as the cache holds them: without the mask, which is true everywhere."""
 
     def example(self, index: int) -> RoadImage:
         # `replace` of dataclasses: pyright does not know flax's.
@@ -83,16 +92,16 @@ def load_road_images(config: FrontViewConfig, *, progress: bool = True, workers:
     """Return all images of the configuration, stacked along a new first axis.
 
     They are made once, in parallel, and kept under the cache root (see `datasets.cache`). The images are read-only
-    maps of the file on disk, so that a large set needs no memory of its own, and `image_valid` is a broadcast view.
+    memory maps of the file on disk, so a large set needs little memory; `image_valid` is a broadcast view.
 
     Args:
         config: which images.
         progress: show a bar with rate and time left while they are made.
-        workers: processes that make them, default one per core. More than one needs the caller's script to be guarded
+        workers: processes that make them, default one per core. For more than one the caller's script must be guarded
             by `if __name__ == "__main__":`.
 
     Raises:
-        UserError: ids outside the split, a severity outside [0, 1], a full disk, a folder that cannot be written.
+        UserError: ids outside the split, a severity outside [0, 1], a full disk, or a folder that cannot be written.
     """
     dataset = _StoredViews(config)
     camera, count = config.world.camera, len(dataset)
@@ -104,3 +113,47 @@ def load_road_images(config: FrontViewConfig, *, progress: bool = True, workers:
         lines = LaneLines(points, flags, np.zeros((0, CAPACITY), bool))
         stored = RoadImage(image=np.zeros((*shape, 3), np.uint8), image_valid=None, lines=lines)  # type: ignore
     return replace(stored, image_valid=np.broadcast_to(True, shape))
+
+
+@dataclass(frozen=True)
+class FrontViewData:
+    """Front-view images of the built-in world for training, validation and test.
+
+    Attributes:
+        train, val, test: number of images of each split.
+        augmentation: of training images, or None.
+    """
+
+    train: int = 4000
+    val: int = 100
+    test: int = 400
+    augmentation: AugmentationConfig | None = AugmentationConfig()
+
+    def source(self, split: Split) -> FrontViewConfig:
+        """Return the dataset of a split."""
+        return FrontViewConfig(split, images=getattr(self, split))
+
+
+def _load(dataset: FrontViewDataset, progress: bool, parts: Collection[str]) -> LabelledImages:
+    images = load_road_images(dataset.config, progress=progress)
+    lines = (jax.tree.map(lambda leaf, i=i: leaf[i], images.lines) for i in range(len(images.image)))
+    return LabelledImages(images, tuple(row_lanes(each) for each in lines))
+
+
+def _choose(choice: Choice) -> FrontViewConfig:
+    if isinstance(choice.configured, FrontViewConfig):
+        return choice.configured
+    return FrontViewConfig(choice.split, images=100)
+
+
+SOURCE = DataSource(
+    name="front-views",
+    data=FrontViewData,
+    config=FrontViewConfig,
+    example=RoadImage,
+    dataset=FrontViewDataset,
+    load=_load,
+    choose=_choose,
+    title=lambda config: f"front-views-{config.split}",
+    build=lambda config, progress: len(load_road_images(config, progress=progress).image),
+)

@@ -1,13 +1,14 @@
-"""Datasets as arrays in memory: one stacked `Example` with a leading axis.
+"""Datasets of lane graphs as arrays in memory: one stacked `Example` with a leading axis.
 
-The arrays are numpy and stay on the host (`training.batches` gathers from them). Parts that a model does not look at
-need not be read at all.
+The arrays are numpy and stay on the host; `datasets.batches` gathers from them. Parts that the model does not read are
+left out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -16,10 +17,11 @@ from tqdm import tqdm
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.cache import CachedDataset
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Areas, Example, LaneGraph
 
-# What training on merged centerlines looks at.
+# Fields of `Example` that training on merged centerlines reads.
 TRAINING_PARTS = (
     "bev",
     "cameras",
@@ -31,17 +33,36 @@ TRAINING_PARTS = (
     "previous_from_ego",
     "has_previous",
 )
-# Fields of `Example` without which there is none.
+# Fields of `Example` that are never dropped.
 _ALWAYS = ("previous_from_ego", "has_previous")
+IN_MEMORY = 6 * 2**30
+"""Bytes of training examples that are held in memory; a larger dataset is read from disk while training."""
+
+
+def load_or_stream(
+    dataset: Dataset, progress: bool = True, parts: Collection[str] = TRAINING_PARTS
+) -> Example | Streamed:
+    """Return some parts of all examples: stacked in memory, or streamed where they exceed `IN_MEMORY`.
+
+    Only a `CachedDataset` is streamed, because its size is known before it is read.
+    """
+    if isinstance(dataset, CachedDataset) and dataset.nbytes(parts) > IN_MEMORY:
+        return stream(dataset, StreamingConfig(), parts)
+    return load_arrays(dataset, parts=parts, progress=progress)
+
+
+def stream(dataset: Dataset, config: StreamingConfig, parts: Collection[str] = TRAINING_PARTS) -> Streamed:
+    """Return some parts of all examples, read by workers while they are used."""
+    return Streamed(dataset, config, partial(keep, parts=parts))
 
 
 def load_arrays(dataset: Dataset, *, parts: Collection[str] | None = None, progress: bool = True) -> Example:
     """Read a whole dataset into memory.
 
     Args:
-        dataset: a `CachedDataset` is read at the speed of the disk, any other example by example.
+        dataset: a `CachedDataset` is read at the speed of the disk, any other dataset example by example.
         parts: fields of `Example` to keep, default all; see `keep`.
-        progress: show a bar with rate and time left, where examples are made one by one.
+        progress: show a bar with rate and time left where examples are made one by one.
 
     Returns:
         The examples stacked along a new first axis.
@@ -61,7 +82,7 @@ def load_arrays(dataset: Dataset, *, parts: Collection[str] | None = None, progr
 
 
 def _stacked(dataset: Dataset, parts: Collection[str] | None, progress: bool) -> Mapping[str, np.ndarray]:
-    """Make every example and write it into place, so that memory holds the data once."""
+    """Make every example and write it straight into the stacked arrays, so that memory holds the data only once."""
     leaves: dict[str, np.ndarray] = {}
     bar = tqdm(range(len(dataset)), desc=f"loading {dataset.name}", unit="example", disable=not progress)
     for index in bar:
@@ -80,24 +101,14 @@ def _stacked(dataset: Dataset, parts: Collection[str] | None, progress: bool) ->
 
 
 def keep(arrays: Example, parts: Collection[str]) -> Example:
-    """Return stacked examples, or one, without the fields that are not in `parts`.
+    """Return one example, or stacked examples, with only the fields in `parts`.
 
-    A field that an `Example` cannot do without (`lanes`, `segments`, `areas`) stays with a capacity of zero,
-    the others become None. Raises ValueError for a name that is no field of `Example`.
+    The mandatory fields `lanes`, `segments` and `areas` get a capacity of zero instead; the other dropped fields become
+    None. Raises ValueError for a name that is no field of `Example`.
     """
     wanted = _checked(parts)
     dropped = {name: None for name in Example.__dataclass_fields__ if name not in wanted}
     return _completed(replace(arrays, **dropped), *np.shape(arrays.has_previous))
-
-
-def for_training(arrays: Example) -> Example:
-    """Return the arrays without what only evaluation and pictures look at (`TRAINING_PARTS` stay)."""
-    return keep(arrays, TRAINING_PARTS)
-
-
-def count(arrays: Example) -> int:
-    """Return the number of stacked examples."""
-    return len(arrays.has_previous)
 
 
 def _checked(parts: Collection[str]) -> frozenset[str]:
@@ -108,7 +119,7 @@ def _checked(parts: Collection[str]) -> frozenset[str]:
 
 
 def _completed(arrays: Example, *leading: int) -> Example:
-    """Return the arrays with a graph or set of capacity zero where a field that must be there is None."""
+    """Return the arrays with a graph or set of capacity zero for each mandatory field that is None."""
     empty = {"lanes": LaneGraph.empty(0, 2), "segments": LaneGraph.empty(0, 2), "areas": Areas.empty(0, 2)}
     missing = {name: part for name, part in empty.items() if getattr(arrays, name) is None}
     stacked = jax.tree.map(lambda leaf: np.zeros((*leading, *leaf.shape), leaf.dtype), missing)

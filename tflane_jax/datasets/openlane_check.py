@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_frames import (
-    SPLITS,
     SUBSETS,
     FrameFile,
-    Split,
     SubsetName,
     frames_of,
     info_path,

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from tqdm import tqdm
 
-from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.base import Dataset, FrameInfo, Split
 from tflane_jax.datasets.identities import Identities, line_distances
-from tflane_jax.datasets.openlane_frames import SUBSETS, Split, SubsetName, info_path
+from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, info_path
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKey

@@ -18,14 +18,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.datasets.base import Split
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, member, numbers
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import pose_matrix
 
 SubsetName = Literal["A", "B"]
-Split = Literal["train", "val", "test"]
-SPLITS: tuple[Split, ...] = ("train", "val", "test")
 # A rotation matrix may differ from an orthonormal one by so much in any entry; the files have float32 digits.
 _ORTHONORMAL = 1e-4
 

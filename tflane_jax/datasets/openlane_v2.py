@@ -1,45 +1,48 @@
 """OpenLane-V2, either subset, in either flavour: frame files and images -> `Example`.
 
-What the files do not tell: whether a lane is seen (visibility is 1), where a traffic element stands (its position is
-zero), and the boundaries of merged centerlines (left and right are the centerline itself). There is no bird's-eye-view
-evidence and no prior.
+Not in the files: the visibility of lanes (set to 1), the 3-D position of traffic elements (set to 0) and the
+boundaries of merged centerlines (left and right are the centerline itself). Examples have no bird's-eye-view evidence
+and no priors.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, TruncationWarning
-from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.loading import stream
+from tflane_jax.datasets.openlane_annotation import read_annotation
+from tflane_jax.datasets.openlane_check import check_openlane_v2
+from tflane_jax.datasets.openlane_example import area_set, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
-    Split,
     SubsetName,
     info_path,
     list_frames,
     read_frame,
+    subset_of,
 )
-from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, ImageConfig, ImageFit, canvas_size, fit_image
+from tflane_jax.datasets.photometric import PhotometricConfig
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
-from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT
+from tflane_jax.files.openlane import CENTERLINE, SEGMENT
 from tflane_jax.geometry import invert_pose, relative_pose
-from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
 
 Flavour = Literal["centerline", "lane_segment", "both"]
 OPENLANE_V2_SIZES = ExampleConfig(lanes=128, segments=192, areas=64, elements=48)
-"""Room in an example; a frame of Argoverse 2 has some 60 centerlines, 75 segments and 11 elements (specs 2.3)."""
+"""Capacities of an example; a frame of subset A has about 60 centerlines, 75 lane segments and 11 elements."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +51,16 @@ class OpenLaneV2Config:
 
     Attributes:
         root: folder of the dataset.
-        split: the test split has no annotations, its examples no valid lane.
-        subset: A is from Argoverse 2 (7 cameras), B from nuScenes (6).
-        flavour: which files are read: centerlines (`Example.lanes`), lane segments with areas (`Example.segments`), or
-            both. Traffic elements and what they govern come from the first of them: the rows of
-            `TrafficElements.lane` are centerlines, of "lane_segment" segments.
+        split: the official test split has no annotations, so its examples have no valid lane.
+        subset: A is from Argoverse 2 (7 cameras), B from nuScenes (6 cameras).
+        flavour: which files are read: "centerline" (`Example.lanes`), "lane_segment" (`Example.segments` and areas), or
+            "both". Traffic elements come from the centerline files if these are read: the rows of
+            `TrafficElements.lane` are centerlines, with "lane_segment" they are segments.
         data_dict: split file under `root`, see `openlane_frames.list_frames`.
-        image: what happens to the images; None leaves them unread (`Example.cameras` is None, boxes are in pixels of
-            the files).
+        image: scaling and cropping of the images; None does not read them (`Example.cameras` is None, boxes are in
+            pixels of the files).
         example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
-        loading: workers; changes no example.
+        loading: workers; they change no example.
     """
 
     root: Path
@@ -71,9 +74,10 @@ class OpenLaneV2Config:
 
 
 class OpenLaneV2Dataset:
-    """Frames of one split by segment, then time.
+    """Frames of one split, sorted by segment, then time.
 
-    Raises UserError where there are none; `example` raises it where a file is missing, damaged, or not as the others.
+    Raises UserError where there are none. `example` raises it for a file that is missing, damaged, or differs from the
+    others.
     """
 
     def __init__(self, config: OpenLaneV2Config):
@@ -162,7 +166,7 @@ class OpenLaneV2Dataset:
 
     @cached_property
     def _fits(self) -> tuple[ImageFit | None, ...]:
-        """What happens to the images of each camera, by the sizes in the first frame that has the camera."""
+        """Scaling and cropping of each camera's images, from the image size in the first frame that has the camera."""
         if self.config.image is None:
             return (None,) * len(SUBSETS[self.config.subset].cameras)
         fits: list[ImageFit | None] = [None] * len(SUBSETS[self.config.subset].cameras)
@@ -198,7 +202,7 @@ class OpenLaneV2Dataset:
 
 
 def nominal_example(config: OpenLaneV2Config) -> Example:
-    """Return an example of original image sizes in which nothing is valid: shapes without data."""
+    """Return an example in which nothing is valid, with the official image sizes: shapes that need no data."""
     sizes, subset = config.example, SUBSETS[config.subset]
     views = None
     if config.image is not None:
@@ -223,91 +227,75 @@ def nominal_example(config: OpenLaneV2Config) -> Example:
     )
 
 
-def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraViews:
-    """Return room for the images of cameras, none valid."""
-    width, height = canvas_size([fit.size for fit in fits if fit is not None], config.divisor)
-    count = len(fits)
-    return CameraViews(
-        image=np.zeros((count, height, width, 3), np.uint8),
-        size=np.zeros((count, 2), np.int32),
-        intrinsics=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
-        camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)),
-        valid=np.zeros(count, bool),
-    )
+@dataclass(frozen=True)
+class OpenLaneV2Data:
+    """OpenLane-V2, or any dataset in its layout, read from disk while training.
 
-
-def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph, Int[np.ndarray, " n"]]:
-    """Return the lanes of an annotation and which of them they are (the nearest, where there are more than fit)."""
-    kept = _nearest(found.lines, capacity, "lanes" if found.left is None else "segments")
-    graph, n = LaneGraph.empty(capacity, points), len(kept)
-    if n:
-        graph.points[:n] = _with_points([found.lines[i] for i in kept], points)
-        graph.left[:n] = graph.points[:n] if found.left is None else _with_points([found.left[i] for i in kept], points)
-        graph.right[:n] = (
-            graph.points[:n] if found.right is None else _with_points([found.right[i] for i in kept], points)
-        )
-        graph.left_type[:n], graph.right_type[:n] = found.left_type[kept], found.right_type[kept]
-        graph.is_connector[:n] = found.is_connector[kept]
-        graph.visibility[:n] = 1.0
-        graph.successor[:n, :n] = found.successor[np.ix_(kept, kept)]
-        graph.valid[:n] = True
-    return graph, kept
-
-
-def area_set(found: Annotation, capacity: int, points: int) -> Areas:
-    """Return the areas of an annotation."""
-    kept = _nearest(found.areas, capacity, "areas")
-    areas, n = Areas.empty(capacity, points), len(kept)
-    if n:
-        areas.points[:n] = _with_points([found.areas[i] for i in kept], points)
-        areas.category[:n] = found.area_category[kept]
-        areas.valid[:n] = True
-    return areas
-
-
-def element_set(
-    found: Annotation, out: TrafficElements, lanes: Int[np.ndarray, " n"], fit: ImageFit | None
-) -> TrafficElements:
-    """Fill the traffic elements of an annotation into `out`; those outside what is left of the image are left out.
-
-    Args:
-        found: boxes in pixels of the file.
-        out: empty.
-        lanes: which of the annotated lanes are the first rows of `out.lane`.
-        fit: of the front image.
+    Attributes:
+        root: folder of the dataset.
+        train, val, test: which official split serves as each; the official test split has no annotations.
+        subset, flavour, data_dict, image, example, loading: see `OpenLaneV2Config`.
+        augmentation: of the colours of training images, or None.
     """
-    boxes = found.boxes if fit is None else fit.boxes(found.boxes)
-    sides = boxes[:, 1] - boxes[:, 0]
-    seen = np.flatnonzero((sides > 0.0).all(-1))
-    order = seen[np.argsort(-sides[seen].prod(-1), kind="stable")]  # larger in the image is nearer, as a rule
-    kept = np.sort(order[: len(out.valid)])
-    _warn_dropped(len(seen) - len(kept), "elements")
-    n = len(kept)
-    out.box[:n] = boxes[kept]
-    out.category[:n], out.attribute[:n] = found.element_category[kept], found.attribute[kept]
-    out.lane[: len(lanes), :n] = found.lane_element[np.ix_(lanes, kept)]
-    out.valid[:n] = True
-    return out
+
+    root: Path
+    train: Split = "train"
+    val: Split = "val"
+    test: Split = "val"
+    subset: SubsetName = "A"
+    flavour: Flavour = "centerline"
+    data_dict: str | None = None
+    image: ImageConfig = TOPONET_SUBSET_A
+    example: ExampleConfig = OPENLANE_V2_SIZES
+    augmentation: PhotometricConfig | None = PhotometricConfig()
+    loading: StreamingConfig = StreamingConfig()
+
+    def source(self, split: Split) -> OpenLaneV2Config:
+        """Return the dataset of a split."""
+        return OpenLaneV2Config(
+            self.root,
+            getattr(self, split),
+            self.subset,
+            self.flavour,
+            self.data_dict,
+            self.image,
+            self.example,
+            self.loading,
+        )
 
 
-def _nearest(lines: list[np.ndarray], capacity: int, name: str) -> Int[np.ndarray, " n"]:
-    """Return the indices of the `capacity` lines that come nearest to the vehicle, ascending."""
-    distance = [np.linalg.norm(line[:, :2], axis=-1).min() for line in lines]
-    _warn_dropped(len(lines) - capacity, name)
-    return np.sort(np.argsort(distance, kind="stable")[:capacity])
+def _load(dataset: OpenLaneV2Dataset, progress: bool, parts: Collection[str]) -> Streamed:
+    return stream(dataset, dataset.config.loading, parts)
 
 
-def _warn_dropped(count: int, name: str) -> None:
-    if count > 0:
-        message = f"more {name} in a frame than ExampleConfig.{name}: the farthest are left out"
-        warnings.warn(message, TruncationWarning, stacklevel=4)
+def _sample(config: OpenLaneV2Config) -> Example:
+    return OpenLaneV2Dataset(config).example(0) if Path(config.root).is_dir() else nominal_example(config)
 
 
-def _with_points(lines: list[np.ndarray], count: int) -> Any:
-    """Return lines with `count` points: as they are, every k-th of a dense line, or resampled."""
-    stride = (DENSE_POINTS - 1) // (count - 1) if count > 1 and (DENSE_POINTS - 1) % (count - 1) == 0 else 0
-    if stride and all(len(line) == DENSE_POINTS for line in lines):
-        return np.stack([line[::stride] for line in lines])
-    if all(len(line) == count for line in lines):
-        return np.stack(lines)
-    return resample_lines(lines, count)
+def _choose(choice: Choice) -> OpenLaneV2Config:
+    assert choice.root is not None
+    if isinstance(choice.configured, OpenLaneV2Config):  # its splits stay as configured: the official test has no truth
+        return replace(choice.configured, root=choice.root)
+    subset = subset_of(choice.root)
+    image = TOPONET_SUBSET_A if subset == "A" else TOPONET_SUBSET_B
+    return OpenLaneV2Config(choice.root, choice.split, subset, image=image, example=choice.configured.example)
+
+
+def _check(root: Path) -> FolderCheck:
+    found = check_openlane_v2(root)
+    return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults)
+
+
+SOURCE = DataSource(
+    name="openlane-v2",
+    data=OpenLaneV2Data,
+    config=OpenLaneV2Config,
+    example=Example,
+    dataset=OpenLaneV2Dataset,
+    load=_load,
+    sample=_sample,
+    choose=_choose,
+    title=lambda config: f"openlane-v2-{config.subset}-{config.split}",
+    root="its folder",
+    check=_check,
+)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from tflane_jax.datasets.argoverse2 import find_logs, read_poses
+from tflane_jax.datasets.argoverse2_log import find_logs, read_poses
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member, numbers
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from tflane_jax.datasets.base import Source
+from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.errors import UserError
 
@@ -40,7 +40,7 @@ _WORKER_ENVIRONMENT = {
 }
 
 
-def frame_leaves(dataset: Source, index: int) -> tuple[dict[str, np.ndarray], str]:
+def frame_leaves(dataset: IndexedExamples, index: int) -> tuple[dict[str, np.ndarray], str]:
     """Return the arrays of one example, with those of its `FrameInfo` under "info.", and its scene's name."""
     info = dataset.info(index)
     leaves = example_leaves(dataset.example(index))
@@ -73,11 +73,13 @@ class _Job:
     """What every worker needs to know."""
 
     folder: Path
-    dataset: Source
+    dataset: IndexedExamples
     slots: dict[str, Slot]
 
 
-def fill(folder: Path, dataset: Source, template: dict[str, np.ndarray], *, workers: int, progress: bool) -> list[str]:
+def fill(
+    folder: Path, dataset: IndexedExamples, template: dict[str, np.ndarray], *, workers: int, progress: bool
+) -> list[str]:
     """Write every example of `dataset` below `folder`, one .npy file per leaf, and return each one's scene
     name.
 

@@ -1,21 +1,23 @@
-"""The built-in world as a dataset: endless, seeded, without a download.
+"""The built-in world as a dataset of lane graphs: endless, seeded, without a download.
 
-An example is a keyframe of a simulated scene. A scene is named by one integer, and each split owns a range of
-integers, so that training, validation and test scenes are disjoint by construction.
+An example is a keyframe of a simulated scene. A scene is named by one integer; each split owns a range of integers, so
+training, validation and test scenes are disjoint by construction.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.cache import CachedDataset, cached
+from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
+from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.simulate import WorldConfig, simulate
 
 # Scene ids of a split: [first, first + SCENES_PER_SPLIT).
@@ -30,12 +32,12 @@ class ProceduralConfig:
     Attributes:
         split: train owns the scene ids [0, 1e8), val [1e8, 2e8), test [2e8, 3e8).
         scenes: number of scenes; each gives `world.keyframes` examples.
-        first: scenes of the split to skip.
+        first: number of scenes to skip at the start of the split's range.
         world: roads, traffic, tracker.
         example: what is in an example, and its capacities.
     """
 
-    split: Literal["train", "val", "test"] = "train"
+    split: Split = "train"
     scenes: int = 1000
     first: int = 0
     world: WorldConfig = field(default_factory=WorldConfig)
@@ -43,10 +45,9 @@ class ProceduralConfig:
 
 
 class ProceduralDataset:
-    """Examples made when they are asked for, in order of scene and time.
+    """Examples made on request, in order of scene and time.
 
-    Raises UserError where the scenes do not lie in the split's range of ids, or cameras are asked for and OpenCV, which
-    draws their images, is not installed.
+    Raises UserError for scenes outside the split's range of ids, or for cameras without OpenCV, which draws the images.
     """
 
     def __init__(self, config: ProceduralConfig):
@@ -64,7 +65,7 @@ class ProceduralDataset:
         return self.config.scenes * self.config.world.keyframes
 
     def example(self, index: int) -> Example:
-        """Return one example; the last few scenes stay in memory, so go through a scene's frames in order."""
+        """Return one example. The last few scenes stay in memory, so reading a scene's frames in order is fast."""
         log, keyframe = self._frame(index)
         return make_example(log, keyframe, self.config.example)
 
@@ -87,3 +88,61 @@ class ProceduralDataset:
 @functools.lru_cache(maxsize=4)
 def _simulated(scene_id: int, config: WorldConfig) -> Log:
     return simulate(scene_id, config)
+
+
+@dataclass(frozen=True)
+class WorldData:
+    """The built-in world for training, validation and test.
+
+    Attributes:
+        train, val, test: number of scenes of each split.
+        world: roads, traffic, tracker.
+        example: what is in an example, and its capacities.
+    """
+
+    train: int = 2000
+    val: int = 100
+    test: int = 200
+    world: WorldConfig = WorldConfig()
+    example: ExampleConfig = ExampleConfig()
+
+    def source(self, split: Split) -> ProceduralConfig:
+        """Return the dataset of a split."""
+        return ProceduralConfig(split, scenes=getattr(self, split), world=self.world, example=self.example)
+
+
+# Scenes of --data procedural and world-cameras where the configuration has other data.
+_SCENES = 100
+
+
+def _choose(choice: Choice) -> ProceduralConfig:
+    if isinstance(choice.configured, ProceduralConfig):
+        return choice.configured
+    return ProceduralConfig(choice.split, scenes=_SCENES, example=choice.configured.example)
+
+
+def _choose_cameras(choice: Choice) -> ProceduralConfig:
+    example: ExampleConfig = choice.configured.example
+    cameras = example.cameras or CameraRigConfig(scale=0.3)
+    return ProceduralConfig(choice.split, scenes=_SCENES, example=replace(example, cameras=cameras))
+
+
+def _open(config: ProceduralConfig, progress: bool) -> CachedDataset:
+    return cached(ProceduralDataset(config), progress=progress)
+
+
+SOURCE = DataSource(
+    name="procedural",
+    data=WorldData,
+    config=ProceduralConfig,
+    example=Example,
+    dataset=ProceduralDataset,
+    choose=_choose,
+    title=lambda config: f"procedural-{config.split}",
+    open=_open,
+    # Not from the cache: one example is made sooner than all of them.
+    sample=lambda config: ProceduralDataset(config).example(0),
+    build=lambda config, progress: len(_open(config, progress)),
+)
+CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
+"""The same world with a ring of cameras, under a name of its own for `tflane data show`."""

@@ -1,6 +1,6 @@
 """Datasets too large for memory: examples are loaded by workers shortly before they are needed, with grain.
 
-Which example comes when is decided by whoever asks (`training.batches`: by seed and step alone), so that neither the
+Which example comes when is decided by whoever asks (`datasets.batches`: by seed and step alone), so that neither the
 number of workers nor a stop in between changes anything, and the position is the step that the checkpoint holds.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from tflane_jax.datasets.base import Source
+from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
 
 
@@ -52,7 +52,7 @@ class Streamed:
         select: what to keep of an example, None is all of it.
     """
 
-    dataset: Source
+    dataset: IndexedExamples
     config: StreamingConfig = StreamingConfig()
     select: Callable[[Any], Any] | None = None
 

@@ -1,38 +1,36 @@
-"""TuSimple lane detection: label files and clips -> `RoadImage` (specs/data_formats.md section 5).
+"""TuSimple lane detection: label files and clips -> `RoadImage`.
 
-A label is one x for each of 48 or 56 image rows, -2 where the lane has none. Examples always have the 56 rows of the
-test set, 160, 170, ..., 710 of 720; rows that a file does not label are absent.
+A label file has one JSON record a line: `raw_file`, `h_samples` (48 or 56 image rows) and `lanes`, one x per row and
+lane, -2 where the lane has no point. Examples always have the 56 rows of the test set (`datasets.lane_rows`); rows
+that a file does not label are absent. Source: https://github.com/TuSimple/tusimple-benchmark.
 """
 
 from __future__ import annotations
 
 import os
-import warnings
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
 from tqdm import tqdm
 
-from tflane_jax.datasets.base import FrameInfo, TruncationWarning
+from tflane_jax.datasets.augmentation import AugmentationConfig
+from tflane_jax.datasets.base import SPLITS, FrameInfo, Split
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.lane_rows import LabelledImages, lane_lines
+from tflane_jax.datasets.photos import HEIGHT, WIDTH
 from tflane_jax.errors import UserError
-from tflane_jax.files.images import HEIGHT, WIDTH, read_image, resize
-from tflane_jax.metrics.tusimple import RowLanes
+from tflane_jax.files.images import read_image, resize
+from tflane_jax.files.tusimple import RowLanes, read_truth
 from tflane_jax.scene import LaneLines, RoadImage
-from tflane_jax.scoring.tusimple import read_truth
 
-ROWS = np.arange(160.0, 720.0, 10.0)
-"""Rows of the points of a line (56), pixels of an image `ROWS_HEIGHT` high."""
-ROWS_HEIGHT = 720
-_NO_POINT = -2.0
-
-Split = Literal["train", "val", "test", "all"]
+LabelSplit = Literal["train", "val", "test", "all"]
 
 _TRAIN, _VAL = ("label_data_0313.json", "label_data_0601.json"), ("label_data_0531.json",)
-_SPLIT_FILES: dict[Split, tuple[str, ...]] = {
+_SPLIT_FILES: dict[LabelSplit, tuple[str, ...]] = {
     "train": _TRAIN,
     "val": _VAL,
     "test": ("test_label.json",),
@@ -46,15 +44,15 @@ class TuSimpleConfig:
 
     Attributes:
         root: folder with the label files and `clips`.
-        split: LSTR's parts of the official training set, train (0313, 0601) and val (0531); test; all is the whole
-            training set, and any further `label_data_*.json`. Files that are not there are left out.
-        label_files: names under `root` that take the place of the split's; each must be there.
-        height, width: of the example's image, pixels.
-        capacity: lines in an example; where there are more, those with the fewest points are left out.
+        split: "train" (label files 0313, 0601) and "val" (0531) are LSTR's parts of the official training set; "test";
+            "all" is the whole training set and any further `label_data_*.json`. Missing files are left out.
+        label_files: file names under `root` to read instead of the split's files; each must exist.
+        height, width: size of an example's image, pixels.
+        capacity: lines in an example; of more, those with the fewest points are left out.
     """
 
     root: str = "data/tusimple/LaneDetection"
-    split: Split = "all"
+    split: LabelSplit = "all"
     label_files: tuple[str, ...] = ()
     height: int = HEIGHT
     width: int = WIDTH
@@ -66,11 +64,11 @@ class TuSimpleDataset:
 
     Attributes:
         name: for messages and run records.
-        label_files: that were found.
-        absent_files: of the split that were not.
+        label_files: label files that were found.
+        absent_files: names of the split's label files that are missing.
 
-    Raises UserError where no label file is found, one is malformed, labels no frame or one that another labels too, or
-    images are missing.
+    Raises UserError where no label file is found, a label file is malformed, two files label the same frame, no frame
+    is labelled, or images are missing.
     """
 
     def __init__(self, config: TuSimpleConfig) -> None:
@@ -100,7 +98,7 @@ class TuSimpleDataset:
         return len(self._labels)
 
     def summary(self) -> str:
-        """Return one line for people: frames, label files, and which of the split were not found."""
+        """Return one line of text: number of frames, label files found, label files missing."""
         found = ", ".join(file.name for file in self.label_files)
         absent = f"; not found: {', '.join(self.absent_files)}" if self.absent_files else ""
         return f"{self.name}: {len(self)} frames of {found}{absent}"
@@ -115,7 +113,7 @@ class TuSimpleDataset:
         return RoadImage(image, np.ones(image.shape[:2], bool), lines)
 
     def truth(self, index: int) -> RowLanes:
-        """Return the labels as the metric reads them: pixels of the original image, absent lanes included."""
+        """Return the labels for TuSimple's metric: pixels of the original image, lanes without a point included."""
         return self._labels[self._checked(index)][1]
 
     def raw_file(self, index: int) -> str:
@@ -123,7 +121,7 @@ class TuSimpleDataset:
         return self._labels[self._checked(index)][0]
 
     def info(self, index: int) -> FrameInfo:
-        """Return where one frame comes from; TuSimple gives neither its time nor its pose."""
+        """Return where one frame comes from; TuSimple gives neither time nor pose."""
         return FrameInfo("tusimple", self.raw_file(index), 0, np.eye(4))
 
     def _checked(self, index: int) -> int:
@@ -135,8 +133,8 @@ class TuSimpleDataset:
 def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers: int | None = None) -> RoadImage:
     """Read a whole dataset into memory, the examples stacked along a new first axis.
 
-    An image of 360 x 640 takes 0.7 MB, the 3,626 of the training set 2.5 GB; `image_valid` is a read-only view of one
-    value. `workers` threads decode, by default one for each core.
+    An image of 360 x 640 takes 0.7 MB; the 3,626 of the training set take 2.5 GB. `image_valid` is a read-only view
+    of one value. `workers` threads decode the images, by default one per core and at most 8.
     """
     count, config = len(dataset), dataset.config
     images = np.empty((count, config.height, config.width, 3), np.uint8)
@@ -158,50 +156,6 @@ def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers
     return RoadImage(images, np.broadcast_to(True, images.shape[:3]), stacked)
 
 
-def lane_lines(truth: RowLanes, height: int, width: int, *, capacity: int = 8) -> LaneLines:
-    """Return labels as lines with points on `ROWS`, from left to right by each line's first point.
-
-    Labels of other rows, or of images of another height, are interpolated between rows that are next to each other and
-    both labelled. Lanes without a point are no lines. Where there are more lines than `capacity`, those with the fewest
-    points are left out with a `TruncationWarning`.
-
-    Args:
-        truth: x in pixels.
-        height, width: of the image, pixels.
-        capacity: lines.
-    """
-    assert truth.rows is not None, "labels have rows"
-    x, valid = _at_rows(truth, ROWS * (height / ROWS_HEIGHT))
-    kept = np.flatnonzero(valid.any(1))
-    if len(kept) > capacity:
-        message = f"an image has {len(kept)} lines and room for {capacity}: raise `capacity`"
-        warnings.warn(message, TruncationWarning, stacklevel=2)
-        kept = kept[np.argsort(-valid[kept].sum(1), kind="stable")[:capacity]]
-    first = x[kept, valid[kept].argmax(1)]
-    kept = kept[np.argsort(first, kind="stable")]
-    lines = LaneLines.empty(capacity, len(ROWS))
-    n = len(kept)
-    lines.points[..., 1] = ROWS / ROWS_HEIGHT
-    lines.points[:n, :, 0] = np.where(valid[kept], x[kept] / width, 0.0)
-    lines.point_valid[:n] = valid[kept]
-    lines.valid[:n] = True
-    return lines
-
-
-def row_lanes(lines: LaneLines, height: float = ROWS_HEIGHT, width: float = 1280.0) -> RowLanes:
-    """Return lines whose point p stands at `ROWS[p]` as the metric reads them, pixels of an image of that size.
-
-    Points left of the image are absent, as the metric understands them. Raises ValueError where a point stands at
-    another row (of augmented lines, say).
-    """
-    points = np.asarray(lines.points, np.float64)[np.asarray(lines.valid)]
-    valid = np.asarray(lines.point_valid)[np.asarray(lines.valid)]
-    u, v = points[..., 0], points[..., 1]
-    if valid.shape[1] != len(ROWS) or (valid & ~(np.abs(v * ROWS_HEIGHT - ROWS) < 0.01)).any():
-        raise ValueError("the lines' points do not stand at TuSimple's rows: give lines that were not augmented")
-    return RowLanes(np.where(valid & (u >= 0.0), u * width, _NO_POINT), ROWS * (height / ROWS_HEIGHT))
-
-
 def _label_files(root: Path, config: TuSimpleConfig) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Return the files to read, and the names of those that are not there."""
     if not root.is_dir():
@@ -221,23 +175,65 @@ def _label_files(root: Path, config: TuSimpleConfig) -> tuple[tuple[Path, ...], 
     return found, absent
 
 
-def _at_rows(
-    truth: RowLanes, rows: Float[np.ndarray, " p"]
-) -> tuple[Float[np.ndarray, "l p"], Bool[np.ndarray, "l p"]]:
-    """Return x at other rows, and where there is one."""
-    assert truth.rows is not None
-    order = np.argsort(truth.rows, kind="stable")
-    labelled = np.asarray(truth.rows, np.float64)[order]
-    x = np.asarray(truth.x, np.float64)
-    if len(labelled) == 0 or len(x) == 0:
-        return np.zeros((len(x), len(rows))), np.zeros((len(x), len(rows)), bool)
-    x = x[:, order]
-    below = np.searchsorted(labelled, rows).clip(max=len(labelled) - 1)
-    above = np.maximum(below - 1, 0)
-    exact = labelled[below] == rows
-    between = (labelled[above] < rows) & (rows < labelled[below])
-    share = (rows - labelled[above]) / np.where(between, labelled[below] - labelled[above], 1.0)
-    mixed = (1.0 - share) * x[:, above] + share * x[:, below]
-    present = x >= 0.0
-    valid = present[:, below] & (exact | (between & present[:, above]))
-    return np.where(exact, x[:, below], mixed), valid
+@dataclass(frozen=True)
+class TuSimpleData:
+    """TuSimple for training, validation and test.
+
+    Attributes:
+        root: folder with clips and label files.
+        train, val, test: which label files each split reads, see `TuSimpleConfig.split`.
+        augmentation: of training images, or None.
+    """
+
+    root: Path
+    train: LabelSplit = "train"
+    val: LabelSplit = "val"
+    test: LabelSplit = "test"
+    augmentation: AugmentationConfig | None = AugmentationConfig()
+
+    def source(self, split: Split) -> TuSimpleConfig:
+        """Return the dataset of a split."""
+        return TuSimpleConfig(str(self.root), getattr(self, split))
+
+
+def _load(dataset: TuSimpleDataset, progress: bool, parts: Collection[str]) -> LabelledImages:
+    images = load_road_images(dataset, progress=progress)
+    return LabelledImages(images, tuple(dataset.truth(index) for index in range(len(dataset))))
+
+
+def _choose(choice: Choice) -> TuSimpleConfig:
+    """Return the official split of the named folder.
+
+    A configuration may read other label files as its "test" split, because its own folder has no better ones; that
+    mapping must not turn `--split test --root FOLDER` into an evaluation on the training frames of FOLDER.
+    """
+    assert choice.root is not None
+    return TuSimpleConfig(str(choice.root), choice.split)
+
+
+def check_tusimple(root: Path) -> FolderCheck:
+    """Count the labelled frames of each split; faults are missing label files, images and malformed records."""
+    rows, faults = [], []
+    for split in SPLITS:
+        try:
+            dataset = TuSimpleDataset(TuSimpleConfig(str(root), split))
+        except UserError as error:
+            faults.append(str(error))
+            continue
+        faults += [f"{root} lacks {name} of split {split}" for name in dataset.absent_files]
+        rows.append({"split": split, "frames": len(dataset), "label files": len(dataset.label_files)})
+    return FolderCheck("TuSimple", rows, faults)
+
+
+SOURCE = DataSource(
+    name="tusimple",
+    data=TuSimpleData,
+    config=TuSimpleConfig,
+    example=RoadImage,
+    dataset=TuSimpleDataset,
+    load=_load,
+    choose=_choose,
+    title=lambda config: f"tusimple-{config.split}",
+    root="the folder with clips and label files",
+    check=check_tusimple,
+)

@@ -1,37 +1,21 @@
-"""Photographs: finding, reading, resizing, and fitting one of any size and camera to what the network was trained on.
+"""Photographs as files: finding, reading, resizing.
 
-OpenCV (extra `images`) does the work and is imported at the first use: the published LSTR weights were trained on its
-decoding and its rounding, so that another library would give other pixels.
+OpenCV (extra `images`) does the work and is imported at the first use. The published LSTR weights were trained on its
+decoding and its rounding, so another library would give other pixels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import UInt8
 
 from tflane_jax.errors import UserError
 
-HEIGHT, WIDTH = 360, 640
-"""What the network sees, pixels (specs/modules.md section 2.1)."""
-
 PHOTO_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-
-# TuSimple's camera, as shares of its 1280 x 720 image. Horizon: median row in which the straight lines of a frame meet,
-# over the 574 of 2,858 label records with three or more of them (row 238.7; 90 % within 227 to 249).
-HORIZON = 0.331
-# Assumed, not measured: TuSimple gives no calibration of its lane images, flat straight lanes look the same through any
-# focal length, and the period of the dashed lines in the ten frames at hand was too faint to tell it. This is the
-# calibration of TuSimple's velocity benchmark as others quote it, 714 pixels of 1280.
-FOCAL = 714.15 / 1280
-
-# A focal length with which TuSimple's view would be a smaller share of a photo's width is in wrong units.
-_LEAST_SEEN = 0.1
 
 
 def opencv() -> ModuleType:
@@ -96,106 +80,3 @@ def resize(image: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[
     """
     cv2 = opencv()
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR)
-
-
-@dataclass(frozen=True)
-class PhotoCamera:
-    """What is known of the camera of a photo; None is unknown.
-
-    Attributes:
-        focal: focal length, pixels of this photo: its width times the focal length in millimetres over the sensor's
-            width (36 mm for a "35 mm equivalent").
-        horizon: row of the horizon, pixels.
-        column: column straight ahead, pixels; the middle one where it is not known.
-    """
-
-    focal: float | None = None
-    horizon: float | None = None
-    column: float | None = None
-
-
-@dataclass(frozen=True)
-class Placement:
-    """The part of a photo that the network sees, pixels.
-
-    Attributes:
-        left, top: its corner.
-        width, height: its size.
-    """
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    def to_photo(self, points: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
-        """Return points (u, v), shares of the network's image, as columns and rows of the photo."""
-        return np.asarray(points, np.float64) * (self.width, self.height) + (self.left, self.top)
-
-    def to_network(self, points: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
-        """Return columns and rows of the photo as shares (u, v) of the network's image."""
-        return (np.asarray(points, np.float64) - (self.left, self.top)) / (self.width, self.height)
-
-
-class FittedPhoto(NamedTuple):
-    """A photo as the network sees it: image, which of its pixels show the photo (all), and the way back."""
-
-    image: UInt8[np.ndarray, "360 640 3"]
-    image_valid: Bool[np.ndarray, "360 640"]
-    placement: Placement
-
-
-def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = None) -> FittedPhoto:
-    """Return what the network should see of a photo of any size.
-
-    Without a camera the whole photo is stretched to the network's size, as by the reference. What is known of the
-    camera removes what TuSimple's would not have seen: a horizon cuts rows off the top until it lies where TuSimple's
-    does; a focal length shorter than TuSimple's cuts the sides and, with a horizon, the bottom.
-
-    Nothing is padded and the aspect is not kept. With the published LSTR weights on TuSimple frames cut to other shapes
-    (ten frames, all seen in training), padding and cutting to 16:9 did worse than stretching in most shapes (1280 x 540
-    from the top: accuracy 0.71 padded, 0.90 with the sides cut, 0.93 stretched), and cutting above a known horizon did
-    better than not in 8 of 9 (880 x 500: 0.97 against 0.92). A short focal length could not be tried in this way.
-
-    Reductions to less than half are averaged over areas, because thin lane paint would otherwise fall between pixels.
-
-    Raises UserError for a photo without pixels, or camera numbers that cannot be pixels of this photo.
-    """
-    height, width = image.shape[:2]
-    if not height or not width:
-        raise UserError(f"a photo of {width} x {height} pixels shows nothing: give another")
-    seen = _seen(height, width, camera or PhotoCamera())
-    part = image[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
-    if seen.width > 2 * WIDTH or seen.height > 2 * HEIGHT:
-        cv2 = opencv()
-        fitted = cv2.resize(part, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
-    else:
-        fitted = resize(part, HEIGHT, WIDTH)
-    return FittedPhoto(fitted, np.ones((HEIGHT, WIDTH), bool), seen)
-
-
-def _seen(height: int, width: int, camera: PhotoCamera) -> Placement:
-    """Return the part of a photo that TuSimple's camera would have seen, as far as that is known."""
-    columns, ahead = float(width), width / 2 if camera.column is None else camera.column
-    if not 0.0 <= ahead <= width:
-        raise UserError(f"the column straight ahead, {ahead:g}, is outside a photo {width} pixels wide")
-    if camera.focal is not None:
-        columns = camera.focal / FOCAL
-        if not columns >= _LEAST_SEEN * width:
-            raise UserError(
-                f"a focal length of {camera.focal:g} pixels is too short for a photo {width} pixels wide: give "
-                f"{width} x focal length / sensor width (36 mm for 35 mm equivalents)"
-            )
-    across = max(round(min(columns, width)), 1)
-    left = round(min(max(ahead - across / 2, 0), width - across))
-
-    top, bottom = 0, height
-    if camera.horizon is not None:
-        if not camera.horizon < height:
-            raise UserError(f"the horizon, row {camera.horizon:g}, is below a photo {height} pixels high")
-        if camera.focal is not None:
-            below = (1.0 - HORIZON) * columns * HEIGHT / WIDTH  # rows that TuSimple's camera sees under its horizon
-            bottom = round(min(max(camera.horizon + below, 1), height))
-        top = round(max(camera.horizon - HORIZON / (1.0 - HORIZON) * (bottom - camera.horizon), 0))
-        top = min(top, bottom - 1)
-    return Placement(left, top, across, bottom - top)

@@ -1,9 +1,11 @@
-"""Bird's-eye-view features of the previous frame seen from the current one (specs/modules.md section 4).
+"""Alignment of the previous frame's bird's-eye-view features with the current frame (BEVFormer, Li et al. 2022).
 
 Grids are those of `geometry.BevGrid`: rows along y, columns along x, both from the least coordinate.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,7 +19,7 @@ from tflane_jax.layers.sampling import sample_bilinear
 def warp(
     features: Float[Array, "h w c"], grid: BevGrid, previous_from_ego: Float[Array, "4 4"]
 ) -> Float[Array, "h w c"]:
-    """Return the previous features at the places of the current cells: bilinear, zero where there were none."""
+    """Return the previous features sampled at the current cells: bilinear, zero outside the previous grid."""
     h, w, c = features.shape
     cells = jnp.asarray(grid.range.denormalise(cell_points(grid)))
     ground = jnp.concatenate([cells, jnp.zeros_like(cells[:, :1])], -1)
@@ -28,12 +30,12 @@ def warp(
 def rotate_nearest(
     features: Float[Array, "h w c"], yaw: Float[Array, ""], center: tuple[float, float]
 ) -> Float[Array, "h w c"]:
-    """Return features turned about a point: each cell takes the nearest one, zero where there is none.
+    """Return features rotated about a point, nearest sampling, zero outside (torchvision's `rotate`).
 
     Args:
         features: of the previous frame.
-        yaw: how far the vehicle has turned since, radians.
-        center: (column, row) that stays, in cells from the outer corner of the grid (torchvision's `rotate`).
+        yaw: change of the vehicle's heading since then, radians.
+        center: (column, row) of the fixed point, in cells from the outer corner of the grid.
     """
     h, w, c = features.shape
     size, middle = jnp.array([w, h], jnp.float32), jnp.array(center, jnp.float32)
@@ -57,11 +59,21 @@ def vehicle_center(grid: BevGrid) -> tuple[float, float]:
     return -x / width * grid.columns, -y / height * grid.rows
 
 
-def ego_shift(grid: BevGrid, previous_from_ego: Float[Array, "4 4"]) -> Float[Array, "2"]:
-    """Return how far the vehicle has moved since the previous frame, along its present axes, as shares of the range.
+def ego_shift(
+    grid: BevGrid, previous_from_ego: Float[Array, "4 4"], axes: Literal["ego", "lidar"] = "ego"
+) -> Float[Array, "2"]:
+    """Return the vehicle's motion since the previous frame, along its present axes, as fractions of the range.
 
-    A cell of the present grid, moved by this, lies at its own place in the previous features turned to the present
-    heading.
+    A cell of the present grid, moved by this, lies at its own place in the previous features after those have been
+    rotated to the present heading.
+
+    Args:
+        grid: cells and range.
+        previous_from_ego: pose of the present ego frame in the previous one.
+        axes: of the grid. "ego": x forward, y left, as everywhere in this library and in TopoNet. "lidar": x right, y
+            forward, the axes of nuScenes' lidar, for which BEVFormer derived its shift.
     """
     moved = previous_from_ego[:2, :2].T @ previous_from_ego[:2, 3]
+    if axes == "lidar":
+        moved = jnp.stack([-moved[1], moved[0]])
     return moved / jnp.array(grid.range.size(2), moved.dtype)

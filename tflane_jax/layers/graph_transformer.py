@@ -1,8 +1,9 @@
 """Graph Transformer Networks: soft selection of edge types, and graph convolution on the meta-paths they form.
 
-Yun et al. 2019 (GTN), its sparse revision and FastGTN (both 2022) as options of the same functions; shared
-specs/modules.md section 10, GTN lane paper section 2.1. A stack of adjacency matrices (e, n, n) holds one edge type
-each. An edge points from a sender to a receiver: `receivers` says which of the two the rows are.
+Graph Transformer Networks (Yun et al. 2019), their sparse revision and FastGTN (Yun et al. 2022) are options of the
+same functions; equation numbers are those of the GTN lane paper, section 2.1. A stack of adjacency matrices (e, n, n)
+holds one edge type per matrix. An edge points from a source to a destination node: `receivers` says whether rows or
+columns are the destinations.
 """
 
 from __future__ import annotations
@@ -13,7 +14,10 @@ from typing import Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
+
+from tflane_jax.layers.graph import Mlp
 
 Receivers = Literal["rows", "columns"]
 Loops = Literal["kept", "removed", "lonely"]
@@ -23,14 +27,15 @@ _selection_init = nn.initializers.normal(0.01)
 
 @dataclass(frozen=True)
 class GtnVariant:
-    """What the published versions of the dense network do differently.
+    """Differences between the published versions of the dense network.
 
     Attributes:
-        receivers: the axis of an adjacency that hears; its weights sum to 1 after normalisation.
-        loops: edges from a node to itself in a meta-path graph: `kept` or `removed` before normalisation.
-        normalise_last: normalise behind the last layer too, not only between layers.
-        own: weight of a node's own features in the convolution, instead of removed loops or added to kept ones.
-        bias: the convolution has one.
+        receivers: axis of the destination nodes; the edges into each of them sum to 1 after normalisation.
+        loops: self-loops of a meta-path graph: `kept` or `removed` before normalisation.
+        normalise_last: normalise after the last layer too, not only between layers.
+        own: weight of the identity that the convolution adds: it replaces removed loops, and adds to kept ones. The
+            sparse revision's `remove_self_loops` is 0, which leaves the loops of meta-paths as they are.
+        bias: the convolution has a bias.
     """
 
     receivers: Receivers = "rows"
@@ -59,7 +64,8 @@ def normalise(
     Args:
         graphs: non-negative.
         receivers: see `GtnVariant`.
-        loops: `kept`, `removed`, or `lonely`: added where a node has no edge into it, the limit of FastGTN's 1e-20 I.
+        loops: `kept`, `removed`, or `lonely`: a self-loop for each node without incoming edges, which is the limit of
+            FastGTN's 1e-20 I.
     """
     axis = -1 if receivers == "rows" else -2
     if loops == "removed":
@@ -75,7 +81,7 @@ def meta_path_graphs(
 ) -> Float[Array, "c n n"]:
     """Return the graphs of meta-paths of length k: Q_1 Q_2 Q_3 ..., normalised between the layers.
 
-    The first layer multiplies two selections, every further layer what it gets and one more.
+    The first layer multiplies two selections; each further layer multiplies its input with one more.
     """
     graphs, *others = (select(adjacency, w) for w in weights)
     for i, selection in enumerate(others):
@@ -100,16 +106,15 @@ def propagate(
     weights: Float[Array, "hops c e"],
     x: Float[Array, "*n d"],
 ) -> Float[Array, "*n d"]:
-    """Return ... Q_2 (Q_1 x): the mixtures of Eq. (1) one after the other, without a product of adjacencies.
+    """Return ... Q_2 (Q_1 x): the mixtures of Eq. (1) applied in turn, without a product of adjacencies.
 
-    By associativity this is convolution on the meta-path graph ... Q_2 Q_1 (FastGTN). Where the edges into every node
-    sum to 1 in each edge type, they do so in the product, which needs no normalisation.
+    By associativity this is convolution on the meta-path graph ... Q_2 Q_1 (FastGTN). If the edges into every node sum
+    to 1 in each edge type, they sum to 1 in the product too, which then needs no normalisation.
 
     Args:
-        mix: returns sum_e share_e A_e x of a hop, from its number, the shares and x; how the A_e are stored is its
-            affair.
-        weights: W of Eq. (1) by hop; -inf for an edge type that a hop may not choose.
-        x: the channels' features side by side, d a multiple of c.
+        mix: maps (hop, edge-type weights, x) to sum_e weight_e A_e x; it decides how the A_e are stored.
+        weights: W of Eq. (1) by hop; -inf excludes an edge type from a hop.
+        x: features of the channels side by side, d a multiple of c.
     """
     shares = jnp.repeat(nn.softmax(weights, -1), x.shape[-1] // weights.shape[1], axis=1).swapaxes(1, 2)
     for hop, of_hop in enumerate(shares):
@@ -124,7 +129,7 @@ class GraphTransformer(nn.Module):
         dim: features out of each channel.
         channels: meta-path graphs.
         layers: products of adjacencies; paths are one edge longer.
-        variant: which published version.
+        variant: the published version.
     """
 
     dim: int
@@ -134,7 +139,7 @@ class GraphTransformer(nn.Module):
 
     @nn.compact
     def __call__(self, adjacency: Float[Array, "e n n"], x: Float[Array, "n d"]) -> Float[Array, "n f"]:
-        """Return the channels' node features side by side, f = channels * dim."""
+        """Return the node features of all channels side by side, f = channels * dim."""
         weights = self.param("selection", _selection_init, (self.layers + 1, self.channels, adjacency.shape[0]))
         graphs = meta_path_graphs(adjacency, weights, self.variant)
         out = convolve(graphs, nn.Dense(self.dim, use_bias=False, name="convolution")(x), self.variant)
@@ -144,14 +149,16 @@ class GraphTransformer(nn.Module):
 
 
 class FastGraphTransformer(nn.Module):
-    """One block of FastGTN: each channel projects the features and sends them along its own soft meta-path.
+    """One block of FastGTN: each channel projects the features and propagates them along its own soft meta-path.
 
     Attributes:
         dim: features out.
         channels: meta-paths.
         hops: edges of a meta-path.
-        beta: share of the projected features themselves.
+        beta: weight of the projected features themselves; the propagated ones have 1 - beta.
         aggregate: `mean` over the channels, or `concat` and a linear layer with ReLU.
+        non_local: incoming edges of each node in FastGTN's non-local graph, which every hop derives from its input and
+            mixes in as a last edge type; None for no such graph.
     """
 
     dim: int
@@ -159,17 +166,48 @@ class FastGraphTransformer(nn.Module):
     hops: int = 2
     beta: float = 0.0
     aggregate: Literal["mean", "concat"] = "mean"
+    non_local: int | None = None
 
     @nn.compact
     def __call__(self, adjacency: Float[Array, "e n n"], x: Float[Array, "n d"]) -> Float[Array, "n f"]:
         """Return the node features, f = dim; `adjacency` has receivers as rows, which sum to 1."""
-        weights = self.param("selection", _selection_init, (self.hops, self.channels, adjacency.shape[0]))
+        types = adjacency.shape[0] + (self.non_local is not None)
+        weights = self.param("selection", _selection_init, (self.hops, self.channels, types))
         projected = nn.Dense(self.channels * self.dim, use_bias=False, name="projection")(x)
-        heard = propagate(lambda _, shares, h: (shares[:, None] * (adjacency @ h)).sum(0), weights, projected)
-        out = nn.relu(self.beta * projected + (1.0 - self.beta) * heard)
+
+        def mix(hop, by_type, h):
+            graphs = adjacency
+            if self.non_local is not None:
+                mean = h.reshape(x.shape[0], self.channels, self.dim).mean(1)
+                similar = NonLocalGraph(self.non_local, name=f"non_local_{hop}")(mean)
+                graphs = jnp.concatenate([adjacency, similar[None]])
+            return (by_type[:, None] * (graphs @ h)).sum(0)
+
+        propagated = propagate(mix, weights, projected)
+        out = nn.relu(self.beta * projected + (1.0 - self.beta) * propagated)
         if self.aggregate == "mean":
             return out.reshape(x.shape[0], self.channels, self.dim).mean(1)
         return nn.relu(nn.Dense(self.dim, name="joined")(out))
+
+
+class NonLocalGraph(nn.Module):
+    """FastGTN's non-local graph: edges into each node from the nodes whose features are most similar.
+
+    Attributes:
+        nearest: edges into each node; all nodes where there are no more.
+        widths: channels of the MLP that features pass before they are compared.
+    """
+
+    nearest: int
+    widths: tuple[int, ...] = (128, 64)
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "n d"]) -> Float[Array, "n n"]:
+        """Return the adjacency, destinations as rows: a softmax over the largest inner products of each row."""
+        features = nn.relu(Mlp(self.widths, name="features")(x))
+        similarity, source = lax.top_k(features @ features.T, min(self.nearest, x.shape[0]))
+        destination = jnp.arange(x.shape[0])[:, None]
+        return jnp.zeros((x.shape[0], x.shape[0]), x.dtype).at[destination, source].set(nn.softmax(similarity, -1))
 
 
 def _identity(graphs: Float[Array, "c n n"]) -> Float[Array, "1 n n"]:

@@ -1,14 +1,17 @@
-"""Transformer encoder and decoder layers of DETR (Carion et al. 2020; specs/modules.md sections 2.4 and 12).
+"""Transformer encoder and decoder layers of DETR (Carion et al. 2020).
 
-Positions are added to queries and keys, never to values. With positions of zero these are PyTorch's layers.
+Positions are added to queries and keys, never to values. With positions of zero these are PyTorch's
+`TransformerEncoderLayer` and `TransformerDecoderLayer`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import flax.linen as nn
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from tflane_jax.layers.attention import Mask, MultiHeadAttention
 
@@ -19,19 +22,24 @@ class TransformerConfig:
 
     Attributes:
         heads: of every attention.
-        hidden: channels inside the feed-forward part.
-        dropout: of attention weights, hidden channels and everything that is added to a residual.
-        norm_first: normalise the input of every part instead of the sum behind it.
+        hidden: hidden channels of the feed-forward network.
+        dropout: probability for attention weights, hidden channels and each residual branch.
+        norm_first: pre-norm (normalise the input of each residual branch) instead of post-norm (normalise the sum).
+        activation: of the hidden channels; "gelu" is the exact one, with the error function, as in PyTorch.
     """
 
     heads: int = 2
     hidden: int = 128
     dropout: float = 0.1
     norm_first: bool = False
+    activation: Literal["relu", "gelu"] = "relu"
+
+
+_ACTIVATIONS = {"relu": nn.relu, "gelu": partial(nn.gelu, approximate=False)}
 
 
 class Residual(nn.Module):
-    """x plus what a part of the layer makes of it, normalised before or after.
+    """Residual connection, pre- or post-norm.
 
     Attributes:
         config: sizes.
@@ -41,7 +49,7 @@ class Residual(nn.Module):
 
     @nn.compact
     def __call__(self, x, part, *, deterministic: bool):
-        """Return the sum; `part` is a function of the (perhaps normalised) features."""
+        """Return x + part(x); `part` maps the features, normalised first where the layer is pre-norm, to a change."""
         norm = nn.LayerNorm(epsilon=1e-5, name="norm")
         change = part(norm(x) if self.config.norm_first else x)
         change = nn.Dropout(self.config.dropout, name="dropout")(change, deterministic=deterministic)
@@ -49,7 +57,7 @@ class Residual(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """Linear, ReLU, linear.
+    """Linear layer, activation, linear layer.
 
     Attributes:
         config: sizes.
@@ -59,14 +67,14 @@ class FeedForward(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "n c"], *, deterministic: bool) -> Float[Array, "n c"]:
-        """Return what is added to x."""
-        hidden = nn.relu(nn.Dense(self.config.hidden, name="expand")(x))
+        """Return the change of x, without the residual."""
+        hidden = _ACTIVATIONS[self.config.activation](nn.Dense(self.config.hidden, name="expand")(x))
         hidden = nn.Dropout(self.config.dropout, name="dropout")(hidden, deterministic=deterministic)
         return nn.Dense(x.shape[-1], name="contract")(hidden)
 
 
 class EncoderLayer(nn.Module):
-    """Self-attention and a feed-forward part.
+    """Self-attention, then a feed-forward network.
 
     Attributes:
         config: sizes.
@@ -98,7 +106,7 @@ class EncoderLayer(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Self-attention among queries, cross-attention to the memory, and a feed-forward part.
+    """Self-attention among queries, cross-attention to the memory, then a feed-forward network.
 
     Attributes:
         config: sizes.
@@ -114,17 +122,17 @@ class DecoderLayer(nn.Module):
         query_position: Float[Array, "q c"],
         memory_position: Float[Array, "n c"],
         mask: Mask | None = None,
-        memory_mask: Bool[Array, "#q n"] | None = None,
+        memory_mask: Mask | None = None,
         *,
         deterministic: bool = True,
     ) -> Float[Array, "q c"]:
         """Return the queries after the layer.
 
         Args:
-            x, query_position: queries and what is added to them where they attend.
-            memory, memory_position: tokens of the encoder, likewise.
+            x, query_position: queries, and position encodings added to them in both attentions.
+            memory, memory_position: output of the encoder, and position encodings added to its keys.
             mask: which query may attend to which query.
-            memory_mask: which query may attend to which token; one row serves all.
+            memory_mask: which query may attend to which token; a single row holds for all queries.
             deterministic: no dropout.
         """
         config = self.config

@@ -1,1 +1,1 @@
-"""Losses on matched pairs. Elementwise where possible; who calls them reduces."""
+"""Losses on matched pairs: a file for each host, terms that hosts share, auxiliary losses."""

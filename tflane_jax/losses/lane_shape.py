@@ -1,4 +1,4 @@
-"""Hungarian fitting loss of lane curves: GTN paper Eq. (3), (4), weighed as in LSTR (specs/modules.md section 2.7)."""
+"""Hungarian fitting loss of lane curves: GTN paper Eq. (3), (4), weighed as in LSTR (Liu et al. 2021)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.losses.common import Report
 from tflane_jax.matching import Assignment, match
-from tflane_jax.scene import LaneLines, LaneShapePrediction
+from tflane_jax.models.auxiliary import AuxiliaryOutputs
+from tflane_jax.models.lstr import LstrConfig
+from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,30 @@ class LaneShapeLossConfig:
     shared_horizon: bool = True
     least_depth: float = 1e-6
     matcher: Literal["scipy", "jax"] = "scipy"
+
+    def loss(
+        self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: RoadImage, host: LstrConfig
+    ) -> tuple[Float[Array, ""], Report]:
+        """Return the loss of a batch and what is recorded of it.
+
+        Args:
+            outputs: curves of every decoder layer, leading axes (batch, layer).
+            auxiliary: auxiliary outputs, leading axis batch.
+            batch: images with their lane lines, leading axis batch.
+            host: the network's configuration.
+
+        Raises:
+            ValueError: a prediction without curves.
+        """
+        if outputs.curves is None:
+            raise ValueError("a lane-shape loss needs predicted curves")
+        targets = lane_shape_targets(batch.lines, shared_horizon=self.shared_horizon)
+        loss, terms = lane_shape_loss(outputs.curves, targets, self)
+        for name in host.auxiliary:
+            cells = getattr(auxiliary, name)
+            terms["cells"] = self.cell_weight * jax.vmap(cell_loss)(cells, targets).mean()
+            loss += terms["cells"]
+        return loss, terms
 
 
 @struct.dataclass
@@ -105,7 +132,7 @@ def cell_loss(logits: Float[Array, "h w"], targets: LaneShapeTargets) -> Float[A
 
 
 def matching_cost(
-    prediction: LaneShapePrediction,
+    prediction: CurvePrediction,
     targets: LaneShapeTargets,
     weights: Float[Array, " l"],
     config: LaneShapeLossConfig,
@@ -118,7 +145,7 @@ def matching_cost(
 
 
 def lane_shape_loss(
-    prediction: LaneShapePrediction, targets: LaneShapeTargets, config: LaneShapeLossConfig
+    prediction: CurvePrediction, targets: LaneShapeTargets, config: LaneShapeLossConfig
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Return the loss of a batch, Eq. (4) summed over decoder layers, and its terms.
 
@@ -152,7 +179,7 @@ def lane_shape_loss(
 
 
 def _terms(
-    prediction: LaneShapePrediction,
+    prediction: CurvePrediction,
     assignment: Assignment,
     weights: Float[Array, " l"],
     targets: LaneShapeTargets,

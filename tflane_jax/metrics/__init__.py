@@ -1,13 +1,12 @@
 """Official lane metrics, re-implemented, with the version of the protocol in their name."""
 
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.frames import (
     ElementDetections,
     ElementTruth,
     LaneDetections,
     LaneTruth,
-    detections_from_prediction,
-    truth_from_example,
 )
 from tflane_jax.metrics.lane_segment import (
     AreaDetections,
@@ -17,7 +16,7 @@ from tflane_jax.metrics.lane_segment import (
     SegmentTruth,
 )
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
-from tflane_jax.metrics.tusimple import RowLanes, TuSimpleMetrics
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.metrics.vector_map import MapDetections, MapTruth, VectorMapMetrics
 
 __all__ = [
@@ -38,6 +37,4 @@ __all__ = [
     "SegmentTruth",
     "TuSimpleMetrics",
     "VectorMapMetrics",
-    "detections_from_prediction",
-    "truth_from_example",
 ]

@@ -1,7 +1,7 @@
 """What the lane metrics compare in one frame: truth and detections of lanes, their topology and traffic elements.
 
-Plain numpy and ragged, so that predictions of any framework fit in; two adapters lead here from the containers of
-`tflane_jax.scene`.
+Plain numpy arrays and ragged lists, so that predictions of any framework fit in. `tflane_jax.evaluation` makes them
+from the containers of `tflane_jax.scene`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import expit
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.distances import pad_lines
-from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
 
 Lines = Sequence[Float[np.ndarray, "_ d"]] | Float[np.ndarray, "l n d"]
 
@@ -59,7 +57,7 @@ class LaneTruth:
     Attributes:
         points: G polylines (n, 3) in driving direction, metres, ego frame; each may have its own n >= 1.
         successor: (G, G) [i, j] lane j continues lane i.
-        visibility: (G,) share of the lane in direct line of sight, 0 to 1; None where it is not known.
+        visibility: (G,) fraction of the lane in direct line of sight, 0 to 1; None where it is not known.
         elements: traffic elements; None where the task has none.
     """
 
@@ -84,53 +82,6 @@ class LaneDetections:
     scores: Float[np.ndarray, " p"]
     successor: Float[np.ndarray, "p p"]
     elements: ElementDetections | None = None
-
-
-def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None) -> LaneTruth:
-    """Return the valid lanes (and traffic elements) of one example."""
-    keep = np.flatnonzero(np.asarray(lanes.valid))
-    truth = None
-    if elements is not None:
-        shown = np.flatnonzero(np.asarray(elements.valid))
-        truth = ElementTruth(
-            boxes=np.asarray(elements.box)[shown],
-            attributes=np.asarray(elements.attribute)[shown],
-            lane=np.asarray(elements.lane)[np.ix_(keep, shown)],
-        )
-    return LaneTruth(
-        points=np.asarray(lanes.points)[keep],
-        successor=np.asarray(lanes.successor)[np.ix_(keep, keep)],
-        visibility=np.asarray(lanes.visibility)[keep],
-        elements=truth,
-    )
-
-
-def detections_from_prediction(prediction: LanePrediction, elements: ElementPrediction | None = None) -> LaneDetections:
-    """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
-
-    No score threshold; a traffic element is of the attribute that its query finds likeliest.
-    """
-    scores = expit(np.asarray(prediction.logits)).max(-1)
-    order = np.argsort(-scores, kind="stable")
-    return LaneDetections(
-        points=np.asarray(prediction.points)[order],
-        scores=scores[order],
-        successor=expit(np.asarray(prediction.successor_logits)[np.ix_(order, order)]),
-        elements=None if elements is None else _element_detections(elements, order),
-    )
-
-
-def _element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"]) -> ElementDetections:
-    """Return the elements, best score first, with the lanes in the given order."""
-    confidence = expit(np.asarray(elements.logits))
-    scores = confidence.max(-1)
-    order = np.argsort(-scores, kind="stable")
-    return ElementDetections(
-        boxes=np.asarray(elements.box)[order],
-        attributes=confidence.argmax(-1)[order],
-        scores=scores[order],
-        lane=expit(np.asarray(elements.lane_logits)[np.ix_(lanes, order)]),
-    )
 
 
 def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "l n d"]:

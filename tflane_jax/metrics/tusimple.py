@@ -7,34 +7,19 @@ six or more lanes the accuracy can exceed 1. All of them are kept.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.tusimple import RowLanes
 
 PIXEL_THRESHOLD = 20.0  # across the lane
 MATCHED = 0.85  # least share of rows
 OFFICIAL_TIME_LIMIT, LSTR_TIME_LIMIT = 200.0, 20_000.0  # milliseconds
 _ABSENT = -100.0
 _LANES = 4  # the benchmark is about the ego lane's and its neighbours' lines
-
-
-@dataclass(frozen=True)
-class RowLanes:
-    """Lanes of one image, as x at fixed rows.
-
-    Attributes:
-        x: (L, H) pixels; negative where a lane has no point in a row.
-        rows: (H,) the image rows, pixels (`h_samples`); None for predictions, which use those of the truth.
-        run_time: milliseconds that a prediction took.
-    """
-
-    x: Float[np.ndarray, "l h"]
-    rows: Float[np.ndarray, " h"] | None = None
-    run_time: float = 0.0
 
 
 class TuSimpleMetrics:

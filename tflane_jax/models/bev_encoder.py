@@ -1,8 +1,11 @@
-"""The layers of BEVFormer's encoder, and the sizes of the whole (Li et al. 2022; specs/modules.md section 4).
+"""The layers of BEVFormer's encoder, and the sizes of the whole (Li et al. 2022).
 
-Where the published code departs from the paper, an option reproduces it: `align="reference"` turns the previous
-features with nearest sampling about `rotation_center` and moves the points looked at; `temporal_value="initial"` lets
-every layer look at the queries as they were before the first layer; `value_projections=2` projects them twice.
+Where the published code departs from the paper, an option reproduces it. `align="reference"` (TopoNet, LaneSegNet)
+rotates the previous features with nearest sampling about `rotation_center`, and shifts the reference points by the
+vehicle's motion. `align="bevformer"` (BEVFormer, MapTR, OpenLane-V2's baseline, SMERF) does the same with a shift along
+the axes of nuScenes' lidar; on a grid with x forward, such as OpenLane-V2's, that moves the points sideways.
+`temporal_value="initial"` gives every layer the queries before the first layer as the present frame;
+`value_projections=2` (OpenLane-V2's baseline, SMERF) projects them twice.
 """
 
 from __future__ import annotations
@@ -21,11 +24,7 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
-
-# What priors add to the BEV features of a layer: (number of the layer, places (q, 2) of the cells in [0, 1], features
-# (q, c), their position encodings (q, c)) -> features.
-# Modules that it uses are made inside it, so that their parameters stand below the layer that calls it.
-Fuse = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
+from tflane_jax.models.prior import BevHook
 
 
 @dataclass(frozen=True)
@@ -47,12 +46,12 @@ class BevFormerConfig:
         capacity: queries that one camera can serve, None for all (see `layers.bev_attention`); `check_capacity` tells
             whether it suffices.
         align: how the previous features come into the present frame, see the top of this file.
-        rotation_center: (column, row) for "reference", in cells from the grid's corner; None is the vehicle. TopoNet
-            has (50, 100) on its 200 x 100 cells, which is not.
-        temporal_value: the queries that temporal attention looks at.
-        value_projections: of temporal attention.
-        remat: compute each layer anew for the gradient instead of keeping what lies in between.
-        precision: of the projections; parameters, places and results are float32.
+        rotation_center: (column, row) of the rotation where `align` is not "warp", in cells from the grid's corner;
+            None is the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
+        temporal_value: the present frame's value in temporal attention, see the top of this file.
+        value_projections: how often temporal attention projects its value.
+        remat: recompute each layer's activations for the gradient instead of keeping them.
+        precision: of the projections; parameters, sampling locations and results are float32.
     """
 
     grid: BevGrid = BevGrid()
@@ -67,7 +66,7 @@ class BevFormerConfig:
     levels: int = 4
     cameras: int = 7
     capacity: int | None = None
-    align: Literal["warp", "reference"] = "warp"
+    align: Literal["warp", "reference", "bevformer"] = "warp"
     rotation_center: tuple[float, float] | None = None
     temporal_value: Literal["running", "initial"] = "running"
     value_projections: int = 1
@@ -121,7 +120,7 @@ class BevEncoder(nn.Module):
         history: BevMemory,
         shift: Float[Array, "2"],
         deterministic: bool,
-        fuse: Fuse | None = None,
+        fuse: BevHook | None = None,
     ) -> Float[Array, "q c"]:
         """Return the encoded queries; see `BevFormer.encode` and the attentions for the arguments."""
         config, initial = self.config, queries

@@ -1,7 +1,7 @@
 """BEVFormer: from feature maps of several cameras, and the previous frame's result, to bird's-eye-view features.
 
-Reference: Li et al. 2022; specs/modules.md section 4 (the BEV constructer of TopoNet). One frame is a module, time an
-explicit carry: `encode_sequence` scans over the frames, `step` makes one of them, with equal results.
+Reference: Li et al. 2022; the published version is TopoNet's "BEV constructer". A module encodes one frame, and time is
+an explicit carry: `encode_sequence` scans over the frames, and `step` encodes one of them, with equal results.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from tflane_jax.geometry.pillars import pillar_points, project_pillars
 from tflane_jax.geometry.poses import pose_yaw
 from tflane_jax.layers.bev_alignment import ego_shift, rotate_nearest, vehicle_center, warp
 from tflane_jax.layers.positions import LearnedImageEncoding
-from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory, Fuse
+from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory
+from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import CameraViews
 
 # Length of the reference's vector of vehicle motion (the "CAN bus").
@@ -42,7 +43,7 @@ class BevFormer(nn.Module):
         previous_from_ego: Float[Array, "4 4"],
         *,
         deterministic: bool = True,
-        fuse: Fuse | None = None,
+        fuse: BevHook | None = None,
     ) -> Float[Array, "h w c"]:
         """Return the BEV features.
 
@@ -73,7 +74,7 @@ class BevFormer(nn.Module):
         motion: Float[Array, " m"],
         *,
         deterministic: bool = True,
-        fuse: Fuse | None = None,
+        fuse: BevHook | None = None,
     ) -> Float[Array, "h w c"]:
         """Return the BEV features from a memory that has been aligned (`align`) and a vector of vehicle motion."""
         config, grid = self.config, self.config.grid
@@ -162,7 +163,8 @@ def align(
         return BevMemory(moved, memory.valid), jnp.zeros(2, moved.dtype)
     center = config.rotation_center or vehicle_center(config.grid)
     turned = rotate_nearest(memory.features, pose_yaw(previous_from_ego), center)
-    return BevMemory(turned, memory.valid), ego_shift(config.grid, previous_from_ego)
+    axes = "lidar" if config.align == "bevformer" else "ego"
+    return BevMemory(turned, memory.valid), ego_shift(config.grid, previous_from_ego, axes)
 
 
 def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]) -> Float[Array, " m"]:

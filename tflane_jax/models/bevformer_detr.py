@@ -1,6 +1,6 @@
 """BEVFormer-DETR, OpenLane-V2's large baseline: lanes and traffic elements found alone, related afterwards.
 
-Reference: specs/modules.md section 9. Next to TopoNet there is no graph in the decoder: plain feed-forward parts, and
+Unlike TopoNet, there is no graph in the decoder: plain feed-forward parts, and
 relationship heads on the queries of the last layers only. A lane is 11 points or a Bezier curve.
 """
 
@@ -14,52 +14,47 @@ from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_basis
-from tflane_jax.models.camera_encoder import (
-    PAPER_CAMERA_ENCODER,
-    CameraEncoderConfig,
-    check_elements,
-)
-from tflane_jax.models.element_decoder import (
-    PAPER_ELEMENT_DECODER,
-    ElementDecoderConfig,
-    ElementOutput,
-)
+from tflane_jax.models.auxiliary import AuxiliaryName
+from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
+from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
+from tflane_jax.models.encoders import check_elements
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.host import Host, decode_lanes
-from tflane_jax.models.lane_decoder import (
-    LaneDecoderLayer,
-    LaneHeads,
-    make_prediction,
-)
-from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.host import Host, HostConfig
+from tflane_jax.models.lane_decoder import LaneDecoderLayer, LaneHeads, make_prediction
+from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
-from tflane_jax.models.marker_fusion import MarkerFusionConfig
-from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
+from tflane_jax.models.prior import HostQueries
+from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.scene import LaneGraph, Prediction
 
 
-@dataclass(frozen=True)
-class BevFormerDetrConfig:
+@dataclass(frozen=True, kw_only=True)
+class BevFormerDetrConfig(HostConfig):
     """The model.
 
     Attributes:
-        encoder: BEV features from cameras or from BEV evidence.
         decoder: lane decoder; references never move (`refine="fixed"`).
-        elements: traffic elements in the front view, or None. They need cameras, and as many layers as the decoder.
         control_points: a lane is a Bezier curve of so many control points, read at `decoder.points` points; None: a
-            lane is its points. Goes with the loss's setting of the same name.
-        markers: fiducial markers in the BEV encoder, or None.
-        sd_map: an SD map in the BEV encoder (SMERF), or None.
+            lane is its points. The loss compares what is predicted.
         denoising: noised lanes to train the decoder with, or None as in the baseline.
+        encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
     """
 
-    encoder: CameraEncoderConfig | EvidenceEncoderConfig = CameraEncoderConfig()
+    encoder: EvidenceEncoderConfig | CameraEncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
     control_points: int | None = None
-    markers: MarkerFusionConfig | None = None
-    sd_map: SdMapModuleConfig | None = None
     denoising: DenoisingConfig | None = None
+
+    @property
+    def query_dim(self) -> int:
+        """Channels of a query."""
+        return self.decoder.dim
+
+    @property
+    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
+        """Denoised lanes, beside what every host has."""
+        return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit each other."""
@@ -72,7 +67,9 @@ class BevFormerDetrConfig:
 def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
     """Return the sizes of OpenLane-V2's large baseline; its copy in SMERF has `control_points=None`."""
     decoder = replace(PAPER_LANE_DECODER, queries=100)
-    return BevFormerDetrConfig(PAPER_CAMERA_ENCODER, decoder, PAPER_ELEMENT_DECODER, control_points)
+    return BevFormerDetrConfig(
+        encoder=PAPER_CAMERA_ENCODER, decoder=decoder, elements=PAPER_ELEMENT_DECODER, control_points=control_points
+    )
 
 
 class BevFormerDetr(Host):
@@ -80,23 +77,24 @@ class BevFormerDetr(Host):
 
     config: BevFormerDetrConfig
 
-    def decode_example(self, example, bev, elements, *, deterministic):
-        return self.decode(bev, elements, example.lanes, deterministic=deterministic)
+    def decode_example(self, example, bev, elements, tokens, *, deterministic):
+        return self.decode(bev, elements, tokens, example.lanes, deterministic=deterministic)
 
     @nn.compact
     def decode(
         self,
         bev: Float[Array, "h w e"],
         elements: ElementOutput | None = None,
+        tokens: ByPrior | None = None,
         lanes: LaneGraph | None = None,
         *,
         deterministic: bool = True,
     ) -> Prediction:
-        """Return lanes of every decoder layer and the topology of the last, from BEV features and traffic elements.
+        """Return lanes of every decoder layer and the topology of the last, from BEV features and prior tokens.
 
         Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
         """
-        return decode_lanes(self, self._lines(), bev, elements, None, lanes, deterministic)
+        return decode_lanes(self, self._lines(), bev, elements, tokens or {}, lanes, deterministic)
 
     def _lines(self) -> LaneDecoderConfig:
         """Return the decoder's sizes, with the points that it predicts."""
@@ -104,17 +102,19 @@ class BevFormerDetr(Host):
         return self.config.decoder if controls is None else replace(self.config.decoder, points=controls)
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return what a set of queries says."""
+        """Return the predictions of one set of queries."""
         controls, config = self.config.control_points, self._lines()
         queries, position, reference = start
         outputs = []
         for i in range(config.layers):
             last = i == config.layers - 1
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, position))
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
             queries = layer(queries, position, reference, bev, None, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             seen = None if elements is None else elements.queries[i]
-            output = LaneHeads(config, relations=last, name=f"heads_{i}")(queries, reference, bev, seen)
+            heads = LaneHeads(config, self.config.spec.bev_range, relations=last, name=f"heads_{i}")
+            output = heads(queries, reference, bev, seen)
             if controls is not None:
                 basis = jnp.asarray(bezier_basis(self.config.decoder.points, controls), output.points.dtype)
                 output = output._replace(points=jnp.einsum("pk,qkc->qpc", basis, output.points))

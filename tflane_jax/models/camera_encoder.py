@@ -1,7 +1,7 @@
-"""What a host sees before it looks for lanes: BEV features from cameras or from an evidence raster, and the front view.
+"""From the cameras of one frame to BEV features, and the front view in which traffic elements are found.
 
-Camera images -> image encoder -> feature maps of all cameras -> BEVFormer -> BEV features; the maps of the front camera
-go on to the traffic elements.
+Images -> image encoder -> feature maps of all cameras -> BEVFormer -> BEV features; the maps of the front camera go on
+to the traffic elements.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.auxiliary import LaneCellHead
-from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory, Fuse
+from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
 from tflane_jax.models.bevformer import BevFormer
-from tflane_jax.models.element_decoder import ElementDecoderConfig
-from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER, ImageEncoder, ImageEncoderConfig
+from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import Example
 
 
@@ -39,6 +39,11 @@ class CameraEncoderConfig:
     images: ImageEncoderConfig = ImageEncoderConfig()
     bev: BevFormerConfig = SMALL_BEVFORMER
     cells: bool = False
+
+    @property
+    def bev_range(self) -> PerceptionRange:
+        """The box that the BEV features cover, metres."""
+        return self.bev.grid.range
 
 
 PAPER_CAMERA_ENCODER = CameraEncoderConfig(PAPER_IMAGE_ENCODER, BevFormerConfig())
@@ -58,7 +63,7 @@ class FrontView(NamedTuple):
     padded: tuple[int, int]
 
 
-class Seen(NamedTuple):
+class EncoderOutput(NamedTuple):
     """What an encoder makes of an example.
 
     Attributes:
@@ -78,7 +83,9 @@ class CameraEncoder(nn.Module):
     config: CameraEncoderConfig
 
     @nn.compact
-    def __call__(self, example: Example, memory: BevMemory | None, *, train: bool, fuse: Fuse | None = None) -> Seen:
+    def __call__(
+        self, example: Example, memory: BevMemory | None, *, train: bool, fuse: BevHook | None = None
+    ) -> EncoderOutput:
         """Return what the cameras show; raises UserError where the example has no images."""
         cameras = example.cameras
         if cameras is None:
@@ -95,52 +102,4 @@ class CameraEncoder(nn.Module):
         size = jnp.where(cameras.valid[0], cameras.size[0], 0)
         padded = cameras.image.shape[1], cameras.image.shape[2]
         front = FrontView([level[0] for level in levels], size, padded)
-        return Seen(bev, front, BevMemory(bev, jnp.ones((), bool)))
-
-
-EncoderConfig = EvidenceEncoderConfig | CameraEncoderConfig
-
-
-def make_encoder(config: EncoderConfig) -> EvidenceEncoder | CameraEncoder:
-    """Return the encoder of a host."""
-    return EvidenceEncoder(config) if isinstance(config, EvidenceEncoderConfig) else CameraEncoder(config)
-
-
-def look(
-    encoder: EvidenceEncoder | CameraEncoder,
-    example: Example,
-    memory: BevMemory | None,
-    *,
-    train: bool,
-    fuse: Fuse | None = None,
-) -> Seen:
-    """Return what a host's encoder makes of an example, and of what priors add to it in each layer.
-
-    Raises UserError where the example lacks what the encoder reads.
-    """
-    if isinstance(encoder, CameraEncoder):
-        return encoder(example, memory, train=train, fuse=fuse)
-    if example.bev is None:
-        raise UserError(
-            "the model reads BEV evidence, and these data have none (bev is None): choose data with evidence, or a "
-            "model with cameras"
-        )
-    return Seen(encoder(example.bev, fuse))
-
-
-def empty_memory(config: EncoderConfig) -> BevMemory | None:
-    """Return the memory at the start of a sequence; None for an encoder that keeps none."""
-    return BevMemory.empty(config.bev) if isinstance(config, CameraEncoderConfig) else None
-
-
-def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoderConfig | None) -> None:
-    """Raise UserError where traffic elements have no front view, or not a layer for each of the lane decoder's."""
-    if elements is None:
-        return
-    if not isinstance(encoder, CameraEncoderConfig):
-        raise UserError("traffic elements are found in the front camera's image: give the model an encoder of cameras")
-    if elements.layers != layers:
-        raise UserError(
-            f"the decoders of elements and lanes go layer by layer, and have {elements.layers} and {layers}: "
-            "set elements.layers and decoder.layers to one number"
-        )
+        return EncoderOutput(bev, front, BevMemory(bev, jnp.ones((), bool)))

@@ -16,14 +16,12 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import image_sine_encoding, inverse_sigmoid
 from tflane_jax.layers.transformer import FeedForward, Residual, TransformerConfig
-
-ATTRIBUTES = 13
-"""Classes of OpenLane-V2's traffic elements."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +62,24 @@ class ElementOutput:
     Attributes:
         queries: (D, E, C), what the lane decoder and the relationship heads look at.
         box: (D, E, 2, 2) top-left and bottom-right corners, pixels of the front image.
-        logits: (D, E, 13).
+        logits: (D, E, K) by class, OpenLane-V2's 13 attributes.
     """
 
     queries: Float[Array, "layers e c"]
     box: Float[Array, "layers e 2 2"]
-    logits: Float[Array, "layers e 13"]
+    logits: Float[Array, "layers e k"]
 
 
 class ElementDecoder(nn.Module):
-    """Feature maps of one image in, traffic elements out."""
+    """Feature maps of one image in, traffic elements out.
+
+    Attributes:
+        config: sizes.
+        classes: K, classes of traffic elements.
+    """
 
     config: ElementDecoderConfig
+    classes: int = ATTRIBUTES
 
     @nn.compact
     def __call__(
@@ -134,7 +138,9 @@ class ElementDecoder(nn.Module):
             around = reference[:, None, None] * scale[None, None]
             layer = ElementDecoderLayer(config, name=f"decoder_{i}")
             queries = layer(queries, position, memory, around, shapes, valid, deterministic=deterministic)
-            logits = nn.Dense(ATTRIBUTES, bias_init=nn.initializers.constant(-np.log(99.0)), name=f"class_{i}")(queries)
+            logits = nn.Dense(self.classes, bias_init=nn.initializers.constant(-np.log(99.0)), name=f"class_{i}")(
+                queries
+            )
             box = ElementBox(config.dim, first=i == 0, name=f"box_{i}")(queries, reference)
             reference = lax.stop_gradient(box)
             outputs.append(ElementOutput(queries, corners(box, size), logits))

@@ -10,11 +10,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, UInt8
 
-from tflane_jax.geometry import BevGrid
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.models.auxiliary import LaneCellHead
-from tflane_jax.models.bev_encoder import Fuse
+from tflane_jax.models.prior import BevHook
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,19 @@ class EvidenceEncoderConfig:
         cell: raster cells a side that become one feature cell.
         dilations: one residual block for each.
         cells: see `CameraEncoderConfig.cells`.
+        range: the box that the raster covers, metres; that of `BevSensorConfig.grid`.
     """
 
     dim: int = 32
     cell: int = 4
     dilations: tuple[int, ...] = (1, 2, 4, 1)
     cells: bool = False
+    range: PerceptionRange = BevGrid().range
+
+    @property
+    def bev_range(self) -> PerceptionRange:
+        """The box that the BEV features cover, metres."""
+        return self.range
 
 
 class EvidenceEncoder(nn.Module):
@@ -40,7 +47,7 @@ class EvidenceEncoder(nn.Module):
     config: EvidenceEncoderConfig
 
     @nn.compact
-    def __call__(self, bev: UInt8[Array, "h w c"], fuse: Fuse | None = None) -> Float[Array, "hf wf d"]:
+    def __call__(self, bev: UInt8[Array, "h w c"], fuse: BevHook | None = None) -> Float[Array, "hf wf d"]:
         """Return features, `cell` times coarser than the raster; raises ValueError where that does not divide it.
 
         Args:

@@ -1,66 +1,109 @@
-"""What all hosts share: an example goes in, BEV features and traffic elements are made of it, lanes come out."""
+"""A host detector: encoder, priors, decoder. What all hosts share, and what each of them declares.
+
+A new host derives a configuration from `HostConfig` and a module from `Host`, in a file of its own.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import flax.linen as nn
-import jax
-import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from tflane_jax.models.auxiliary import AUXILIARY
-from tflane_jax.models.bev_encoder import BevMemory, Fuse
-from tflane_jax.models.camera_encoder import EncoderConfig, empty_memory, look, make_encoder
-from tflane_jax.models.element_decoder import ElementDecoder, ElementOutput
-from tflane_jax.models.lane_denoising import NoisedQueries
-from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
-from tflane_jax.models.marker_fusion import (
-    MarkerFusion,
-    MarkerFusionConfig,
-    MarkerTokens,
-    empty_marker_memory,
-    fusion_gate,
-    fusion_mask,
-    guide_frame,
-)
-from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, sd_map_mask
-from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemory
-from tflane_jax.scene import Example, LaneGraph, Prediction
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.models.auxiliary import AuxiliaryName
+from tflane_jax.models.bev_encoder import BevMemory
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
+from tflane_jax.models.encoders import encode_example, make_encoder, start_bev_memory
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.prior import HostSpec, Prior
+from tflane_jax.models.priors import ByPrior, PriorsConfig, bev_hook, encode, observe, start_memories
+from tflane_jax.scene import Example, Prediction
 
 
 @struct.dataclass
 class HostMemory:
-    """What a host carries from frame to frame; what it does not use is None.
+    """What a host carries from frame to frame.
 
     Attributes:
-        bev: BEV features of the frame before.
-        markers: lanes that markers gave in the last frames.
+        bev: BEV features of the frame before; None for an encoder without memory.
+        priors: memories of the priors that have one, by name.
     """
 
     bev: BevMemory | None = None
-    markers: MarkerMemory | None = None
+    priors: ByPrior = struct.field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostConfig:
+    """What every host has; hosts add their decoders.
+
+    Attributes:
+        encoder: BEV features from BEV evidence or from cameras.
+        range: R_p, the box in which lanes are perceived, metres.
+        priors: traffic flow, SD map, markers; without any, the vision-only baseline.
+        elements: traffic elements in the front view, or None. They need cameras.
+    """
+
+    encoder: EvidenceEncoderConfig | CameraEncoderConfig = EvidenceEncoderConfig()
+    range: PerceptionRange = PerceptionRange()
+    priors: PriorsConfig = PriorsConfig()
+    elements: ElementDecoderConfig | None = None
+
+    open_base: ClassVar[bool] = True
+    """Settings of this type accept any subclass, see `config_io.subclasses`."""
+    query_type: ClassVar[Literal["instance", "point"]] = "instance"
+    """What a query represents, see `HostSpec.query_type`."""
+
+    @property
+    def query_dim(self) -> int:
+        """Channels of a query."""
+        raise NotImplementedError
+
+    @property
+    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
+        """Auxiliary outputs that the host has in training; each has a term in its loss."""
+        return ("lane_cells",) if self.encoder.cells else ()
+
+    @property
+    def spec(self) -> HostSpec:
+        """What priors are told of the host."""
+        return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type)
+
+    def build(self) -> Host:
+        """Return the Linen module; raises UserError where parts do not fit each other."""
+        raise NotImplementedError
+
+    def build_priors(self) -> dict[str, Prior]:
+        """Return the priors of this host, by name."""
+        return self.priors.build(self.spec)
+
+    def start(self) -> HostMemory:
+        """Return the memory before the first frame of a sequence."""
+        return HostMemory(start_bev_memory(self.encoder), start_memories(self.build_priors()))
 
 
 class Host(nn.Module):
-    """A model from an example to the predictions of every decoder layer; subclasses say how lanes are decoded.
+    """From an example to the predictions of every decoder layer; subclasses say how queries are decoded.
 
     Attributes:
-        config: has `encoder` and `decoder`, and `elements`, `markers` and `sd_map`, each None in a host without.
+        config: of the host.
     """
 
     config: Any
 
     def setup(self):
-        config = self.config
+        config: HostConfig = self.config
         self.encoder = make_encoder(config.encoder)
         if config.elements is not None:
             self.elements = ElementDecoder(config.elements)
-        if config.markers is not None:
-            self.marker_tokens = MarkerTokens(config.markers, config.decoder.range)
-        if config.sd_map is not None:
-            self.sd_map_tokens = SdMapEncoder(config.sd_map)
+        self.priors = _Built(config.build_priors())
+        for prior in self.priors.by_name.values():
+            for name, module in prior.modules().items():
+                setattr(self, name, module)
 
     def __call__(self, example: Example, memory: HostMemory | None = None, *, train: bool = False) -> Prediction:
         """Return predictions with a leading axis over decoder layers; the last one is the answer."""
@@ -80,94 +123,53 @@ class Host(nn.Module):
             UserError: the example lacks what the model reads.
         """
         memory = memory or HostMemory()
-        guide, markers = None, memory.markers
-        if self.config.markers is not None:
-            guide, markers = guide_frame(example, memory.markers, self.config.markers)
-        answer, bev = self.answer(example, memory.bev, guide, train=train)
-        return answer, HostMemory(bev, markers)
+        observations, memories = observe(self.priors.by_name, example, memory.priors)
+        answer, bev = self.answer(example, memory.bev, observations, train=train)
+        return answer, HostMemory(bev, memories)
 
     def answer(
-        self, example: Example, memory: BevMemory | None, guide: MarkerGuidance | None, *, train: bool = False
+        self, example: Example, memory: BevMemory | None, observations: ByPrior, *, train: bool = False
     ) -> tuple[Prediction, BevMemory | None]:
-        """Return predictions and BEV features for the next frame, from what markers tell of this one: the part of
-        `step` that learns.
+        """Return predictions, and BEV features for the next frame: the part of `step` that is learned.
+
+        Args:
+            example: one frame.
+            memory: BEV features of the frame before; None without.
+            observations: of every prior, see `models.priors.observe`.
+            train: see `step`.
         """
-        seen = look(self.encoder, example, memory, train=train, fuse=self._priors(example, guide, not train))
+        tokens = encode(self.priors.by_name, observations, deterministic=not train)
+        hook = bev_hook(self.priors.by_name, tokens, self.config.spec)
+        encoded = encode_example(self.encoder, example, memory, train=train, hook=hook)
         elements = None
-        if self.config.elements is not None and seen.front is not None:
-            elements = self.elements(*seen.front, deterministic=not train)
-        return self.decode_example(example, seen.bev, elements, deterministic=not train), seen.memory
-
-    def _priors(self, example: Example, guide: MarkerGuidance | None, deterministic: bool) -> Fuse | None:
-        """Return what the priors add to every layer of the BEV encoder."""
-        markers, sd_map = self.config.markers, self.config.sd_map
-        fusions = []
-        if sd_map is not None:
-            lines = self.sd_map_tokens(example.sd_map, deterministic=deterministic)
-            fusions.append(
-                lambda layer, cells, bev, position: SdMapFusion(sd_map, name=f"sd_map_{layer}")(
-                    bev, position, *lines, sd_map_mask(example.sd_map, cells, sd_map)
-                )
-            )
-        if markers is not None and guide is not None:
-            tokens, (gate, valid) = self.marker_tokens(guide, deterministic=deterministic), fusion_gate(guide, markers)
-            fusions.append(
-                lambda layer, cells, bev, position: MarkerFusion(markers, name=f"markers_{layer}")(
-                    bev, position, tokens, fusion_mask(guide, valid, cells, markers), gate
-                )
-            )
-
-        def fuse(layer: int, places: Any, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
-            cells = self.config.decoder.range.denormalise(jnp.asarray(places))
-            for each in fusions:
-                bev = each(layer, cells, bev, position)
-            return bev
-
-        return fuse if fusions else None
+        if self.config.elements is not None and encoded.front is not None:
+            elements = self.elements(*encoded.front, deterministic=not train)
+        prediction = self.decode_example(example, encoded.bev, elements, tokens, deterministic=not train)
+        return prediction, encoded.memory
 
     def decode_example(
-        self, example: Example, bev: Float[Array, "h w e"], elements: ElementOutput | None, *, deterministic: bool
+        self,
+        example: Example,
+        bev: Float[Array, "h w e"],
+        elements: ElementOutput | None,
+        tokens: ByPrior,
+        *,
+        deterministic: bool,
     ) -> Prediction:
-        """Return lanes and topology of every decoder layer; a host with priors reads them from the example."""
+        """Return the predictions of every decoder layer.
+
+        Args:
+            example: truth to denoise in training; nothing else of it may be looked at.
+            bev: BEV features.
+            elements: traffic elements of the front view, None without.
+            tokens: of every prior, by name.
+            deterministic: no dropout.
+        """
         raise NotImplementedError
 
 
-def start_memory(encoder: EncoderConfig, markers: MarkerFusionConfig | None) -> HostMemory:
-    """Return the memory of a host before the first frame of a sequence."""
-    return HostMemory(empty_memory(encoder), None if markers is None else empty_marker_memory(markers))
+class _Built:
+    """The priors of a module, out of sight of Linen, which would turn a plain dict of them into submodules."""
 
-
-def decode_lanes(
-    host: Any,
-    config: LaneDecoderConfig,
-    bev: Float[Array, "h w e"],
-    elements: ElementOutput | None,
-    priors: Any,
-    lanes: LaneGraph | None,
-    deterministic: bool,
-) -> Prediction:
-    """Return what the learned queries say; what the denoising queries say goes to the loss, where that asks.
-
-    Both go through one decoder and know nothing of each other.
-
-    Args:
-        host: has the decoder, `decode_queries(start, bev, elements, priors, deterministic)`, where `start` is what
-            `LaneQueries` returns, and `config.denoising`.
-        config: of the queries.
-        bev, elements, priors, deterministic: handed on.
-        lanes: truth to denoise; nothing else looks at it.
-    """
-    start, noise = LaneQueries(config, name="queries")(), host.config.denoising
-    if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
-        return host.decode_queries(start, bev, elements, priors, deterministic)
-    noised = NoisedQueries(config, noise, name="noised")(lanes)
-    starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
-    decode = nn.vmap(
-        type(host).decode_queries,
-        in_axes=(0, None, None, None, None),  # pyright: ignore[reportArgumentType]
-        variable_axes={"params": None, "intermediates": 0},
-        split_rngs={"params": False, "dropout": True},
-    )
-    every = decode(host, starts, bev, elements, priors, deterministic)
-    host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], every.lanes))
-    return jax.tree.map(lambda leaf: leaf[0], every)
+    def __init__(self, by_name: dict[str, Prior]):
+        self.by_name = by_name

@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention, sample_bilinear
 from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGraphFeedForward
@@ -25,7 +26,7 @@ from tflane_jax.layers.positions import inverse_sigmoid
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.lane_queries import LaneDecoderConfig
-from tflane_jax.scene import ElementPrediction, LanePrediction, Prediction
+from tflane_jax.scene import CenterlinePrediction, ElementPrediction, Prediction
 
 
 class LaneDecoderLayer(nn.Module):
@@ -93,9 +94,14 @@ class PointwiseRefinement(nn.Module):
     """Moves each point of a lane by what is seen there, with one network for all points of all lanes.
 
     The heads' own perceptron must learn for every point anew what a line beside it means; this one learns it once.
+
+    Attributes:
+        config: sizes.
+        range: the box that normalised coordinates span.
     """
 
     config: LaneDecoderConfig
+    range: PerceptionRange
 
     @nn.compact
     def __call__(
@@ -104,7 +110,7 @@ class PointwiseRefinement(nn.Module):
         """Return the change of the reference points, zero before training."""
         config, (h, w, e) = self.config, bev.shape
         here = sample_bilinear(bev.reshape(h * w, e), (h, w), reference[..., :2])
-        heading = directions(config.range.denormalise(reference)[..., :2])
+        heading = directions(self.range.denormalise(reference)[..., :2])
         x = nn.Dense(config.dim, name="here")(here)
         x = x + nn.Dense(config.dim, use_bias=False, name="heading")(heading)
         x = x + nn.Dense(config.dim, use_bias=False, name="lane")(queries)[:, None]
@@ -137,10 +143,12 @@ class LaneHeads(nn.Module):
 
     Attributes:
         config: sizes.
+        range: the box that normalised coordinates span.
         relations: whether the layer predicts topology.
     """
 
     config: LaneDecoderConfig
+    range: PerceptionRange
     relations: bool = True
 
     @nn.compact
@@ -163,14 +171,14 @@ class LaneHeads(nn.Module):
         change = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries).reshape(reference.shape)
         if config.refine == "iterative":
             change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
-            change = change + PointwiseRefinement(config, name="pointwise")(queries, reference, bev)
+            change = change + PointwiseRefinement(config, self.range, name="pointwise")(queries, reference, bev)
         unit = nn.sigmoid(change + inverse_sigmoid(reference))
         successor = element_lane = None
         if self.relations:
             successor = RelationshipHead(config.relation, name="successor")(queries, queries)
             if elements is not None:
                 element_lane = RelationshipHead(config.relation, name="element_lane")(queries, elements)
-        return LaneOutput(config.range.denormalise(unit), unit, logits, successor, element_lane)
+        return LaneOutput(self.range.denormalise(unit), unit, logits, successor, element_lane)
 
 
 def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -> Prediction:
@@ -179,15 +187,16 @@ def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -
     The axis of a topology counts only the layers, always the last ones, that predict it.
     """
     related = [output for output in outputs if output.successor is not None]
-    lanes = LanePrediction(
+    lanes = CenterlinePrediction(
         points=jnp.stack([output.points for output in outputs]),
         logits=jnp.stack([output.logits for output in outputs]),
         successor_logits=jnp.stack([output.successor for output in related]),  # pyright: ignore[reportArgumentType]
     )
     if elements is None:
-        return Prediction(lanes)
+        return Prediction(centerlines=lanes)
     edges = jnp.stack([output.element_lane for output in related])  # pyright: ignore[reportArgumentType]
-    return Prediction(lanes, ElementPrediction(elements.box, elements.logits, edges))
+    boxes = ElementPrediction(elements.box, elements.logits, edges)
+    return Prediction(centerlines=lanes, elements=boxes)
 
 
 def smooth_basis(points: int) -> Float[np.ndarray, "p k"]:

@@ -8,6 +8,7 @@ to see where that runs; small models need it to converge. In prediction there ar
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -16,8 +17,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange, transform_points, yaw_pose
-from tflane_jax.models.lane_queries import LaneDecoderConfig
-from tflane_jax.scene import LaneGraph
+from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.element_decoder import ElementOutput
+from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
+from tflane_jax.scene import LaneGraph, Prediction
 
 
 @dataclass(frozen=True)
@@ -40,10 +43,17 @@ class DenoisingConfig:
 
 
 class NoisedQueries(nn.Module):
-    """Queries that stand on noised lanes; those without a lane stand anywhere, and are to say so."""
+    """Queries placed on noised lanes; those without a lane are placed anywhere and must learn to reject it.
+
+    Attributes:
+        config: sizes of the decoder.
+        noise: how lanes are noised.
+        range: the box that normalised coordinates span.
+    """
 
     config: LaneDecoderConfig
     noise: DenoisingConfig
+    range: PerceptionRange
 
     @nn.compact
     def __call__(
@@ -52,14 +62,50 @@ class NoisedQueries(nn.Module):
         """Return content, position and reference points in [0, 1] of every copy; query i belongs to lane i."""
         config, copies = self.config, self.noise.copies
         keys = jax.random.split(self.make_rng("dropout"), copies)
-        lines = jax.vmap(lambda key: noised_lanes(key, lanes, config.queries, config.range, self.noise))(keys)
-        reference = jnp.clip(config.range.normalise(lines), 0.01, 0.99)
+        lines = jax.vmap(lambda key: noised_lanes(key, lanes, config.queries, self.range, self.noise))(keys)
+        reference = jnp.clip(self.range.normalise(lines), 0.01, 0.99)
         position = nn.Dense(config.dim, name="position")(reference.reshape(copies, config.queries, -1))
         if config.refine == "fixed":
             middle = config.points // 2
             reference = jnp.broadcast_to(reference[:, :, middle : middle + 1], reference.shape)
         content = self.param("content", nn.initializers.normal(1.0), (config.dim,))
         return jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference)
+
+
+def decode_lanes(
+    host: Any,
+    config: LaneDecoderConfig,
+    bev: Float[Array, "h w e"],
+    elements: ElementOutput | None,
+    tokens: Any,
+    lanes: LaneGraph | None,
+    deterministic: bool,
+) -> Prediction:
+    """Return what the learned queries predict; predictions of denoising queries become the auxiliary output `denoised`.
+
+    Both kinds go through one decoder and exchange nothing.
+
+    Args:
+        host: has the decoder, `decode_queries(start, bev, elements, tokens, deterministic)`, where `start` is what
+            `LaneQueries` returns, and `config.denoising`.
+        config: of the queries.
+        bev, elements, tokens, deterministic: handed on.
+        lanes: truth to denoise; nothing else looks at it.
+    """
+    start, noise = LaneQueries(config, host.config.spec.bev_range, name="queries")(), host.config.denoising
+    if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
+        return host.decode_queries(start, bev, elements, tokens, deterministic)
+    noised = NoisedQueries(config, noise, host.config.spec.bev_range, name="noised")(lanes)
+    starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
+    decode = nn.vmap(
+        type(host).decode_queries,
+        in_axes=(0, None, None, None, None),  # pyright: ignore[reportArgumentType]
+        variable_axes={"params": None, "intermediates": 0},
+        split_rngs={"params": False, "dropout": True},
+    )
+    every = decode(host, starts, bev, elements, tokens, deterministic)
+    host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], every.centerlines))
+    return jax.tree.map(lambda leaf: leaf[0], every)
 
 
 def noised_lanes(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import qmc
 
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
 
 
@@ -31,7 +31,6 @@ class LaneDecoderConfig:
         edge_weight: share of neighbours in the scene graph.
         bands: frequencies per coordinate that tell where a refined lane is.
         refine: see `models.lane_decoder`.
-        range: the box that normalised coordinates span.
         dropout: of attention weights, hidden channels, messages and everything that is added to a residual.
     """
 
@@ -46,7 +45,6 @@ class LaneDecoderConfig:
     edge_weight: float = 0.6
     bands: int = 6
     refine: Literal["fixed", "iterative"] = "iterative"
-    range: PerceptionRange = BevGrid().range
     dropout: float = 0.0
 
 
@@ -56,9 +54,15 @@ PAPER_LANE_DECODER = LaneDecoderConfig(
 
 
 class LaneQueries(nn.Module):
-    """The learned queries: content, position and the reference point that the position stands for."""
+    """The learned queries: content, position and the reference points that the position encodes.
+
+    Attributes:
+        config: sizes.
+        range: the box that normalised coordinates span.
+    """
 
     config: LaneDecoderConfig
+    range: PerceptionRange
 
     @nn.compact
     def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
@@ -70,21 +74,23 @@ class LaneQueries(nn.Module):
         embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
         position, content = jnp.split(embedding, 2, -1)
         if config.refine == "iterative":
-            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config))))
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config, self.range))))
             return content, position, nn.sigmoid(anchors)
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         shape = (config.queries, config.points, 3)
         return content, position, jnp.broadcast_to(spot[:, None], shape)
 
 
-def spread_lanes(config: LaneDecoderConfig, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:
+def spread_lanes(
+    config: LaneDecoderConfig, range_: PerceptionRange, length: float = 24.0
+) -> Float[np.ndarray, "q p 3"]:
     """Return straight lanes spread evenly over the range, in [0, 1]: the anchors before training.
 
     Middles and headings follow a Halton sequence: three lanes in five run along the ego's own axis, half of them
     against it, and the others anywhere. `length` is in metres.
     """
     sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
-    middle = np.asarray(config.range.low(2)) + sample[:, :2] * np.asarray(config.range.size(2))
+    middle = np.asarray(range_.low(2)) + sample[:, :2] * np.asarray(range_.size(2))
     share = sample[:, 2] / 0.6
     heading = np.where(share < 1.0, np.pi * (share < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
     along = np.linspace(-length / 2, length / 2, config.points)
@@ -92,4 +98,4 @@ def spread_lanes(config: LaneDecoderConfig, length: float = 24.0) -> Float[np.nd
     lanes = np.zeros((config.queries, config.points, 3), np.float32)
     lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
     # Off the border, where the sigmoid that the points go through is flat.
-    return np.clip(config.range.normalise(lanes), 0.02, 0.98)
+    return np.clip(range_.normalise(lanes), 0.02, 0.98)

@@ -18,9 +18,9 @@ from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.positions import image_sine_encoding
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
-from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
-from tflane_jax.scene import LaneShapePrediction
+from tflane_jax.scene import CurvePrediction
 
 # Of TuSimple images in [0, 1], blue, green, red: the order in which the published weights read them.
 MEAN_BGR = (0.40789654, 0.44719302, 0.47026115)
@@ -85,6 +85,11 @@ class LstrConfig:
     anchors: tuple[float, float] | None = None
     cells: bool = False
 
+    @property
+    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
+        """Auxiliary outputs that the network has in training."""
+        return ("line_cells",) if self.cells else ()
+
     def build(self) -> Lstr:
         """Return the Linen module."""
         return Lstr(self)
@@ -121,7 +126,7 @@ class Lstr(nn.Module):
     @nn.compact
     def __call__(
         self, image: Float[Array, "h w 3"], valid: Bool[Array, "h w"], *, train: bool = False
-    ) -> LaneShapePrediction:
+    ) -> CurvePrediction:
         """Return predictions with a leading axis over decoder layers; the last one is the answer.
 
         Args:
@@ -140,7 +145,7 @@ class Lstr(nn.Module):
         encoder = config.encoder.build(config.dim, "encoder")
         memory = encoder(features, position, cells, deterministic=not train)
         if config.cells and self.is_mutable_collection(AUXILIARY):
-            self.sow(AUXILIARY, "cells", nn.Dense(1, name="cell_head")(memory)[..., 0])
+            self.sow(AUXILIARY, "line_cells", nn.Dense(1, name="cell_head")(memory)[..., 0])
         memory = memory.reshape(-1, config.dim)
         position, seen = position.reshape(-1, config.dim), key_mask(cells.reshape(-1))
 
@@ -166,7 +171,7 @@ class LaneShapeHeads(nn.Module):
     anchors: tuple[float, float] | None = None
 
     @nn.compact
-    def __call__(self, queries: Float[Array, "layers q c"]) -> LaneShapePrediction:
+    def __call__(self, queries: Float[Array, "layers q c"]) -> CurvePrediction:
         """Return the predictions of every layer."""
         logits = nn.Dense(2, name="class")(queries)
         specific = Mlp((self.dim, self.dim, 4), name="specific")(queries)  # alpha, beta, b'', b'''
@@ -176,7 +181,7 @@ class LaneShapeHeads(nn.Module):
         curves = jnp.concatenate([specific[..., :2], shared, specific[..., 2:]], -1)
         if self.anchors is not None:
             curves = _from_columns(_like(_TYPICAL, curves) + _like(_SPREAD, curves) * curves, self.anchors)
-        return LaneShapePrediction(logits, curves)
+        return CurvePrediction(logits, curves)
 
 
 def _from_columns(curves: Float[Array, "*b 8"], anchors: tuple[float, float]) -> Float[Array, "*b 8"]:

@@ -10,7 +10,7 @@ model without markers; Eq. (3) alone would normalise them once more.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -22,6 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
     MarkerMemory,
@@ -72,6 +73,10 @@ class MarkerFusionConfig:
     query_position: bool = True
     connectivity: bool = False
 
+    def build(self, host: HostSpec) -> MarkerPrior:
+        """Return the prior for a host."""
+        return MarkerPrior(self, host)
+
 
 SMALL_MARKER_FUSION = MarkerFusionConfig(
     memory=MarkerMemoryConfig(lanes=32),
@@ -82,6 +87,68 @@ SMALL_MARKER_FUSION = MarkerFusionConfig(
         dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
     ),
 )
+
+
+class FusedMarkers(NamedTuple):
+    """What every BEV layer needs of a frame's markers.
+
+    Attributes:
+        tokens: (N, D) of the lanes.
+        lanes: the lanes themselves.
+        gate: () c of Eq. (3).
+        valid: (N,) lanes that are attended to.
+    """
+
+    tokens: Float[Array, "n d"]
+    lanes: MarkerGuidance
+    gate: Float[Array, ""]
+    valid: Bool[Array, " n"]
+
+
+class MarkerPrior(Prior):
+    """Marker lanes with a decaying memory, fused into every layer of the BEV encoder."""
+
+    reads = ("markers", "previous_from_ego", "has_previous")
+
+    def __init__(self, config: MarkerFusionConfig, host: HostSpec):
+        self.config = config
+        self.marker_tokens = MarkerTokens(config, host.bev_range)
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return the encoder of lanes."""
+        return {"marker_tokens": self.marker_tokens}
+
+    def start(self) -> MarkerMemory | None:
+        """Return an empty memory; None for a model without memory (Table III)."""
+        config = self.config
+        if config.memory is None:
+            return None
+        return MarkerMemory.empty(config.memory.frames, config.prior.lanes, config.prior.points)
+
+    def observe(self, example: Example, memory: MarkerMemory | None) -> tuple[MarkerGuidance, MarkerMemory | None]:
+        """Return the lanes of this frame's markers, or remembered ones, and the memory for the next frame."""
+        config, markers = self.config, example.markers
+        if markers is None:  # data without markers are data in which no marker is in sight
+            markers = MarkerObservations.empty(1, 1, config.prior.points)
+        observed = jax.tree.map(jnp.asarray, select_marker_lanes(markers, config.prior))
+        if memory is None or config.memory is None:
+            exponent = 1.0 if config.memory is None else config.memory.exponent
+            return guidance(observed, exponent), memory
+        bank, lanes = remember(
+            memory, observed, jnp.asarray(example.previous_from_ego), jnp.asarray(example.has_previous), config.memory
+        )
+        return lanes, bank
+
+    def encode(self, observation: MarkerGuidance, *, deterministic: bool) -> FusedMarkers:
+        """Return the lanes' tokens with the gate and mask of the variant (Table II)."""
+        tokens = self.marker_tokens(observation, deterministic=deterministic)
+        return FusedMarkers(tokens, observation, *fusion_gate(observation, self.config))
+
+    def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+        """Return Eq. (3)."""
+        fusion = MarkerFusion(self.config, name=f"markers_{layer}")
+        mask = fusion_mask(tokens.lanes, tokens.valid, cells.centers, self.config)
+        return fusion(cells.features, cells.position, tokens.tokens, mask, tokens.gate)
 
 
 class MarkerTokens(nn.Module):
@@ -179,33 +246,3 @@ def fusion_mask(
     if config.radius is None:
         return key_mask(valid)
     return radius_mask(jnp.asarray(cells), guide.points, valid, config.radius)
-
-
-def guide_frame(
-    example: Example, memory: MarkerMemory | None, config: MarkerFusionConfig
-) -> tuple[MarkerGuidance, MarkerMemory | None]:
-    """Return what guides this frame, and the memory for the next.
-
-    Args:
-        example: one frame; data that know no markers are data in which none is seen.
-        memory: of the frame before; None is a frame on its own, and stays None.
-        config: see there.
-    """
-    markers = example.markers
-    if markers is None:
-        markers = MarkerObservations.empty(1, 1, config.prior.points)
-    observed = jax.tree.map(jnp.asarray, select_marker_lanes(markers, config.prior))
-    if memory is None or config.memory is None:
-        exponent = 1.0 if config.memory is None else config.memory.exponent
-        return guidance(observed, exponent), memory
-    bank, guide = remember(
-        memory, observed, jnp.asarray(example.previous_from_ego), jnp.asarray(example.has_previous), config.memory
-    )
-    return guide, bank
-
-
-def empty_marker_memory(config: MarkerFusionConfig) -> MarkerMemory | None:
-    """Return the memory before the first frame; None for a model without memory."""
-    if config.memory is None:
-        return None
-    return MarkerMemory.empty(config.memory.frames, config.prior.lanes, config.prior.points)

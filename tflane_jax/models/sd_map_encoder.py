@@ -1,30 +1,25 @@
 """SMERF (Luo et al. 2024): an SD map as tokens, to which BEV queries attend; specs/modules.md section 9.
 
-A host encodes the map once a frame, and fuses it in every layer of its BEV encoder, behind the cameras:
-
-    tokens, valid = SdMapEncoder(config, name="sd_map")(example.sd_map)
-
-    def fuse(layer, places, bev, position):
-        return SdMapFusion(config, name=f"sd_map_{layer}")(bev, position, tokens, valid)
-
-The BEV encoder takes `fuse`; the parameters of a fusion stand below the layer that calls it.
+The tokens are made once a frame and fused in every layer of the BEV encoder, behind the cameras.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
-from tflane_jax.scene import SdMap
+from tflane_jax.scene import Example, SdMap
 
 
 @dataclass(frozen=True)
@@ -48,6 +43,10 @@ class SdMapModuleConfig:
     radius: float | None = None
     absent: Literal["nothing", "reference"] = "nothing"
 
+    def build(self, host: HostSpec) -> SdMapPrior:
+        """Return the prior for a host."""
+        return SdMapPrior(self, host)
+
 
 SMALL_SD_MAP = SdMapModuleConfig(
     # A road is some 7 m to each side of its line, and the line a few metres off.
@@ -61,25 +60,70 @@ SMALL_SD_MAP = SdMapModuleConfig(
 POINTS = 11
 
 
+class FusedSdMap(NamedTuple):
+    """What every BEV layer needs of a frame's SD map.
+
+    Attributes:
+        tokens: (R, D) of the lines.
+        valid: (R,).
+        sd_map: the lines themselves.
+    """
+
+    tokens: Float[Array, "r d"]
+    valid: Bool[Array, " r"]
+    sd_map: SdMap
+
+
+class SdMapPrior(Prior):
+    """Tokens of an SD map, fused into every layer of the BEV encoder."""
+
+    reads = ("sd_map",)
+
+    def __init__(self, config: SdMapModuleConfig, host: HostSpec):
+        self.config = config
+        self.sd_map_tokens = SdMapEncoder(config, host.bev_range)
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return the encoder of lines."""
+        return {"sd_map_tokens": self.sd_map_tokens}
+
+    def observe(self, example: Example, memory: None) -> tuple[SdMap, None]:
+        """Return the SD map; without one, a map whose lines are all invalid."""
+        sd_map = SdMap.empty(1, POINTS) if example.sd_map is None else example.sd_map
+        return jax.tree.map(jnp.asarray, sd_map), None
+
+    def encode(self, observation: SdMap, *, deterministic: bool) -> FusedSdMap:
+        """Return the tokens of the lines."""
+        return FusedSdMap(*self.sd_map_tokens(observation, deterministic=deterministic), observation)
+
+    def into_bev(self, tokens: FusedSdMap, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+        """Return the BEV features with the map fused in."""
+        fusion = SdMapFusion(self.config, name=f"sd_map_{layer}")
+        mask = sd_map_mask(tokens.sd_map, cells.centers, self.config)
+        return fusion(cells.features, cells.position, tokens.tokens, tokens.valid, mask)
+
+
 class SdMapEncoder(nn.Module):
-    """An SD map to one token for each line."""
+    """An SD map to one token for each line.
+
+    Attributes:
+        config: sizes.
+        range: the box that normalised coordinates span, that of the host's BEV features.
+    """
 
     config: SdMapModuleConfig
+    range: PerceptionRange
 
     @nn.compact
-    def __call__(
-        self, sd_map: SdMap | None, *, deterministic: bool = True
-    ) -> tuple[Float[Array, "r d"], Bool[Array, " r"]]:
+    def __call__(self, sd_map: SdMap, *, deterministic: bool = True) -> tuple[Float[Array, "r d"], Bool[Array, " r"]]:
         """Return tokens, 0 in padding, and which of them are valid.
 
         Args:
-            sd_map: None, of a dataset without SD maps, is a map without lines. Parameters depend on the number of
-                points on a line: those made without a map fit maps of 11 points, as `ExampleConfig.sd_map` gives.
+            sd_map: one frame's map. Parameters depend on the number of points on a line: those initialised without
+                a map fit maps of 11 points, as `ExampleConfig.sd_map` gives.
             deterministic: no dropout; with it, the key `dropout` is needed.
         """
-        if sd_map is None:
-            sd_map = jax.tree.map(jnp.asarray, SdMap.empty(1, POINTS))
-        seen = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior)
+        seen = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
         encoder = PolylineEncoder(self.config.lines, name="lines")
         return encoder(seen.points, seen.labels, seen.valid, deterministic=deterministic), seen.valid
 
@@ -119,10 +163,8 @@ class SdMapFusion(nn.Module):
         return fused if config.absent == "reference" else jnp.where(present, fused, bev)
 
 
-def sd_map_mask(
-    sd_map: SdMap | None, cells: Float[ArrayLike, "q 2"], config: SdMapModuleConfig
-) -> Bool[Array, "q r"] | None:
+def sd_map_mask(sd_map: SdMap, cells: Float[ArrayLike, "q 2"], config: SdMapModuleConfig) -> Bool[Array, "q r"] | None:
     """Return which BEV cell, centred at (x, y) in metres, may look at which line of the map; None: at all."""
-    if sd_map is None or config.radius is None:
+    if config.radius is None:
         return None
     return radius_mask(jnp.asarray(cells), jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.radius)

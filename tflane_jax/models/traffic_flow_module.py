@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -22,8 +23,9 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.priors.traffic_flow import TrafficFlowTokens
-from tflane_jax.scene import RoadUser
+from tflane_jax.models.prior import HostQueries, HostSpec, Prior
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
+from tflane_jax.scene import Example, RoadUser, TrafficFlow
 
 Fusion = Literal["T->T", "T->L", "L->T", "L->L"]
 ALL_FUSIONS: tuple[Fusion, ...] = ("T->T", "T->L", "L->T", "L->L")
@@ -37,8 +39,6 @@ class TrafficFlowModuleConfig:
     Attributes:
         fusions: which of the four modules run, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
         depth: temporal self-attention layers, "Dep." in Table 5.
-        query_type: what a lane query of the host stands for: "instance" (TopoNet, LaneSegNet) or "point" (MapTR).
-            It decides I(Q_type) in Eq. (3).
         position_encoding: "sine" for normalised coordinates, "linear" for metres.
         bands: frequencies per coordinate of the sine encoding.
         width: channels inside the temporal encoder.
@@ -47,11 +47,70 @@ class TrafficFlowModuleConfig:
 
     fusions: tuple[Fusion, ...] = LANE_FUSIONS
     depth: int = 1
-    query_type: Literal["instance", "point"] = "instance"
     position_encoding: Literal["sine", "linear"] = "sine"
     bands: int = 7
     width: int = 32
     heads: int = 4
+
+
+@dataclass(frozen=True)
+class TrafficFlowConfig:
+    """Traffic flow as a prior of a host.
+
+    Attributes:
+        prior: selection of instances.
+        module: the TFM.
+        insert: "before_decoder" enhances the queries once, as the paper says (section 3.3); "every_layer" enhances
+            them before each decoder layer, with parameters of its own.
+    """
+
+    prior: TrafficFlowPriorConfig = TrafficFlowPriorConfig()
+    module: TrafficFlowModuleConfig = TrafficFlowModuleConfig()
+    insert: Literal["before_decoder", "every_layer"] = "before_decoder"
+
+    def build(self, host: HostSpec) -> TrafficFlowPrior:
+        """Return the prior for a host."""
+        return TrafficFlowPrior(self, host)
+
+
+class TrafficFlowPrior(Prior):
+    """Selects instances, encodes each to a token, and enhances the host's queries."""
+
+    reads = ("traffic_flow",)
+
+    def __init__(self, config: TrafficFlowConfig, host: HostSpec):
+        self.config, self.host = config, host
+        self.temporal_encoder = TemporalEncoder(config.module, host.dim)
+
+    def modules(self) -> dict[str, nn.Module]:
+        """Return the temporal encoder."""
+        return {"temporal_encoder": self.temporal_encoder}
+
+    def observe(self, example: Example, memory: None) -> tuple[TrafficFlowTokens, None]:
+        """Return reTF_i; without traffic flow, all instances are invalid."""
+        flow, prior = example.traffic_flow, self.config.prior
+        if flow is None:
+            flow = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames))
+        return select_traffic_flow(flow, prior, self.host.range, self.host.bev_range), None
+
+    def encode(
+        self, observation: TrafficFlowTokens, *, deterministic: bool
+    ) -> tuple[Float[Array, "t d"], Bool[Array, " t"]]:
+        """Return TF_Feat and which instances are valid."""
+        del deterministic
+        return self.temporal_encoder(observation), observation.valid
+
+    def into_queries(
+        self, tokens: tuple[Float[Array, "t d"], Bool[Array, " t"]], layer: int, queries: HostQueries
+    ) -> Float[Array, "q d"]:
+        """Return L'_Feat in front of the layers that `insert` names."""
+        if layer > 0 and self.config.insert == "before_decoder":
+            return queries.features
+        features, valid = tokens
+        mask = SpatialMask.from_validity(len(queries.features), valid, queries.mask)
+        name = f"spatial_encoder_{layer}"
+        spatial = SpatialEncoder(self.config.module, self.host.dim, self.host.query_type, name=name)
+        return spatial(queries.features, queries.position, features, mask)
 
 
 class TemporalEncoder(nn.Module):
@@ -125,10 +184,12 @@ class SpatialEncoder(nn.Module):
     Attributes:
         config: shape.
         dim: channels of lane queries and traffic tokens.
+        query_type: what a query of the host represents; I(Q_type) of Eq. (3) is 1 for points.
     """
 
     config: TrafficFlowModuleConfig
     dim: int
+    query_type: Literal["instance", "point"] = "instance"
 
     @nn.compact
     def __call__(
@@ -169,4 +230,4 @@ class SpatialEncoder(nn.Module):
         # Eq. (3): L' = T(F^(4)) + I(Q_type) * L.
         transformed = fused + Mlp((2 * self.dim, self.dim), name="transform")(fused)
         transformed = nn.LayerNorm(name="transform_norm")(transformed)
-        return transformed + lanes if self.config.query_type == "point" else transformed
+        return transformed + lanes if self.query_type == "point" else transformed

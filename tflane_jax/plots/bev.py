@@ -18,9 +18,9 @@ from tflane_jax.plots import style
 from tflane_jax.scene import (
     Areas,
     AreaType,
+    CenterlinePrediction,
     Example,
     LaneGraph,
-    LanePrediction,
     RoadUser,
     TrafficElements,
     TrafficFlow,
@@ -198,7 +198,7 @@ def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
     ax.add_collection(PolyCollection(list(nose), facecolors=style.ROAD, zorder=6.1))
 
 
-def draw_prediction(ax: Axes, prediction: LanePrediction, *, threshold: float = 0.3) -> None:
+def draw_prediction(ax: Axes, prediction: CenterlinePrediction, *, threshold: float = 0.3) -> None:
     """Draw the lanes that score at least `threshold`, stronger the higher they score, and their topology.
 
     A link runs from the end of a lane to the start of its successor, where the model holds that more likely

@@ -18,7 +18,7 @@ from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, draw_ego, draw_evidence, draw_lanes, draw_prediction, draw_scene, prepare
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
-from tflane_jax.scene import CameraViews, ElementPrediction, Example, LanePrediction, TrafficElements
+from tflane_jax.scene import CameraViews, CenterlinePrediction, ElementPrediction, Example, TrafficElements
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +54,7 @@ Tree = TypeVar("Tree")
 def save_camera_views(
     path: Path,
     examples: Example,
-    lanes: LanePrediction | None = None,
+    lanes: CenterlinePrediction | None = None,
     elements: ElementPrediction | None = None,
     *,
     titles: Sequence[str] = (),
@@ -116,7 +116,7 @@ def draw_camera(
     ax: Axes,
     example: Example,
     number: int,
-    lanes: LanePrediction | None = None,
+    lanes: CenterlinePrediction | None = None,
     elements: ElementPrediction | None = None,
     *,
     threshold: float = 0.3,
@@ -190,7 +190,7 @@ def draw_boxes(
 def _draw_above(
     ax: Axes,
     example: Example,
-    lanes: LanePrediction | None,
+    lanes: CenterlinePrediction | None,
     title: str,
     threshold: float,
     ground: PerceptionRange,

@@ -7,13 +7,13 @@ matplotlib is imported when the first figure is made: it takes a second and is a
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,15 +50,13 @@ def new_figure(
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
-    """Write the figure in the format of the file's suffix, all or nothing, and return the path."""
+    """Write the figure whole or not at all, in the format of the file's suffix, and return the path.
+
+    Raises UserError where the file cannot be written.
+    """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with replacing(path) as temporary:
         figure.savefig(temporary, dpi=dpi, format=path.suffix.removeprefix(".") or "png")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

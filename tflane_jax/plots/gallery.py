@@ -23,7 +23,7 @@ from tflane_jax.plots.bev import (
     prepare,
 )
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
-from tflane_jax.scene import Example, LanePrediction
+from tflane_jax.scene import CenterlinePrediction, Example
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +40,7 @@ Tree = TypeVar("Tree")
 def save_examples(
     path: Path,
     examples: Example,
-    predictions: Mapping[str, LanePrediction] | None = None,
+    predictions: Mapping[str, CenterlinePrediction] | None = None,
     *,
     titles: Sequence[str] = (),
     ground: PerceptionRange = GROUND,

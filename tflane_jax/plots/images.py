@@ -11,10 +11,10 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from tflane_jax.evaluation.lane_shapes import left_to_right
 from tflane_jax.geometry.lane_shapes import curve_columns
-from tflane_jax.metrics.image_lanes import left_to_right
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.scene import LaneLines, LaneShapePrediction, RoadImage
+from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,7 @@ _POINTS = 100
 def save_road_images(
     path: Path,
     examples: RoadImage,
-    predictions: Mapping[str, LaneShapePrediction] | None = None,
+    predictions: Mapping[str, CurvePrediction] | None = None,
     *,
     titles: Sequence[str] = (),
 ) -> Path:
@@ -72,7 +72,7 @@ def save_photo(
     return save_figure(figure, path)
 
 
-def predicted_lines(prediction: LaneShapePrediction, count: int = _POINTS) -> Float[np.ndarray, "l p 2"]:
+def predicted_lines(prediction: CurvePrediction, count: int = _POINTS) -> Float[np.ndarray, "l p 2"]:
     """Return (u, v) of the detected lanes, left to right at their lower ends, as shares of the image.
 
     Args:

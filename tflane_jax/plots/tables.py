@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tflane_jax.files.atomic import write_text
 
 Row = Mapping[str, Any]
 
@@ -53,7 +54,10 @@ def save_table(
     stem = Path(stem)
     text = json.dumps({"meta": _plain(meta), "rows": _plain(rows)}, indent=1, allow_nan=False)
     table = format_table(rows, columns, title=title, digits=digits)
-    return _write(stem.with_name(stem.name + ".md"), table), _write(stem.with_name(stem.name + ".json"), text)
+    return (
+        write_text(stem.with_name(stem.name + ".md"), table + "\n"),
+        write_text(stem.with_name(stem.name + ".json"), text + "\n"),
+    )
 
 
 def _line(cells: Iterable[str], widths: list[int], right: list[bool]) -> str:
@@ -89,14 +93,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, (str, int, float, bool, type(None))) else str(value)
-
-
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text + "\n", encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path

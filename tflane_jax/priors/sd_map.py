@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
 from tflane_jax.scene import SdCategory, SdMap
 
@@ -20,11 +20,9 @@ class SdMapPriorConfig:
     """How an SD map becomes tokens.
 
     Attributes:
-        range: the box that normalised coordinates span.
         categories: labels, `scene.SdCategory`; a category beyond them counts as the last.
     """
 
-    range: PerceptionRange = BevGrid().range
     categories: int = len(SdCategory)
 
 
@@ -43,15 +41,18 @@ class SdMapTokens:
     valid: Bool[Array, " r"]
 
 
-def sd_map_tokens(sd_map: SdMap, config: SdMapPriorConfig) -> SdMapTokens:
-    """Return the tokens of one frame's SD map; padding may hold anything."""
+def sd_map_tokens(sd_map: SdMap, config: SdMapPriorConfig, bev_range: PerceptionRange) -> SdMapTokens:
+    """Return the tokens of one frame's SD map; padding may hold anything.
+
+    Normalised coordinates span `bev_range`, the box of the host's BEV features.
+    """
     xp = namespace(sd_map.points, sd_map.category, sd_map.valid)
     points = xp.where(sd_map.valid[:, None, None], sd_map.points, 0.0)
     known = (sd_map.category >= 0) & (sd_map.category < config.categories)
     category = xp.where(known, sd_map.category, config.categories - 1)
     labels = (category[:, None] == xp.arange(config.categories)[None]) & sd_map.valid[:, None]
     return SdMapTokens(
-        points=xp.where(sd_map.valid[:, None, None], config.range.normalise(points), 0.0),
+        points=xp.where(sd_map.valid[:, None, None], bev_range.normalise(points), 0.0),
         labels=labels.astype(points.dtype),
         valid=sd_map.valid,
     )

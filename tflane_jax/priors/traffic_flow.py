@@ -14,7 +14,7 @@ from typing import Literal
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
 from tflane_jax.scene import TrafficFlow
 
@@ -25,7 +25,6 @@ class TrafficFlowPriorConfig:
 
     Attributes:
         frames: f_t, how many past frames are used, the latest ones (paper: 20).
-        region: R_t; positions outside it are not used.
         min_valid_frames: tol_pts, an instance needs this many valid frames (paper: 5).
         max_instances: T_max, the number of slots (paper: N_t = 30).
         top_instances: T_top, how many slots may be filled; None fills all. 0 is inference without traffic flow.
@@ -34,11 +33,9 @@ class TrafficFlowPriorConfig:
         front_sector_deg: full opening of the sector ahead that has the highest weight (paper: 60).
         distance_scale: distance at which an instance outside that sector has lost half its weight, metres.
         coordinates: "normalised" aligns positions with the BEV in [0, 1] (Table 5, "Norm." = T); "metres" does not.
-        bev_range: the box that normalised coordinates span.
     """
 
     frames: int = 20
-    region: PerceptionRange = PerceptionRange()
     min_valid_frames: int = 5
     max_instances: int = 30
     top_instances: int | None = None
@@ -46,7 +43,6 @@ class TrafficFlowPriorConfig:
     front_sector_deg: float = 60.0
     distance_scale: float = 25.0
     coordinates: Literal["normalised", "metres"] = "normalised"
-    bev_range: PerceptionRange = BevGrid().range
 
 
 @struct.dataclass
@@ -74,8 +70,16 @@ class TrafficFlowTokens:
     index: Int[Array, " t"]
 
 
-def select_traffic_flow(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> TrafficFlowTokens:
+def select_traffic_flow(
+    flow: TrafficFlow, config: TrafficFlowPriorConfig, region: PerceptionRange, bev_range: PerceptionRange
+) -> TrafficFlowTokens:
     """Return the tokens of one frame's traffic flow; padding in `flow` may hold anything.
+
+    Args:
+        flow: tracks in the current ego frame.
+        config: selection.
+        region: R_t; positions outside it are not used. A host's perception range.
+        bev_range: the box that normalised coordinates span. That of the host's BEV features.
 
     Raises ValueError where the traffic flow holds fewer frames than the config asks for.
     """
@@ -95,7 +99,7 @@ def select_traffic_flow(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> Tr
     )
     seen = flow.valid if config.occluded_frames == "keep" else flow.valid & ~flow.occluded
     position = xp.where(flow.valid[..., None], flow.position, 0.0)
-    frame_valid = seen & config.region.contains(position)
+    frame_valid = seen & region.contains(position)
     instance_valid = frame_valid.sum(-1) >= max(config.min_valid_frames, 1)
 
     latest = _latest_valid(frame_valid)
@@ -114,7 +118,7 @@ def select_traffic_flow(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> Tr
     yaw = xp.where(frame_valid, flow.yaw[order], 0.0)
     coordinates = position[order]
     if config.coordinates == "normalised":
-        coordinates = config.bev_range.normalise(coordinates)
+        coordinates = bev_range.normalise(coordinates)
     return TrafficFlowTokens(
         position=xp.where(frame_valid[..., None], coordinates, 0.0),
         heading=xp.where(frame_valid[..., None], xp.stack([xp.cos(yaw), xp.sin(yaw)], -1), 0.0),

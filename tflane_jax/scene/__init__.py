@@ -8,30 +8,64 @@ Arrays are numpy on the host and jax on the device; dtype float32, bool and int3
 Host-side recordings in global coordinates (maps, poses, tracks) are in `tflane_jax.scene.logs`.
 """
 
-from tflane_jax.scene.example import Example, RoadImage, shapes_of, stack_examples
-from tflane_jax.scene.prediction import ElementPrediction, LanePrediction, LaneShapePrediction, Prediction
-from tflane_jax.scene.priors import MarkerObservations, RoadUser, SdCategory, SdMap, TrafficFlow
-from tflane_jax.scene.truth import Areas, AreaType, LaneGraph, LaneLines, LineType, TrafficElements
-from tflane_jax.scene.views import BevChannel, CameraViews
+from tflane_jax.scene.example import (
+    Example,
+    RoadImage,
+    shapes_of,
+    stack_examples,
+)
+from tflane_jax.scene.prediction import (
+    CenterlinePrediction,
+    CurvePrediction,
+    ElementPrediction,
+    LinePrediction,
+    Prediction,
+    SegmentPrediction,
+)
+from tflane_jax.scene.priors import (
+    MarkerObservations,
+    RoadUser,
+    SdCategory,
+    SdMap,
+    TrafficFlow,
+)
+from tflane_jax.scene.truth import (
+    Areas,
+    AreaType,
+    LaneGraph,
+    LaneLines,
+    LineClass,
+    LineType,
+    MapLines,
+    TrafficElements,
+)
+from tflane_jax.scene.views import (
+    BevChannel,
+    CameraViews,
+)
 
 __all__ = [
     "AreaType",
     "Areas",
     "BevChannel",
     "CameraViews",
+    "CenterlinePrediction",
+    "CurvePrediction",
     "ElementPrediction",
     "Example",
     "LaneGraph",
     "LaneLines",
-    "LanePrediction",
-    "LaneShapePrediction",
+    "LineClass",
+    "LinePrediction",
     "LineType",
+    "MapLines",
     "MarkerObservations",
     "Prediction",
     "RoadImage",
     "RoadUser",
     "SdCategory",
     "SdMap",
+    "SegmentPrediction",
     "TrafficElements",
     "TrafficFlow",
     "shapes_of",

@@ -1,4 +1,7 @@
-"""What models predict; a part that a model does not predict is None."""
+"""What models predict about one frame; a part that a model does not predict is None.
+
+Arrays may have a leading axis over decoder layers (`*layers`); without it, they are the last layer's answer.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +13,59 @@ from tflane_jax.scene.arrays import Array
 
 
 @struct.dataclass
-class LanePrediction:
-    """Lanes predicted by Q queries.
+class CenterlinePrediction:
+    """Centerlines predicted by Q queries.
 
     Attributes:
         points: (Q, P, 3) metres, ego frame, in driving direction.
-        logits: (Q, C) class logits (sigmoid); C = 1 for centerlines.
-        successor_logits: (Q, Q) [i, j]: lane j continues lane i.
+        logits: (Q, C) class logits (sigmoid); C = 1 for OpenLane-V2.
+        successor_logits: (Q, Q) [i, j]: lane j continues lane i; None for a model without topology.
     """
 
     points: Float[Array, "*layers q p 3"]
     logits: Float[Array, "*layers q c"]
-    successor_logits: Float[Array, "*layers q q"]
+    successor_logits: Float[Array, "*layers q q"] | None = None
 
     @property
     def scores(self) -> Float[Array, "*layers q"]:
         """Confidence of the best class, 0 to 1."""
         return jax.nn.sigmoid(self.logits).max(-1)
+
+
+@struct.dataclass
+class SegmentPrediction:
+    """Lane segments predicted by Q queries (OpenLane-V2 `lane_segment`, LaneSegNet).
+
+    Attributes:
+        points: (Q, P, 3) centerline, metres, ego frame, in driving direction.
+        left, right: (Q, P, 3) boundaries in driving direction, metres.
+        logits: (Q, C) class logits (sigmoid): lane segment, then pedestrian crossing.
+        left_type_logits, right_type_logits: (Q, T) by `LineType`; None where types are not predicted.
+        mask_logits: (Q, H, W) lane area on the BEV grid, row 0 at the least y; None without a mask head.
+        successor_logits: (Q, Q) [i, j]: segment j continues segment i; None for a model without topology.
+    """
+
+    points: Float[Array, "*layers q p 3"]
+    left: Float[Array, "*layers q p 3"]
+    right: Float[Array, "*layers q p 3"]
+    logits: Float[Array, "*layers q c"]
+    left_type_logits: Float[Array, "*layers q t"] | None = None
+    right_type_logits: Float[Array, "*layers q t"] | None = None
+    mask_logits: Float[Array, "*layers q h w"] | None = None
+    successor_logits: Float[Array, "*layers q q"] | None = None
+
+
+@struct.dataclass
+class LinePrediction:
+    """Map lines of a vector map predicted by Q queries (MapTR).
+
+    Attributes:
+        points: (Q, P, D) metres, ego frame; D = 2 or 3.
+        logits: (Q, C) class logits (sigmoid), by `LineClass`.
+    """
+
+    points: Float[Array, "*layers q p d"]
+    logits: Float[Array, "*layers q c"]
 
 
 @struct.dataclass
@@ -36,30 +75,42 @@ class ElementPrediction:
     Attributes:
         box: (E, 2, 2) top-left and bottom-right corners, pixels of camera 0.
         logits: (E, 13) by OpenLane-V2 attribute (sigmoid).
-        lane_logits: (Q, E) [i, e]: element e governs lane i of the `LanePrediction` beside it.
+        lane_logits: (Q, E) [i, e]: element e governs lane i of the prediction beside it; None without topology.
     """
 
     box: Float[Array, "*layers e 2 2"]
     logits: Float[Array, "*layers e a"]
-    lane_logits: Float[Array, "*layers q e"]
+    lane_logits: Float[Array, "*layers q e"] | None = None
 
 
 @struct.dataclass
-class Prediction:
-    """What a model says about one frame; a part that the model does not predict is None."""
-
-    lanes: LanePrediction | None = None
-    elements: ElementPrediction | None = None
-
-
-@struct.dataclass
-class LaneShapePrediction:
-    """Lane lines predicted by Q queries as parameters of the lane shape model (GTN paper, Eq. 7 and 8).
+class CurvePrediction:
+    """Lane lines of one image, predicted by Q queries as lane shape parameters (GTN paper, Eq. 7 and 8).
 
     Attributes:
         logits: (Q, 2) class logits (softmax), index 1 is a lane.
-        curves: (Q, 8) lower and upper end (alpha, beta: rows v), k'', f'', m'', n', b'', b''' in shares of the image.
+        curves: (Q, 8) lower and upper end (alpha, beta: rows v), k'', f'', m'', n', b'', b''' in fractions of the
+            image.
     """
 
     logits: Float[Array, "*layers q 2"]
     curves: Float[Array, "*layers q 8"]
+
+
+@struct.dataclass
+class Prediction:
+    """Everything that a model predicts about one frame; no model predicts all parts.
+
+    Attributes:
+        centerlines: merged centerlines and their topology.
+        segments: lane segments and their topology.
+        lines: lines of a vector map.
+        elements: traffic lights and signs.
+        curves: lane shapes in one image.
+    """
+
+    centerlines: CenterlinePrediction | None = None
+    segments: SegmentPrediction | None = None
+    lines: LinePrediction | None = None
+    elements: ElementPrediction | None = None
+    curves: CurvePrediction | None = None

@@ -27,6 +27,15 @@ class AreaType(enum.IntEnum):
     ROAD_BOUNDARY = 2
 
 
+class LineClass(enum.IntEnum):
+    """Class of a line of a vector map, as MapTR numbers it; MapTRv2 adds centerlines."""
+
+    DIVIDER = 0
+    CROSSING = 1
+    BOUNDARY = 2
+    CENTERLINE = 3
+
+
 @struct.dataclass
 class LaneGraph:
     """Directed lane graph: N lanes of P points.
@@ -104,6 +113,35 @@ class Areas:
         a, p = self.points.shape[:2]
         chex.assert_shape(self.points, (a, p, 3))
         chex.assert_shape([self.category, self.valid], (a,))
+
+
+@struct.dataclass
+class MapLines:
+    """Lines of a vector map: L polylines and rings of P points.
+
+    Attributes:
+        points: (L, P, 3) metres, ego frame; a ring repeats its first point at the end.
+        category: (L,) `LineClass`.
+        closed: (L,) the line is a ring, so that its start and direction mean nothing.
+        valid: (L,).
+    """
+
+    points: Float[Array, "l p 3"]
+    category: Int[Array, " l"]
+    closed: Bool[Array, " l"]
+    valid: Bool[Array, " l"]
+
+    @classmethod
+    def empty(cls, capacity: int, points: int) -> MapLines:
+        """Return a map with room for `capacity` lines of `points` points and none valid."""
+        flag = np.zeros(capacity, bool)
+        return cls(np.zeros((capacity, points, 3), np.float32), np.zeros(capacity, np.int32), flag, flag.copy())
+
+    def validate(self) -> None:
+        """Raise AssertionError naming the field whose shape does not fit the others."""
+        l, p = self.points.shape[:2]
+        chex.assert_shape(self.points, (l, p, 3))
+        chex.assert_shape([self.category, self.closed, self.valid], (l,))
 
 
 @struct.dataclass

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
+from tflane_jax.files import tusimple
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, DistanceCenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
 from tflane_jax.metrics.vector_map import CLASSES, Sampling, VectorMapMetrics
-from tflane_jax.scoring import maptr, openlane_v2, plain, tusimple
+from tflane_jax.scoring import maptr, openlane_v2, plain
 from tflane_jax.scoring.score import Accumulator
 
 

@@ -1,45 +1,40 @@
-"""What the program around the training loop must know of a kind of task: its data, its numbers, its pictures."""
+"""What a task is: a model with its loss, its data, its numbers and its pictures, in one typed object.
+
+A task is a frozen dataclass: its fields are settings, and jit takes it as a static argument. The training loop calls
+its learning part (`training.task.Trainable`), evaluation its predicting part (`evaluation.predict.Predictor`), and the
+program around them the rest.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Generic, TypeVar
 
+import jax
 import numpy as np
+from jaxtyping import Array, Float
 
-from tflane_jax.training.batches import Prepare
-from tflane_jax.training.loop import Draw
-from tflane_jax.training.task import Params, Task
+from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.streaming import Prepare, Streamed
+from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
+from tflane_jax.models.parameters import Params
+from tflane_jax.scene import Prediction
 
+ExampleT = TypeVar("ExampleT")
+"""What the task learns from: `Example` or `RoadImage`."""
+DataT = TypeVar("DataT")
+"""A split as `load` returns it and `evaluate` takes it."""
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What an evaluation found.
-
-    Attributes:
-        protocol: of the metrics, with its version.
-        groups: numbers by name, for each group that was measured ("all", "occluded", ...).
-        counts: names of numbers that count examples instead of rating them.
-    """
-
-    protocol: str
-    groups: Mapping[str, Mapping[str, float]]
-    counts: tuple[str, ...] = field(default=("frames", "lanes"))
-
-    def scores(self) -> dict[str, float]:
-        """Return the numbers as "group/name", without counts: what runs record and checkpoints are chosen by."""
-        return {
-            f"{group}/{name}": value
-            for group, values in self.groups.items()
-            for name, value in values.items()
-            if name not in self.counts
-        }
+Terms = dict[str, Float[Array, ""] | Params]
+"""Numbers to record of a loss; the entry `STATISTICS` holds new running statistics."""
+Draw = Callable[[Path, int, Params], None]
+"""(run folder, step, averaged parameters) -> pictures in the run folder."""
 
 
 @dataclass(frozen=True)
-class Model:
+class Model(Generic[ExampleT]):
     """A trained model as comparisons and pictures take it.
 
     Attributes:
@@ -47,63 +42,113 @@ class Model:
         params: of one seed.
     """
 
-    task: Any
+    task: Task[ExampleT, Any]
     params: Params
 
 
-class System(Protocol):
-    """One kind of task. `config` is a `config.RunConfig`, `source` what its `data.source(split)` gives."""
+@dataclass(frozen=True)
+class Task(Generic[ExampleT, DataT]):
+    """Base of all tasks. `Source` below is what `data.source(split)` gives."""
 
-    columns: tuple[str, ...]
+    columns: ClassVar[tuple[str, ...]] = ()
     """Of the evaluation's table, as far as an evaluation has them."""
-    compared: tuple[str, ...]
+    compared: ClassVar[tuple[str, ...]] = ()
     """Scores ("group/name") that a comparison tests, as far as all of its models have them."""
-    errors: tuple[str, ...]
-    """Those of them of which less is better."""
+    errors: ClassVar[tuple[str, ...]] = ()
+    """Compared scores where lower is better."""
 
-    def load(self, source: Any, *, progress: bool = True) -> Any:
-        """Return a split, as `evaluate` takes it: in memory, or a `datasets.streaming.Streamed` of it."""
-        ...
+    # -----------------------------------------------------------------------------------------------------------------
+    # Learning
 
-    def examples(self, config: Any, data: Any) -> Any:
-        """Return the examples of a split: what training looks at, as `training.batches` takes it."""
-        ...
+    @property
+    def frames(self) -> int:
+        """Successive frames that training sees as one example; 1 for frames on their own."""
+        return 1
 
-    def shapes(self, config: Any) -> Any:
-        """Return shapes and types of one example of a configuration, as far as can be told without its data."""
-        ...
+    def init(self, key: jax.Array, example: ExampleT) -> Params:
+        """Return fresh parameters; `example` gives shapes only."""
+        raise NotImplementedError
 
-    def check(self, config: Any, data: Any) -> None:
-        """Raise UserError where the first example of a split shows that a configuration's model cannot serve it."""
-        ...
+    def loss(self, params: Params, batch: ExampleT, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
+        """Return the loss of a batch (leading axis on every leaf) and what is recorded of it; `key` is for dropout."""
+        raise NotImplementedError
 
-    def prepare(self, config: Any) -> Prepare | None:
+    # -----------------------------------------------------------------------------------------------------------------
+    # Predicting
+
+    @property
+    def streams(self) -> bool:
+        """Whether evaluation predicts the frames of a scene one after the other, with memory."""
+        return False
+
+    def predict(self, params: Params, example: ExampleT) -> Prediction:
+        """Return the last decoder layer's prediction for one example, a frame on its own."""
+        raise NotImplementedError
+
+    def start(self) -> Any:
+        """Return the memory before the first frame of a sequence; None for a model without memory."""
+        return None
+
+    def step(self, params: Params, memory: Any, example: ExampleT) -> tuple[Any, Prediction]:
+        """Return the memory for the next frame, and the prediction for this one."""
+        return memory, self.predict(params, example)
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Data
+
+    def load(self, source: Any, *, progress: bool = True) -> DataT:
+        """Return a split, in memory or as a `Streamed` that reads it while it is used."""
+        raise NotImplementedError
+
+    def examples(self, data: DataT) -> ExampleT | Streamed:
+        """Return what training looks at of a split, as `datasets.batches` takes it."""
+        raise NotImplementedError
+
+    def shapes(self, data: SplitData) -> ExampleT:
+        """Return shapes and types of one example, as far as can be told without its data."""
+        raise NotImplementedError
+
+    def check(self, data: SplitData, train: DataT) -> None:
+        """Raise UserError where the training split shows that the model cannot learn from these data."""
+
+    def prepare(self, data: SplitData) -> Prepare | None:
         """Return the augmentation of training examples, None for none."""
-        ...
+        return None
 
-    def evaluate(self, task: Task, params: Params, data: Any, batch_size: int) -> Evaluation:
+    # -----------------------------------------------------------------------------------------------------------------
+    # Numbers and pictures
+
+    def evaluate(self, params: Params, data: DataT, config: EvaluationConfig) -> Evaluation:
         """Return the metrics of a model on a split."""
-        ...
+        raise NotImplementedError
 
-    def drawing(self, config: Any) -> Draw:
+    def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
+        """Return the names ("group/name") of the scores that evaluating on the validation split gives."""
+        raise NotImplementedError
+
+    def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws predictions for a few validation examples while training."""
-        ...
+        raise NotImplementedError
 
-    def inference_variants(self, task: Any) -> dict[str, Any]:
+    def draw_comparison(self, models: Mapping[str, Model[ExampleT]], source: Any, data: DataT, path: Path) -> Path:
+        """Draw what several models predict for the same examples; return the picture's path."""
+        raise NotImplementedError
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Comparing
+
+    def inference_variants(self) -> dict[str, Task[ExampleT, DataT]]:
         """Return further ways to use a trained model that a comparison lists, by what to add to its name."""
-        ...
+        return {}
 
-    def remarks(self, model: Model) -> dict[str, str]:
+    def remarks(self, params: Params) -> dict[str, str]:
         """Return further columns of a comparison's row."""
-        ...
+        del params
+        return {}
 
     def quoted(self) -> list[dict[str, str]]:
         """Return rows that a comparison quotes from papers."""
-        ...
-
-    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: Any, path: Path) -> Path:
-        """Draw what several models say about the same examples."""
-        ...
+        return []
 
 
 def spread(size: int, count: int) -> list[int]:

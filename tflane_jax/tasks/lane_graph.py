@@ -1,149 +1,172 @@
-"""The task "predict the lane graph": a host model, its loss and its answer, as the training program wants them."""
+"""The task "predict what is around the vehicle": a host model with its loss, data, metrics and pictures."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
 
 import jax
-from flax.traverse_util import flatten_dict
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.batches import first_example
+from tflane_jax.datasets.clips import as_clips
+from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.loading import TRAINING_PARTS, keep
+from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
+from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
-from tflane_jax.layers.batch_norm import BATCH_AXIS
-from tflane_jax.losses.lane_cells import lane_cell_loss
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_denoising_losses, lane_graph_loss
-from tflane_jax.models.auxiliary import AUXILIARY
-from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.host import HostMemory, start_memory
-from tflane_jax.models.marker_fusion import guide_frame
-from tflane_jax.models.toponet import TopoNetConfig, TrafficFlowConfig
-from tflane_jax.priors.marker_memory import MarkerGuidance
-from tflane_jax.scene import Example, Prediction
-from tflane_jax.training.task import STATISTICS, Params, split_statistics
+from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
+from tflane_jax.evaluation.predict import predict_examples
+from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
+from tflane_jax.files.openlane import ATTRIBUTES
+from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
+from tflane_jax.losses.common import HostLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
+from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
+from tflane_jax.models.bevformer import check_capacity
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.host import HostConfig, HostMemory
+from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
+from tflane_jax.models.priors import ByPrior, observe, observe_clip
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
+from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 
 T = TypeVar("T")
+_COMPARED_EXAMPLES = 6
 
 
 @dataclass(frozen=True)
-class LaneGraphTask:
-    """A host with the lane-graph loss; hashable, so that jit takes it as a static argument.
+class LaneGraphTask(Task[Example, Example | Streamed]):
+    """A host with its loss.
 
     Attributes:
         model: the host, with or without priors.
-        losses: weights of costs and losses.
+        losses: weights of the host's costs and losses.
         clip: frames of a scene that training runs through with memory, one after the other; an example is then a clip,
             a leading axis on every leaf, and evaluation streams through the scenes. 1: frames stand alone.
     """
 
-    model: TopoNetConfig | BevFormerDetrConfig = TopoNetConfig()
-    losses: LaneGraphLossConfig = LaneGraphLossConfig()
+    model: HostConfig = TopoNetConfig()
+    losses: HostLossConfig = TopoNetLossConfig()
     clip: int = 1
 
+    columns: ClassVar[tuple[str, ...]] = (
+        "lanes of",
+        "seed",
+        "OLS",
+        "DET_l",
+        "DET_t",
+        "TOP_ll",
+        "TOP_lt",
+        "DET_l@1.0",
+        "DET_l@2.0",
+        "DET_l@3.0",
+        "lanes",
+        "frames",
+    )
+    compared: ClassVar[tuple[str, ...]] = (
+        "all/OLS",
+        "all/DET_t",
+        "all/TOP_lt",
+        *(
+            f"{group}/{name}"
+            for name in ("DET_l", "TOP_ll", "recall")
+            for group in ("all", "occluded", "clear", *Sightings.groups)
+        ),
+    )
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Learning
+
     @property
-    def traffic_flow(self) -> TrafficFlowConfig | None:
-        """How the host uses traffic flow; None for a host without."""
-        return self.model.traffic_flow if isinstance(self.model, TopoNetConfig) else None
+    def frames(self) -> int:
+        """Frames of a clip."""
+        return self.clip
 
     def init(self, key: jax.Array, example: Example) -> Params:
         """Return fresh parameters; `example`, or a clip, gives shapes only."""
         if self.clip > 1:
             example = jax.tree.map(lambda leaf: leaf[0], example)
-        variables = self.model.build().init(key, example)
-        return dict(variables["params"]) | {name: variables[name] for name in (STATISTICS,) if name in variables}
+        return joined_statistics(self.model.build().init(key, example))
 
-    def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
+    def loss(self, params: Params, batch: Example, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
         """Return the loss of a batch (leading axis on every leaf) and its terms; `key` is for dropout."""
         learned, statistics = split_statistics(params)
         module, start = self.model.build(), self.start()
-        guides = jax.vmap(self._guides)(batch)
+        observations = jax.vmap(self._observations)(batch)
 
-        def frame(bev, statistics, example, guide, key):
+        def frame(bev, statistics, example, observations, key):
             variables, streams = {"params": learned} | statistics, {"dropout": key}
             kept, method = [STATISTICS, AUXILIARY], type(module).answer
             (outputs, bev), state = module.apply(
-                variables, example, bev, guide, train=True, method=method, mutable=kept, rngs=streams
+                variables, example, bev, observations, train=True, method=method, mutable=kept, rngs=streams
             )
             updated = {name: value for name, value in state.items() if name == STATISTICS}
-            # Flax keeps what is sown in a tuple.
-            flat: Any = flatten_dict(state.get(AUXILIARY, {}))
-            said = {path[-1]: values[0] for path, values in flat.items()}
-            return bev, updated, (outputs, said)
+            return bev, updated, (outputs, auxiliary_outputs(state))
 
-        def alone(example, guide, key):
-            _, updated, told = frame(None, statistics, example, guide, key)
-            return told, updated
+        def alone(example, observations, key):
+            _, updated, found = frame(None, statistics, example, observations, key)
+            return found, updated
 
-        def clip(examples, guides, key):
+        def clip(examples, observations, key):
             def body(carry, now):
-                bev, updated, told = frame(*carry, *now)
-                return (bev, updated), told
+                bev, updated, found = frame(*carry, *now)
+                return (bev, updated), found
 
-            frames = examples, guides, jax.random.split(key, self.clip)
+            frames = examples, observations, jax.random.split(key, self.clip)
             # Unrolled: inside of a loop XLA compiles the gradient of a convolution to code 25 times slower on a CPU.
-            (_, updated), told = lax.scan(body, (start.bev, statistics), frames, unroll=self.clip)
-            return told, updated
+            (_, updated), found = lax.scan(body, (start.bev, statistics), frames, unroll=self.clip)
+            return found, updated
 
         if self.clip > 1 and start.bev is None:
             # No frame needs what another one has learned.
-            batch, guides = _frames((batch, guides))
+            batch, observations = _frames((batch, observations))
         through_clips = self.clip > 1 and start.bev is not None
         keys = jax.random.split(key, len(jax.tree.leaves(batch)[0]))
         train: Any = jax.vmap(clip if through_clips else alone, axis_name=BATCH_AXIS, out_axes=(0, None))
-        (outputs, said), updated = train(batch, guides, keys)
+        (outputs, auxiliary), updated = train(batch, observations, keys)
         if through_clips:
-            outputs, said, batch = _frames((outputs, said, batch))
-        if outputs.elements is None:
-            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses)
-        elif batch.traffic_elements is None or batch.cameras is None:
-            raise UserError(
-                "the model predicts traffic elements, and these data label none: choose data with front images and "
-                "traffic elements, or set task.model.elements to None"
-            )
-        else:
-            sizes = batch.cameras.size[:, 0]
-            loss, terms = lane_graph_loss(outputs, batch.lanes, self.losses, batch.traffic_elements, sizes)
-        if "denoised" in said:
-            every = lane_denoising_losses(said["denoised"], batch.lanes, self.losses)
-            terms |= {f"denoised_{name}": term[-1] for name, term in every.items()}
-            loss += sum(term.sum() for term in every.values())
-        if "lane_cells" in said:
-            each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
-            losses = each(said["lane_cells"], batch.lanes, self.model.decoder.range)
-            terms["cells"] = self.losses.cell_weight * losses.mean()
-            loss += terms["cells"]
-        return loss, terms | updated
+            outputs, auxiliary, batch = _frames((outputs, auxiliary, batch))
+        loss, report = self.losses.loss(outputs, auxiliary, batch, self.model)
+        return loss, report | updated
 
-    def _guides(self, example: Example) -> MarkerGuidance | None:
-        """Return what markers tell of a frame, or of each frame of a clip; there is nothing to learn in it."""
-        markers = self.model.markers
-        if markers is None:
-            return None
-        if self.clip == 1:
-            return guide_frame(example, None, markers)[0]
+    def _observations(self, example: Example) -> ByPrior:
+        """Return what the priors observe in a frame, or in each frame of a clip; nothing in it is learned."""
+        priors = self.model.build_priors()
+        return observe(priors, example, {})[0] if self.clip == 1 else observe_clip(priors, example)
 
-        def body(memory, example):
-            guide, memory = guide_frame(example, memory, markers)
-            return memory, guide
+    # -----------------------------------------------------------------------------------------------------------------
+    # Predicting
 
-        return lax.scan(body, self.start().markers, example)[1]
+    @property
+    def streams(self) -> bool:
+        """A model that is trained on clips is evaluated on streams."""
+        return self.clip > 1
 
     def predict(self, params: Params, example: Example) -> Prediction:
-        """Return the last decoder layer's answer for one example, a frame on its own."""
+        """Return the last decoder layer's prediction for one example, a frame on its own."""
         return self.step(params, None, example)[1]
 
     def start(self) -> HostMemory:
         """Return the memory before the first frame of a sequence."""
-        return start_memory(self.model.encoder, self.model.markers)
+        return self.model.start()
 
     def step(self, params: Params, memory: HostMemory | None, example: Example) -> tuple[HostMemory, Prediction]:
-        """Return the memory for the next frame, and the answer for this one.
+        """Return the memory for the next frame, and the prediction for this one.
 
         The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a
         leading axis, `lax.scan(partial(task.step, params), task.start(), examples)`.
         """
-        # What depends on parameters alone must stay inside a scan: taken out, it is rounded otherwise than in a stream.
+        # Terms of parameters alone must stay inside a scan: hoisted out of it, they are rounded otherwise.
         params, example = lax.optimization_barrier((params, example))
         learned, statistics = split_statistics(params)
         module = self.model.build()
@@ -151,6 +174,133 @@ class LaneGraphTask:
         result: Any = module.apply(variables, example, memory, method=type(module).step)
         outputs, following = result
         return following, jax.tree.map(lambda layers: layers[-1], outputs)
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Data
+
+    def load(self, source: Any, *, progress: bool = True) -> Example | Streamed:
+        """Return the examples of a source, see `datasets.sources.load`."""
+        return sources.load(source, progress=progress, parts=self.parts)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Fields of `Example` that training and evaluation read."""
+        further = {name for prior in self.model.build_priors().values() for name in prior.reads}
+        return (*TRAINING_PARTS, *sorted(further - set(TRAINING_PARTS)))
+
+    def examples(self, data: Example | Streamed) -> Example | Streamed:
+        """Return the examples themselves, or the clips that they form."""
+        return data if self.clip == 1 else as_clips(data, self.clip)
+
+    def shapes(self, data: SplitData) -> Example:
+        """Return shapes of the training parts of an example."""
+        return shapes_of(keep(sources.sample(data.source("train")), self.parts))
+
+    def check(self, data: SplitData, train: Example | Streamed) -> None:
+        """Raise UserError where a camera sees more BEV cells than it can serve."""
+        encoder, cameras = self.model.encoder, first_example(train).cameras
+        if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
+            check_capacity(encoder.bev, cameras)
+
+    def prepare(self, data: SplitData) -> Prepare | None:
+        """Return the photometric augmentation of the data, if they have one."""
+        augmentation = getattr(data, "augmentation", None)
+        return None if augmentation is None else partial(_augmented, augmentation)
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Numbers and pictures
+
+    def evaluate(self, params: Params, data: Example | Streamed, config: EvaluationConfig) -> Evaluation:
+        """Return the metrics of everything that the host predicts and the examples label."""
+        metrics = evaluate_lanes(self, params, data, config.batch_size)
+        return Evaluation(metrics.protocol, metrics.compute())
+
+    def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
+        """Return OpenLane-V2's centerline metrics by group, with those of traffic elements if the model has them."""
+        marked = data.source("val").example.markers is not None
+        groups = Sightings.groups if marked else ()
+        names = set(Evaluation("", GroupedCenterlineMetrics(frame_groups=groups).compute()).scores())
+        if self.model.elements is not None:
+            of_elements = ("OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES)))
+            names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}
+        return names
+
+    def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
+        """Return the function that draws a few validation examples from above and in their camera images."""
+        from tflane_jax.plots import save_camera_views, save_examples
+
+        source = data.source("val")
+        dataset = sources.open_dataset(source)
+        indices = spread(len(dataset), config.pictures)
+
+        def draw(folder: Path, step: int, params: Params) -> None:
+            if indices:
+                examples, answer = predict_examples(self, params, dataset, indices)
+                path, names = folder / "pictures" / f"step_{step:08d}.png", titles(dataset, indices)
+                ground, view = source.example.ground, source.example.range
+                lanes = {f"step {step}": answer.centerlines}
+                save_examples(path, examples, lanes, titles=names, ground=ground, view=view)
+                if examples.cameras is not None:
+                    path = path.with_stem(f"{path.stem}_cameras")
+                    lanes, elements = answer.centerlines, answer.elements
+                    save_camera_views(path, examples, lanes, elements, titles=names, ground=ground, view=view)
+
+        return draw
+
+    def draw_comparison(
+        self, models: Mapping[str, Model[Example]], source: Any, data: Example | Streamed, path: Path
+    ) -> Path:
+        """Draw the test frames with the most hidden lanes (of streamed data, any), every model beside the truth."""
+        from tflane_jax.plots import save_examples
+
+        dataset = sources.open_dataset(source)
+        if isinstance(data, Streamed):
+            indices = spread(len(data), _COMPARED_EXAMPLES)
+        else:
+            hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
+            indices = np.argsort(-hidden, kind="stable")[:_COMPARED_EXAMPLES].tolist()
+        examples = stack_examples([dataset.example(index) for index in indices])
+        lanes = {
+            name: predict_examples(model.task, model.params, dataset, indices)[1].centerlines
+            for name, model in models.items()
+        }
+        names = titles(dataset, indices)
+        ground, view = source.example.ground, source.example.range
+        return save_examples(path, examples, lanes, titles=names, ground=ground, view=view)
+
+    # -----------------------------------------------------------------------------------------------------------------
+    # Comparing
+
+    def inference_variants(self) -> dict[str, Task[Example, Example | Streamed]]:
+        """Return a model with traffic flow once more without any (TF-Lane, Table 7)."""
+        if self.model.priors.traffic_flow is None:
+            return {}
+        return {"no traffic flow at inference": limit_instances(self, 0)}
+
+
+def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:
+    return augment_example(example, config, key)
+
+
+def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
+    """Return the task with at most `count` instances of traffic flow, the heaviest; 0 is inference without.
+
+    The parameters stay the same. Raises UserError where the model takes no traffic flow or has fewer slots.
+    """
+    traffic = task.model.priors.traffic_flow
+    if traffic is None:
+        raise UserError("this run is a baseline without traffic flow: --max-instances has nothing to limit")
+    if not 0 <= count <= traffic.prior.max_instances:
+        raise UserError(f"--max-instances {count} is outside 0 to {traffic.prior.max_instances}, the model's slots")
+    limited = replace(traffic, prior=replace(traffic.prior, top_instances=count))
+    priors = replace(task.model.priors, traffic_flow=limited)
+    return replace(task, model=replace(task.model, priors=priors))
+
+
+def titles(dataset: Dataset, indices: list[int]) -> list[str]:
+    """Return a title for the picture of each example."""
+    infos = [dataset.info(index) for index in indices]
+    return [f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]
 
 
 def _frames(clips: T) -> T:

@@ -1,24 +1,57 @@
-"""The task "find the lane lines of one image": the LSTR family with its fitting loss, as training wants it."""
+"""The task "find the lane lines of one image": the LSTR family (GTN paper), measured by TuSimple's metric."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from tflane_jax.layers.batch_norm import BATCH_AXIS
-from tflane_jax.losses.lane_shape import LaneShapeLossConfig, cell_loss, lane_shape_loss, lane_shape_targets
-from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.datasets import sources
+from tflane_jax.datasets.augmentation import augment
+from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.lane_rows import LabelledImages
+from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
+from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
+from tflane_jax.datasets.streaming import Prepare
+from tflane_jax.evaluation import lane_shapes
+from tflane_jax.evaluation.predict import predict_batch, predictions
+from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
+from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
+from tflane_jax.losses.lane_shape import LaneShapeLossConfig, lane_shape_loss, lane_shape_targets
+from tflane_jax.metrics.tusimple import TuSimpleMetrics
+from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.lstr import LstrConfig, normalise
-from tflane_jax.scene import LaneShapePrediction, RoadImage
-from tflane_jax.training.task import STATISTICS, Params, split_statistics
+from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
+from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
+from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.world.front_view.lines import CAPACITY, ROWS
+
+# The metric's image: rows and columns of TuSimple.
+HEIGHT, WIDTH = 720, 1280
+_COMPARED_EXAMPLES = 6
+_TIMED_FRAMES = 30
+
+# Table 1 of the GTN paper, on the 2,782 test images of TuSimple; percent, as our own rows.
+_TABLE_1 = (
+    ("SCNN", 7, 96.53, 6.17, 1.80),
+    ("PINet", 30, 96.70, 2.94, 2.63),
+    ("FastDraw", 90, 95.20, 7.60, 4.50),
+    ("GTN paper", 420, 96.21, 2.93, 4.02),
+)
 
 
 @dataclass(frozen=True)
-class LaneShapeTask:
-    """A network of the LSTR family; hashable, so that jit takes it as a static argument.
+class LaneShapeTask(Task[RoadImage, LabelledImages]):
+    """A network of the LSTR family with its loss.
 
     Attributes:
         model: the network.
@@ -28,37 +61,154 @@ class LaneShapeTask:
     model: LstrConfig = LstrConfig()
     losses: LaneShapeLossConfig = LaneShapeLossConfig()
 
+    columns: ClassVar[tuple[str, ...]] = ("seed", "Accuracy", "FP", "FN", "loss", "frames")
+    compared: ClassVar[tuple[str, ...]] = ("all/Accuracy", "all/FP", "all/FN")
+    errors: ClassVar[tuple[str, ...]] = ("all/FP", "all/FN")
+
     def init(self, key: jax.Array, example: RoadImage) -> Params:
         """Return fresh parameters; `example` gives shapes only."""
-        variables = self.model.build().init(key, normalise(example.image, example.image_valid), example.image_valid)
-        return dict(variables["params"]) | {STATISTICS: variables["batch_stats"]}
+        image = normalise(example.image, example.image_valid)
+        return joined_statistics(self.model.build().init(key, image, example.image_valid))
 
-    def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
+    def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
         """Return the loss of a batch (leading axis on every leaf) and its terms; norms use the batch's statistics."""
         learned, statistics = split_statistics(params)
         module, keys = self.model.build(), jax.random.split(key, len(batch.image))
 
         def one(image, valid, key):
             variables = {"params": learned} | statistics
-            prediction, updated = module.apply(
+            curves, state = module.apply(
                 variables, image, valid, train=True, mutable=[STATISTICS, AUXILIARY], rngs={"dropout": key}
             )
-            state: dict[str, Any] = dict(updated)
-            return prediction, state.get(AUXILIARY, {}), state[STATISTICS]
+            return curves, auxiliary_outputs(state), state[STATISTICS]
 
         images = normalise(batch.image, batch.image_valid)
-        train = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
-        prediction, auxiliary, updated = train(images, batch.image_valid, keys)
-        targets = lane_shape_targets(batch.lines, shared_horizon=self.losses.shared_horizon)
-        loss, terms = lane_shape_loss(prediction, targets, self.losses)
-        if self.model.cells:
-            terms["cells"] = self.losses.cell_weight * jax.vmap(cell_loss)(auxiliary["cells"][0], targets).mean()
-            loss += terms["cells"]
-        return loss, terms | {STATISTICS: updated}
+        train: Any = jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, 0, None))
+        curves, auxiliary, updated = train(images, batch.image_valid, keys)
+        loss, report = self.losses.loss(Prediction(curves=curves), auxiliary, batch, self.model)
+        return loss, report | {STATISTICS: updated}
 
-    def predict(self, params: Params, example: RoadImage) -> LaneShapePrediction:
-        """Return the last decoder layer's answer for one example; its lines are not looked at."""
+    def predict(self, params: Params, example: RoadImage) -> Prediction:
+        """Return the last decoder layer's prediction for one example; its lines are not looked at."""
         learned, statistics = split_statistics(params)
         image = normalise(example.image, example.image_valid)
         layers = self.model.build().apply({"params": learned} | statistics, image, example.image_valid)
-        return jax.tree.map(lambda leaf: leaf[-1], layers)
+        return Prediction(curves=jax.tree.map(lambda leaf: leaf[-1], layers))
+
+    def load(self, source: Any, *, progress: bool = True) -> LabelledImages:
+        """Return the images of a source, stacked, with their labels."""
+        return sources.load(source, progress=progress)
+
+    def examples(self, data: LabelledImages) -> RoadImage:
+        """Return the images with their lines."""
+        return data.images
+
+    def shapes(self, data: SplitData) -> RoadImage:
+        """Return shapes of images at the network's resolution."""
+        lines = LaneLines.empty(CAPACITY, len(ROWS))
+        size = (INPUT_HEIGHT, INPUT_WIDTH)
+        return shapes_of(RoadImage(np.zeros((*size, 3), np.uint8), np.zeros(size, bool), lines))
+
+    def prepare(self, data: SplitData) -> Prepare | None:
+        """Return the augmentation of the data, None for none."""
+        augmentation = getattr(data, "augmentation", None)
+        if augmentation is None:
+            return None
+
+        def prepare(example: RoadImage, key: tuple[int, int, int]) -> RoadImage:
+            return augment(example, augmentation, key)
+
+        return prepare
+
+    def evaluate(self, params: Params, data: LabelledImages, config: EvaluationConfig) -> Evaluation:
+        """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss."""
+        metrics, losses = TuSimpleMetrics(), []
+        for indices, answer in predictions(self, params, data.images, config.batch_size):
+            lines = jax.tree.map(lambda leaf, i=indices: leaf[i.start : i.stop], data.images.lines)
+            losses += [float(_loss(self, answer.curves, lines))] * len(indices)
+            for row, index in enumerate(indices):
+                truth, found = data.truth[index], jax.tree.map(lambda leaf, i=row: leaf[i], answer.curves)
+                metrics.update(found_lanes(found, truth), truth)
+        return Evaluation(metrics.protocol, {"all": metrics.compute() | {"loss": float(np.mean(losses))}})
+
+    def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
+        """Return TuSimple's metrics and the loss."""
+        return {f"all/{name}" for name in ("Accuracy", "FP", "FN", "loss")}
+
+    def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
+        """Return the function that draws lanes over a few validation images."""
+        from tflane_jax.plots.images import save_road_images
+
+        dataset = sources.open_dataset(data.source("val"))
+        indices = spread(len(dataset), config.pictures)
+        examples = stack_examples([dataset.example(index) for index in indices]) if indices else None
+
+        def draw(folder: Path, step: int, params: Params) -> None:
+            if examples is not None:
+                answer = predict_curves(self, params, examples)
+                save_road_images(folder / "pictures" / f"step_{step:08d}.png", examples, {f"step {step}": answer})
+
+        return draw
+
+    def draw_comparison(
+        self, models: Mapping[str, Model[RoadImage]], source: Any, data: LabelledImages, path: Path
+    ) -> Path:
+        """Draw a few test images, every model beside the truth."""
+        from tflane_jax.plots.images import save_road_images
+
+        images = data.images
+        examples = jax.tree.map(lambda leaf: leaf[spread(len(images.image), _COMPARED_EXAMPLES)], images)
+        answers = {name: predict_curves(model.task, model.params, examples) for name, model in models.items()}
+        return save_road_images(path, examples, answers)
+
+    def remarks(self, params: Params) -> dict[str, str]:
+        """Return how many images a second the model takes on this machine, one at a time."""
+        return {"fps": f"{frames_per_second(self, params):.0f}", "source": "this run"}
+
+    def quoted(self) -> list[dict[str, str]]:
+        """Return Table 1 of the paper."""
+        return [
+            {
+                "model": name,
+                "all/Accuracy": f"{accuracy:.1f}",
+                "all/FP": f"{fp:.1f}",
+                "all/FN": f"{fn:.1f}",
+                "fps": str(fps),
+                "source": "quoted: GTN paper, TuSimple test, its GPU",
+            }
+            for name, fps, accuracy, fp, fn in _TABLE_1
+        ]
+
+
+def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
+    """Return the lanes of one prediction at the rows of the truth."""
+    assert truth.rows is not None, "labels have rows"
+    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
+
+
+def predict_curves(task: Task[RoadImage, Any], params: Params, examples: RoadImage) -> CurvePrediction:
+    """Return the predictions for stacked images, numpy."""
+    ((_, answer),) = predictions(task, params, examples, len(examples.image))
+    return answer.curves
+
+
+def frames_per_second(
+    task: Task[RoadImage, Any], params: Params, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH
+) -> float:
+    """Return how many images a second a model takes one at a time, from uint8 image to curves, compilation apart."""
+    image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
+    lines = jax.tree.map(lambda leaf: leaf[None], LaneLines.empty(1, 1))
+    batch = jax.device_put(RoadImage(image, np.ones((1, height, width), bool), lines))
+    params, seconds = jax.device_put(params), []
+    for _ in range(_TIMED_FRAMES):
+        began = time.perf_counter()
+        jax.block_until_ready(predict_batch(task, params, batch))
+        seconds.append(time.perf_counter() - began)
+    return 1.0 / float(np.median(seconds[1:]))
+
+
+@partial(jax.jit, static_argnums=0)
+def _loss(task: LaneShapeTask, answer: CurvePrediction, lines: Any) -> jax.Array:
+    one_layer = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], answer)
+    targets = lane_shape_targets(lines, shared_horizon=task.losses.shared_horizon)
+    return lane_shape_loss(one_layer, targets, task.losses)[0]

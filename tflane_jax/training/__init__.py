@@ -1,5 +1,5 @@
-"""Training: state, update step, schedules, batches, checkpoints and the loop that joins them (issue letter I).
+"""Training: state, update step, schedules, batches, checkpoints and the loop that joins them.
 
-A *task* (`training.task.Task`) is all that the program knows of a model; the loop knows no dataset, metric or picture
-either: evaluation and drawing come in as functions.
+The program sees a model only through its *task* (`training.task.Task`). The loop knows no dataset, metric or picture:
+it takes functions that evaluate and draw.
 """

@@ -1,12 +1,13 @@
-"""Checkpoints: whole or absent, checked against checksums, self-contained.
+"""Checkpoints: complete or absent, verified by checksums, self-contained.
 
-One folder per checkpoint, `step_00001000/`: the state as an orbax tree of plain arrays (`state/`) and `manifest.json`
-with the step, its metrics, what the loop wants back, the run's resolved configuration, and the checksum of every file
-of the state. It is written beside its place and renamed into it. Nothing is ever unpickled.
+A checkpoint is a folder, `step_00001000/`. `state/` holds the training state as an orbax tree of plain arrays.
+`manifest.json` holds the step, its metrics, the loop's progress, the run's resolved configuration, and the checksum of
+every file of the state. The folder is written under another name and then renamed. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -20,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import serialization
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from tflane_jax.errors import UserError
 from tflane_jax.training.state import TrainState
@@ -30,13 +32,13 @@ Which = int | Literal["last", "best"]
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a checkpoint says about itself.
+    """Description of a checkpoint.
 
     Attributes:
         step: updates made.
         config: the run's resolved configuration, plain JSON.
         metrics: of the evaluation at this step; empty where there was none.
-        progress: what the loop needs to go on as if it had never stopped.
+        progress: what the loop restores beside the state, so that a resumed run gives the same records.
         files: CRC-32 of every file of the state, by path relative to the checkpoint.
         version: of this layout.
     """
@@ -71,17 +73,24 @@ class Checkpoints:
         return self.folder / f"step_{step:08d}"
 
     def best_step(self) -> int | None:
-        """Return the step with the highest best metric (the earliest of equals), None where nothing was evaluated."""
+        """Return the step with the highest best metric (the earliest of equals), None if none was evaluated."""
         scores = [(self.manifest(step).metrics.get(self._best_metric), -step) for step in self.steps()]
         found = [(score, negative) for score, negative in scores if score is not None and np.isfinite(score)]
         return -max(found)[1] if found else None
 
     def save(self, state: TrainState, manifest: Manifest) -> Path:
-        """Write a checkpoint, in place of one of the same step, and drop those that need not be kept."""
+        """Write a checkpoint and drop those that need not be kept.
+
+        A checkpoint of the same step is replaced, unless it was evaluated: its metrics may make it the best one, and
+        the state after a step is always the same.
+        """
+        place = self.path(manifest.step)
+        if place.exists() and self._is_evaluated(manifest.step):
+            return place
         self.folder.mkdir(parents=True, exist_ok=True)
         for stale in self.folder.glob(".writing-*"):  # left behind by a process that was killed
             shutil.rmtree(stale, ignore_errors=True)
-        writing, place = self.folder / f".writing-{os.getpid()}", self.path(manifest.step)
+        writing = self.folder / f".writing-{os.getpid()}"
         try:
             _save_tree(writing / "state", _plain(state))
             content = asdict(manifest) | {"files": _checksums(writing)}
@@ -96,7 +105,7 @@ class Checkpoints:
         return place
 
     def manifest(self, step: int) -> Manifest:
-        """Return what the checkpoint says about itself; raises UserError where it is damaged."""
+        """Return the description of a checkpoint; raises UserError if it is damaged."""
         try:
             content = json.loads((self.path(step) / "manifest.json").read_text(encoding="utf-8"))
             manifest = Manifest(**content)
@@ -109,7 +118,7 @@ class Checkpoints:
         return manifest
 
     def find(self, which: Which) -> int:
-        """Return the step that is meant; raises UserError, listing what there is, where there is no such one."""
+        """Return the step of a checkpoint; raises UserError, with a list of those that exist, if there is none."""
         steps = self.steps()
         if not steps:
             raise UserError(f"{self.folder} holds no checkpoint: the run ended before its first one was written")
@@ -144,7 +153,7 @@ class Checkpoints:
         return jax.device_put(_with_keys(state, template))
 
     def arrays(self, step: int) -> dict[str, np.ndarray]:
-        """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError where they are damaged."""
+        """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError if they are damaged."""
         folder, manifest = self.path(step), self.manifest(step)
         try:
             if (found := _checksums(folder)) != manifest.files:
@@ -158,7 +167,20 @@ class Checkpoints:
         """Return the averaged parameters of a checkpoint (leading seed axis where it has several), numpy."""
         prefix = "ema_params/"
         arrays = self.arrays(step)
-        return _nested({name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)})
+        averaged = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+        return unflatten_dict(averaged, sep="/")
+
+    def content(self, step: int) -> str:
+        """Return a hash of a checkpoint's arrays and of the configuration that it was made with."""
+        manifest = self.manifest(step)
+        text = json.dumps([manifest.step, manifest.files, manifest.config], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _is_evaluated(self, step: int) -> bool:
+        try:
+            return bool(self.manifest(step).metrics)
+        except UserError:  # damaged: to be replaced
+            return False
 
     def _drop_old(self) -> None:
         steps = self.steps()
@@ -174,14 +196,14 @@ class Checkpoints:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Arrays on disk. Orbax is imported where it is used, because that takes long.
+# Arrays on disk. Orbax is imported in the functions that need it, because its import takes about a second.
 
 
 def _save_tree(folder: Path, tree: dict[str, np.ndarray]) -> None:
     import orbax.checkpoint as ocp
 
     with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as writer:
-        writer.save(folder.absolute(), args=ocp.args.PyTreeSave(_nested(tree)))
+        writer.save(folder.absolute(), args=ocp.args.PyTreeSave(unflatten_dict(tree, sep="/")))
 
 
 def _load_tree(folder: Path) -> dict[str, np.ndarray]:
@@ -232,20 +254,6 @@ def _first_difference(tree: dict[str, Any], expected: dict[str, Any]) -> str | N
     return None
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(tree: dict[str, Any]) -> dict[str, Any]:
     """Return the leaves of nested dicts by path; empty dicts vanish."""
-    out: dict[str, Any] = {}
-    for name, value in tree.items():
-        out |= _flat(value, f"{prefix}{name}/") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return out
-
-
-def _nested(leaves: dict[str, Any]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for path, leaf in leaves.items():
-        *parents, name = path.split("/")
-        node = out
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[name] = leaf
-    return out
+    return flatten_dict(tree, sep="/")  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Parameters to start from: those of another run, whole or as far as the two models are the same."""
+"""Starting from the parameters of another run: all of them, or those that both models have."""
 
 from __future__ import annotations
 
@@ -12,38 +12,59 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.migrations import migrate
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config
 from tflane_jax.training.state import TrainState, per_seed
-from tflane_jax.training.task import Params
 
 
 def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, partly: bool) -> list[Params]:
-    """Return the parameters that each seed starts from: the best averaged ones of a run (the last, where none was
-    evaluated).
+    """Return the parameters that each seed starts from: the averaged ones of a run's best checkpoint.
+
+    The last checkpoint counts as best if none was evaluated.
 
     Args:
-        reference: run folder; `{seed}` in it stands for the seed, so that each starts from a run of its own.
+        reference: run folder; `{seed}` in it is replaced by the seed, so that each seed can have its own run.
         state: fresh.
         seeds: of the state.
-        partly: keep the fresh parameters of what the run's model lacks, and leave out what only that one has.
+        partly: keep fresh parameters where the run's model has none, and ignore those that only that model has.
 
     Raises:
-        UserError: no such run, or it holds another model; where `partly`, one with nothing in common or with a
-            parameter of another shape.
+        UserError: no such run, or a run of another model; with `partly`, a model without common parameters or with
+            a parameter of another shape.
     """
     return [
-        _params_of_run(Path(reference.replace("{seed}", str(seed))), fresh.params, partly=partly)
-        for seed, fresh in zip(seeds, per_seed(state, seeds), strict=True)
+        _params_of_run(folder, fresh.params, partly=partly)
+        for folder, fresh in zip(_folders(reference, seeds), per_seed(state, seeds), strict=True)
     ]
 
 
-def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
-    settings = read_config(folder)["training"]
+def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Return folder, step and content of the checkpoint that each seed starts from, see `starting_params`."""
+    found = []
+    for folder in _folders(reference, seeds):
+        checkpoints, step, _ = _starting_checkpoint(folder)
+        found.append({"run": str(folder), "step": step, "content": checkpoints.content(step)})
+    return found
+
+
+def _folders(reference: str, seeds: Sequence[int]) -> list[Path]:
+    return [Path(reference.replace("{seed}", str(seed))) for seed in seeds]
+
+
+def _starting_checkpoint(folder: Path) -> tuple[Checkpoints, int, list[int]]:
+    """Return the checkpoints of a run, the step to start from, and the run's seeds."""
+    settings = migrate(read_config(folder))[0]["training"]
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
     step = checkpoints.best_step()
-    params = checkpoints.params(checkpoints.find("last") if step is None else step)
-    saved, wanted = (_flat(tree) for tree in (per_seed(params, settings["seeds"])[0], fresh))
+    return checkpoints, checkpoints.find("last") if step is None else step, settings["seeds"]
+
+
+def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
+    checkpoints, step, seeds = _starting_checkpoint(folder)
+    params = checkpoints.params(step)
+    saved, wanted = (_flat(tree) for tree in (per_seed(params, seeds)[0], fresh))
     for name in sorted(saved.keys() & wanted.keys()):
         if _shape(saved[name]) != _shape(wanted[name]):
             raise UserError(

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a wish to stop after the current step."""
+"""Ctrl-C and SIGTERM as a request to stop after the current step."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from types import FrameType, TracebackType
 
 
 class StopRequest:
-    """While the block lasts, SIGINT and SIGTERM set `signal`; a second one acts at once, as usual.
+    """Inside the block, SIGINT and SIGTERM set `signal`; a second one has its usual effect.
 
-    Outside the main thread signals are left alone.
+    Outside the main thread, signals are not touched.
     """
 
     signal: int | None = None

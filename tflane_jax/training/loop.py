@@ -1,7 +1,7 @@
 """The training program, top to bottom: set up, state, compile, steps, evaluation, checkpoints, stop.
 
-It knows no dataset, metric or picture: the caller hands in arrays, a function that evaluates and one that draws. All
-that a run needs to go on is in its folder (`training.run_folder`).
+It knows no dataset, metric or picture: the caller passes arrays, a function that evaluates and one that draws. The run
+folder (`training.run_folder`) holds all that is needed to resume.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,25 +18,30 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from tflane_jax.config_io import first_difference
+from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.adaptive import Memory
-from tflane_jax.training.batches import Prepare, batches, first_example
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
-from tflane_jax.training.fine_tuning import starting_params
+from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import Start, claimed, read_config, write_json, write_text
+from tflane_jax.training.run_folder import Start, claimed, read_config
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states, per_seed, with_params
 from tflane_jax.training.step import compiled_update
-from tflane_jax.training.task import Params, Task
+from tflane_jax.training.task import Trainable
 
 Evaluate = Callable[[Params], dict[str, float]]
 """Averaged parameters of one seed -> numbers by name."""
 Draw = Callable[[Path, int, Params, list[Record]], None]
 """(run folder, step, averaged parameters of the first seed, all records) -> pictures in the run folder."""
+CurrentForm = Callable[[dict[str, Any]], tuple[dict[str, Any], list[str]]]
+"""Saved configuration (JSON) -> the same in the form of this version, and notices for the user."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +51,16 @@ class TrainingConfig:
     Attributes:
         steps: updates.
         batch_size: examples of an update (of each seed).
-        seeds: roots of everything random in training; several train side by side in one program, each exactly as it
-            would alone up to float rounding.
+        seeds: roots of all random numbers in training. Several seeds train in one program, each as it would alone up
+            to float rounding.
         log_every: steps between records; a record holds means over the steps since the last one.
         eval_every: steps between evaluations, each with a checkpoint and pictures; the last step always has one.
         checkpoint_every: steps between further checkpoints.
         keep_checkpoints: how many of the latest to keep, beside the best.
-        best_metric: of the evaluation, higher is better.
-        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); `{seed}` in it stands for
-            the seed. None starts afresh.
-        init_partly: whether that run's model may have other parts: what it lacks starts afresh.
+        best_metric: score of the evaluation that chooses the best checkpoint; higher is better.
+        init_from: folder of a run whose best averaged parameters to start from (fine-tuning); `{seed}` in it is
+            replaced by the seed. None starts from random parameters.
+        init_partly: whether that run's model may have other modules; those that it lacks start from random parameters.
     """
 
     steps: int = 10_000
@@ -72,7 +77,7 @@ class TrainingConfig:
 
 @dataclass
 class _Window:
-    """Sums of metrics since the last record, which a checkpoint carries so that records, too, survive a resume."""
+    """Sums of metrics since the last record; checkpoints hold them, so that a resumed run writes the same records."""
 
     steps: int = 0
     sums: dict[str, list[float]] = field(default_factory=dict)
@@ -107,7 +112,7 @@ class TrainingResult:
 
 
 def train(
-    task: Task,
+    task: Trainable,
     arrays: Any,
     folder: Path,
     *,
@@ -115,6 +120,7 @@ def train(
     optim: OptimConfig,
     resolved: dict[str, Any],
     resolved_text: str = "",
+    current_form: CurrentForm | None = None,
     start: Start = "new",
     prepare: Prepare | None = None,
     evaluate: Evaluate | None = None,
@@ -125,20 +131,21 @@ def train(
 
     Args:
         task: what to train.
-        arrays: training examples, see `training.batches`. Which of them a step sees follows from its number, so that
-            the step in a checkpoint is also the position in the data.
+        arrays: training examples, see `datasets.batches`. The step determines which of them are used, so that the step
+            of a checkpoint is also the position in the data.
         folder: of the run.
         config, optim: settings.
         resolved: the run's whole configuration as plain JSON; it is saved, and a resumed run must have the same one.
-        resolved_text: the same for people.
+        resolved_text: the same as text, for the run folder.
+        current_form: brings the saved configuration of a resumed run to the form of `resolved`; None leaves it.
         start: see `run_folder.claimed`.
-        prepare: augments every example, see `training.batches`.
+        prepare: augments every example, see `datasets.batches`.
         evaluate, draw: called at every evaluation.
         progress: show a bar with rate and time left.
 
     Raises:
-        UserError: see `run_folder.claimed` and `Checkpoints`; settings that cannot work; a loss that is not finite,
-            after the last good state was written.
+        UserError: see `run_folder.claimed` and `Checkpoints`; settings out of range; a loss that is not finite, after
+            the last good state was written.
     """
     _check(config)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
@@ -149,11 +156,14 @@ def train(
         # =============================================================================================================
         # Run folder
         # =============================================================================================================
-        if start == "resume" and (saved := read_config(folder)) != resolved:
-            raise UserError(
-                f"{folder} was started with another configuration ({_difference(saved, resolved)}): "
-                "resume it as it is, or start another run"
-            )
+        if start == "resume":
+            saved, notices = (current_form or _unchanged)(read_config(folder))
+            if difference := first_difference(saved, resolved):
+                raise UserError(
+                    f"{folder} was started with another configuration ({difference}): "
+                    "resume it as it is, or start another run"
+                )
+            _tell(notices)
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
         # =============================================================================================================
@@ -161,7 +171,7 @@ def train(
         # =============================================================================================================
         state = init_states(task, optimizer, config.seeds, first_example(arrays))
         window, metrics, seconds = _Window(), {}, 0.0
-        memories = [Memory() for _ in config.seeds]
+        memories, started_from = [Memory() for _ in config.seeds], {}
         if start == "resume" and (written := checkpoints.steps()):
             manifest = checkpoints.manifest(written[-1])
             state = checkpoints.restore(manifest.step, state)
@@ -171,8 +181,9 @@ def train(
         elif config.init_from is not None:
             given = starting_params(config.init_from, state, config.seeds, partly=config.init_partly)
             state = with_params(state, given, optimizer)
+            started_from = {"init_from": origins(config.init_from, config.seeds)}
         first = step = int(np.max(state.step))
-        add_provenance(folder)
+        _tell(add_provenance(folder, **started_from))
         write_text(folder / "config.txt", resolved_text)
         write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
 
@@ -207,7 +218,7 @@ def train(
             while batch is not None and stop.signal is None:
                 began = time.perf_counter()
                 state, values = update(state, batch)
-                # Waiting here costs nothing: matching is on the host, so that the host is needed in every step anyway.
+                # Waiting here costs nothing: matching runs on the host, which is needed in every step anyway.
                 values = jax.device_get(values)
                 if not values["finite"].all():
                     save({})
@@ -260,12 +271,12 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:
-    """Return the record of values that every seed has one of."""
+    """Return the record of values with one entry per seed."""
     return {"step": step, "split": split} | {name: v[0] if len(v) == 1 else v for name, v in values.items()}
 
 
 def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
-    """Name the step, the seed and the first thing that is not finite: a loss term, else the loss, else the gradient."""
+    """Return a message with the step, the seed and everything that is not finite: loss terms, loss, gradient."""
     bad = int(np.argmin(np.atleast_1d(values["finite"])))
     numbers = {name: float(np.atleast_1d(value)[bad]) for name, value in values.items()}
     terms = [name for name, value in sorted(numbers.items(), reverse=True) if not np.isfinite(value)]
@@ -276,12 +287,10 @@ def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...]
     )
 
 
-def _difference(saved: dict[str, Any], resolved: dict[str, Any], prefix: str = "") -> str:
-    """Return the first entry in which two configurations differ."""
-    for name in sorted(saved.keys() | resolved.keys()):
-        old, new = saved.get(name), resolved.get(name)
-        if isinstance(old, dict) and isinstance(new, dict) and old != new:
-            return _difference(old, new, f"{prefix}{name}.")
-        if old != new:
-            return f"{prefix}{name}: {old} there, {new} here"
-    return ""
+def _unchanged(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    return saved, []
+
+
+def _tell(notices: Sequence[str]) -> None:
+    for notice in notices:
+        tqdm.write(notice, file=sys.stderr)

@@ -1,10 +1,15 @@
-"""Where a run's numbers come from: code, versions, machine, command."""
+"""Where a run's numbers come from: code, versions, machine, command.
+
+Results are bit-identical only for the same code, the same versions and the same number of cores: XLA divides a sum
+between its threads, and the division decides how it is rounded.
+"""
 
 from __future__ import annotations
 
 import datetime
 import importlib.metadata
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -14,13 +19,27 @@ from typing import Any
 import jax
 
 import tflane_jax
-from tflane_jax.training.run_folder import write_json
+from tflane_jax.files.atomic import write_json
 
 _PACKAGES = ("tflane_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy")
 
+# What decides how many threads XLA and the libraries below it use, beside the cores that a process may run on.
+_THREAD_VARIABLES = ("XLA_FLAGS", "OMP_NUM_THREADS", "NPROC", "PJRT_NPROC")
+
+
+def thread_setting(cores: int | None = None) -> dict[str, Any]:
+    """Return what decides the number of threads: cores of this process, and environment variables that are set.
+
+    Args:
+        cores: number of cores to report instead, for a process that is going to be started on as many.
+    """
+    if cores is None:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {"cores": cores} | {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ}
+
 
 def provenance() -> dict[str, Any]:
-    """Return what is needed to know which program gave these numbers, as plain JSON."""
+    """Return code version, package versions, machine and command of this process, as plain JSON."""
     device = jax.devices()[0]
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -30,17 +49,37 @@ def provenance() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         "device": f"{device.platform}: {device.device_kind} x {jax.device_count()}",
+        "threads": thread_setting(),
     }
 
 
-def add_provenance(folder: Path) -> None:
-    """Append this start to the run folder's provenance.json."""
-    path = folder / "provenance.json"
+def add_provenance(folder: Path, **more: Any) -> list[str]:
+    """Append this start to the run folder's provenance.json, with further entries of plain JSON.
+
+    Returns:
+        A line for the user where an earlier start of the run had another thread setting.
+    """
+    earlier, new = read_provenance(folder), provenance() | more
+    write_json(folder / "provenance.json", [*earlier, new])
+    others = [start["threads"] for start in earlier if start.get("threads", new["threads"]) != new["threads"]]
+    if not others:
+        return []
+    return [
+        f"{folder} was trained with {_listed(others[-1])} before, now with {_listed(new['threads'])}: "
+        "the results are not bit-identical to those of an uninterrupted run"
+    ]
+
+
+def read_provenance(folder: Path) -> list[dict[str, Any]]:
+    """Return the record of every start of a run, the first one first; empty where there is none."""
     try:
-        earlier = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
-        earlier = []
-    write_json(path, [*earlier, provenance()])
+        return []
+
+
+def _listed(setting: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in setting.items())
 
 
 def _git() -> dict[str, Any] | None:
@@ -52,7 +91,7 @@ def _git() -> dict[str, Any] | None:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
     try:
-        # A package installed inside some other project's checkout is not that project's code.
+        # A package that is installed inside the checkout of another project is not that project's code.
         if not git("ls-files", "--", str(root / "__init__.py")):
             return None
         return {"commit": git("rev-parse", "HEAD"), "uncommitted_changes": bool(git("status", "--porcelain", "-uno"))}

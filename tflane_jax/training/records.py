@@ -1,4 +1,4 @@
-"""The record of a run: metrics as JSON lines and for TensorBoard, both cut back to the step a run is resumed from."""
+"""Records of a run: metrics as JSON lines and for TensorBoard, both cut back to the step of a resume."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Record = dict[str, Any]
 
 
 def read_records(path: Path) -> list[Record]:
-    """Return the records of a metrics.jsonl in order; a last line cut short by a kill is left out."""
+    """Return the records of a metrics.jsonl in order, without a last line that was cut short."""
     if not path.exists():
         return []
     records = []
@@ -32,7 +32,7 @@ class RecordWriter:
 
     Args:
         folder: the run's folder.
-        step: the step the run starts or resumes from; what an earlier process wrote beyond it is dropped.
+        step: step from which the run starts or resumes; later records of an earlier process are dropped.
     """
 
     def __init__(self, folder: Path, step: int):
@@ -48,7 +48,7 @@ class RecordWriter:
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=purge, write_to_disk=True)
 
     def write(self, record: Record) -> None:
-        """Append one record; it is on disk when this returns."""
+        """Append one record and flush the file."""
         self.records.append(record)
         self._file.write(_line(record))
         self._file.flush()

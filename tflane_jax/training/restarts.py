@@ -1,13 +1,13 @@
 """Cosine annealing with warm restarts (SGDR; GTN paper, section 2.2, Eq. 2) as a state that the optimiser carries.
 
-Eq. (2) as printed has the peak rate on its left and closes the cosine's parenthesis before pi. It is read as in the
-SGDR paper, which is what the text around it describes:
+Eq. (2) as printed has the peak rate on its left and closes the cosine's parenthesis before pi. The text around it
+describes the SGDR paper's formula, which is used here:
 
     eta_t = eta_min + (eta_max - eta_min) (1 + cos(pi T_cur / T_i)) / 2
 
-from eta_max at T_cur = 0 to eta_min at T_cur = T_i. There the next cycle begins, which is `factor` times as long. Where
-a cycle stands is data, not a function of the step, so that one compiled update also serves cycles that are changed
-while they last (`training.adaptive`).
+from eta_max at T_cur = 0 to eta_min at T_cur = T_i. Then the next cycle begins, `factor` times as long. The position in
+the cycle is data, not a function of the step, so that cycles can change during training (`training.adaptive`) without
+another compilation.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class RestartsConfig:
         cycle_steps: steps of the first cycle, T_0.
         factor: length of a cycle relative to the one before it, at least 1.
         floor: least learning rate, eta_min, relative to the peak, eta_max.
-        last_cycle: what happens to cycles at the end of the run. "cut": nothing, the run may end within one. "fit": a
-            cycle after which the next one could not be completed takes all the steps that are left.
-        adaptive: changes cycles by the validation loss; None leaves them as they are.
+        last_cycle: "cut": the run may end within a cycle. "fit": a cycle after which the next one could not be
+            completed takes all steps that are left.
+        adaptive: rule that changes cycles by the evaluations; None for fixed cycles.
     """
 
     cycle_steps: int = 1000
@@ -50,13 +50,13 @@ class RestartsConfig:
 
 
 class Cycle(NamedTuple):
-    """Where the learning rate stands; a leading axis on every leaf when several seeds train together.
+    """Position in the cycle of the learning rate; with several seeds, every leaf has a leading seed axis.
 
     Attributes:
         count: updates made.
-        start: update with which the cycle began (it moves back where a cycle is extended).
+        start: first update of the cycle (it moves back when a cycle is extended).
         length: its steps, T_i.
-        period: its steps before it was extended or fitted to the run; the next cycle has `factor` times these.
+        period: its steps before it was extended or fitted to the run; the next cycle has `factor` times as many.
         magnitude: eta_max - eta_min of this cycle, relative to that of the first.
         number: of the cycle, from 0.
     """
@@ -70,7 +70,7 @@ class Cycle(NamedTuple):
 
 
 def check_restarts(config: RestartsConfig) -> None:
-    """Raise UserError where a setting cannot work."""
+    """Raise UserError for a setting out of its range."""
     if not 1 <= config.cycle_steps < _LONGEST:
         raise UserError(f"optim.restarts.cycle_steps is {config.cycle_steps}: it must be at least 1 (and below 2^29)")
     if not config.factor >= 1.0:
@@ -110,9 +110,9 @@ def next_period(config: RestartsConfig, period: Int[Array, ""]) -> Int[Array, ""
 
 
 def current_cycle(config: RestartsConfig, cycle: Cycle, steps: int) -> Cycle:
-    """Return the cycle of the next update: a new one where `cycle` has ended.
+    """Return the cycle of the next update: a new one if `cycle` has ended.
 
-    A cycle is replaced no earlier than that, so that an evaluation at its very end still finds it.
+    A cycle is not replaced earlier, so that an evaluation at its end still finds it.
     """
     period = next_period(config, cycle.period)
     new = Cycle(
@@ -135,8 +135,8 @@ def relative_rate(config: RestartsConfig, cycle: Cycle) -> Float[Array, ""]:
 
 def half_cosine(elapsed: ArrayLike, length: ArrayLike) -> Float[Array, "..."]:
     """Return (1 + cos(pi elapsed / length)) / 2 for counts, precise relative to its value also near its end at 0."""
-    # The same as sin^2(pi/2 (1 - elapsed / length)): no difference of nearly equal numbers, and exactly 1 and 0 at
-    # the two ends.
+    # sin^2(pi/2 (1 - elapsed / length)) is the same without the difference of nearly equal numbers, and exactly 1 and
+    # 0 at the two ends.
     return jnp.sin(jnp.pi / 2 * (jnp.subtract(length, elapsed) / jnp.asarray(length))) ** 2
 
 
@@ -157,7 +157,7 @@ def with_cycle(opt_state: Any, cycle: Cycle) -> Any:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Cycles that follow the evaluations: on the host, between two updates.
+# Cycles changed by evaluations: on the host, between two updates.
 
 
 def adapt(
@@ -167,7 +167,7 @@ def adapt(
     evaluations: Sequence[Mapping[str, float]],
     steps: int,
 ) -> tuple[Any, list[Memory], dict[str, list[Any]]]:
-    """Judge the cycle of every seed by its evaluation and change those that are to be changed.
+    """Judge the cycle of every seed by its evaluation, and extend or restart it by the verdict.
 
     Args:
         config: with `adaptive`.
@@ -218,8 +218,8 @@ def adapt(
 def extended_cycle(cycle: Any, extend: float, steps: int) -> Any:
     """Return a cycle (numpy) whose rest takes 1 + `extend` times as long, at most up to the end of the run.
 
-    Time is stretched also for what has passed, so that the learning rate is the same after the change as before it (up
-    to the rounding to whole steps).
+    The elapsed steps are stretched by the same factor, so that the learning rate does not jump (up to the rounding to
+    whole steps).
     """
     elapsed = cycle.count - cycle.start
     left = cycle.length - elapsed
@@ -230,7 +230,7 @@ def extended_cycle(cycle: Any, extend: float, steps: int) -> Any:
 
 
 def restarted_cycle(config: RestartsConfig, cycle: Any, shrink: float, steps: int) -> Any:
-    """Return the cycle (numpy) that begins now in place of one that is stuck: of the same period, with less height."""
+    """Return the cycle (numpy) that begins now after a stuck one: the same period, a lower peak."""
     return cycle._replace(
         start=cycle.count,
         length=np.asarray(fitted_length(config, cycle.count, cycle.period, steps)),

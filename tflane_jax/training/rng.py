@@ -1,4 +1,4 @@
-"""Random streams by name and step, so that what is drawn does not depend on the order of calls."""
+"""Random streams by name and step, so that random numbers do not depend on the order of calls."""
 
 from __future__ import annotations
 

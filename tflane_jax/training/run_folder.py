@@ -1,8 +1,8 @@
-"""The folder of a run: who may write into it, and what lies where.
+"""The folder of a run: its files, and the lock that only one process at a time can hold.
 
-config.json, config.txt   resolved configuration: to load again, to read
-provenance.json           git hash, versions, device, command of every start
-metrics.jsonl             records; tensorboard/ holds the same
+config.json, config.txt   resolved configuration, as JSON and as text
+provenance.json           git hash, versions, device, cores, threads and command of every start
+metrics.jsonl             records; tensorboard/ holds the same numbers
 checkpoints/              see training.checkpoint
 curves.png, pictures/     drawn at every evaluation
 evaluations/              tables of `tflane eval`
@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import is_temporary
 
 Start = Literal["new", "resume", "overwrite"]
 _CONTENT = (
@@ -37,7 +37,7 @@ _CONTENT = (
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the resolved configuration of a run as plain JSON; raises UserError where the folder holds no run."""
+    """Return the resolved configuration of a run as saved (JSON); raises UserError if the folder holds no run."""
     try:
         return json.loads((folder / "config.json").read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -46,29 +46,17 @@ def read_config(folder: Path) -> dict[str, Any]:
         raise UserError(f"{folder / 'config.json'} is damaged ({error}): checkpoints hold a copy") from error
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write a JSON file, whole or not at all."""
-    write_text(path, json.dumps(content, indent=1) + "\n")
-
-
-def write_text(path: Path, content: str) -> None:
-    """Write a text file, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(content, encoding="utf-8")
-    os.replace(temporary, path)
-
-
 @contextlib.contextmanager
 def claimed(folder: Path, start: Start) -> Iterator[None]:
-    """Make the folder ready for this process alone, for as long as the block lasts.
+    """Prepare the folder and lock it for this process inside the block.
 
     Args:
         folder: of the run.
-        start: "new" refuses a folder that holds a run, "overwrite" deletes that run (and nothing else), "resume" needs
-            one.
+        start: "new" refuses a folder that holds a run, "overwrite" deletes that run (and no other files), "resume"
+            requires a run.
 
     Raises:
-        UserError: the folder is not what `start` says, another process trains into it, or it cannot be written.
+        UserError: the folder does not fit `start`, another process trains into it, or it cannot be written.
     """
     check_start(folder, start)
     try:
@@ -85,7 +73,7 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
 
 
 def check_start(folder: Path, start: Start) -> None:
-    """Raise UserError where the folder is not what `start` says; see `claimed`. Nothing is written."""
+    """Raise UserError if the folder does not fit `start`, see `claimed`. Nothing is written."""
     holds_run = (folder / "config.json").exists()
     if start == "new" and holds_run:
         raise UserError(
@@ -94,15 +82,17 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
-    if not holds_run and folder.is_dir() and (other := {p.name for p in folder.iterdir()} - set(_CONTENT)):
+    found = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+    # A process killed while it wrote the first file leaves a temporary one: still no foreign file.
+    if not holds_run and (other := {name for name in found if not is_temporary(name)} - set(_CONTENT)):
         raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")
 
 
 def _lock(file: int, folder: Path) -> None:
-    """Take the lock, which the system releases even where the process is killed."""
+    """Take the lock; the system releases it even if the process is killed."""
     try:
         import fcntl
-    except ImportError:  # Windows has no such lock; two processes in one folder are then the user's to avoid
+    except ImportError:  # Windows: two processes in one folder are not detected
         return
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Process-wide settings of JAX, made in one place and once, by whoever owns the process (the command line, a test)."""
+"""Process-wide settings of JAX, made once by the program that owns the process (command line, test)."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ _KEPT = 2**30
 
 
 def configure_jax() -> None:
-    """Let arrays of different rank never broadcast silently, and keep the memory of one step for the next."""
+    """Make silent broadcasting between ranks an error, and keep freed memory for the next step."""
     jax.config.update("jax_numpy_rank_promotion", "raise")
     _keep_freed_memory()
 
 
 def _keep_freed_memory() -> None:
-    """Let glibc hold on to freed memory of up to 1 GiB a piece.
+    """Let glibc keep freed blocks of up to 1 GiB.
 
-    Every run of a compiled program allocates its temporary memory anew. By default glibc maps pieces of this size from
-    the system each time, which then clears every page: a seventh of the time of an LSTR training step.
+    Every call of a compiled program allocates its temporary memory anew. By default glibc maps blocks of this size from
+    the system each time, and the system clears every page: a seventh of the time of an LSTR training step.
     """
     if sys.platform != "linux":
         return
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # a C library without it, musl say
+    except (AttributeError, OSError):  # a C library without it, such as musl
         return
     mallopt(_M_MMAP_THRESHOLD, _KEPT)
     mallopt(_M_TRIM_THRESHOLD, _KEPT)

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from optax.contrib import muon
 
 from tflane_jax.errors import UserError
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.restarts import (
     Cycle,
     RestartsConfig,
@@ -26,7 +27,6 @@ from tflane_jax.training.restarts import (
     half_cosine,
     relative_rate,
 )
-from tflane_jax.training.task import Params
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,14 @@ class OptimConfig:
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
         weight_decay: on kernels and embeddings only.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam).
-        optimizer: of the kernels of dense layers. None of the papers has "muon" (Jordan et al. 2024), whose
-            updates are made orthogonal; what it brings small models stands in docs/cameras.md.
+        optimizer: of the kernels of dense layers. "muon" (Jordan et al. 2024) orthogonalises the updates. None of the
+            three papers uses it; docs/cameras.md has its effect on small models.
         clip_norm: largest global gradient norm; inf for none.
         b1, b2, eps: of Adam.
         ema_decay: of the averaged parameters that are evaluated; 0 evaluates the parameters themselves.
         epoch_steps: 0 lowers the learning rate with every step from the end of the warm-up to the end of the run.
-            More: as mmcv does by epoch (specs/modules.md, section 12, 7), it is the same in all steps of an epoch,
-            the cosine goes from the first to the end of the last epoch, and the warm-up multiplies it.
+            A positive number is the length of an epoch: as in mmcv's cosine annealing by epoch, the rate is constant
+            within an epoch, the cosine spans all epochs, and the warm-up multiplies it.
         restarts: cycles of the learning rate that follow the warm-up; None has one cosine over the run.
     """
 
@@ -71,7 +71,7 @@ Rate = Callable[[Any, Int[ArrayLike, ""]], Float[Array, ""]]
 
 
 def make_rate(config: OptimConfig, steps: int) -> Rate:
-    """Return what tells the learning rate of the next update, with and without restarts; raises like the optimiser."""
+    """Return the function that gives the learning rate of the next update; raises like `make_optimizer`."""
     _check(config, steps)
     if (restarts := config.restarts) is None:
         schedule = make_schedule(config, steps)
@@ -80,7 +80,7 @@ def make_rate(config: OptimConfig, steps: int) -> Rate:
 
 
 def make_schedule(config: OptimConfig, steps: int) -> optax.Schedule:
-    """Return the learning rate as a function of the step (0 is the first update), which it is without restarts.
+    """Return the learning rate as a function of the step (0 is the first update), for a run without restarts.
 
     Raises:
         UserError: the warm-up does not end before the training does, or `epoch_steps` is negative.
@@ -108,7 +108,7 @@ def make_schedule(config: OptimConfig, steps: int) -> optax.Schedule:
 
 
 def warmup_factor(config: OptimConfig, step: Int[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """Return what the learning rate is multiplied by in the warm-up: from `warmup_ratio` to 1, and 1 after it."""
+    """Return the factor of the warm-up: from `warmup_ratio` to 1, then 1."""
     missing = jnp.maximum(1.0 - jnp.asarray(step) / max(config.warmup_steps, 1), 0.0)
     return 1.0 - (1.0 - config.warmup_ratio) * (missing if config.warmup_steps else jnp.zeros_like(missing))
 
@@ -128,9 +128,9 @@ def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformat
 
 
 def _decay_what_learns(rate: float) -> optax.GradientTransformation:
-    """Add `rate` times the parameters, except to those that have no gradient and never had one.
+    """Add `rate` times the parameters, except to those whose update is zero everywhere.
 
-    Frozen parts of a backbone are such; PyTorch does not hand them to the optimiser at all.
+    These are the frozen parts of a backbone, which PyTorch does not pass to the optimiser at all.
     """
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
@@ -154,8 +154,8 @@ def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
 
         return jax.tree_util.tree_map_with_path(label, params)
 
-    # An update's root mean square is 0.2, as Adam's usually is, so that one learning rate serves both. Muon has the
-    # sign of a step, Adam that of a gradient.
+    # The root mean square of an update is 0.2, as usual for Adam, so that one learning rate fits both. optax's Muon
+    # returns steps, its Adam gradients: hence the sign.
     matrices = optax.chain(muon(1.0, consistent_rms=0.2), optax.scale(-1.0))
     return optax.partition({"adam": adam, "muon": matrices}, labels)
 
@@ -196,9 +196,9 @@ def _check(config: OptimConfig, steps: int) -> None:
 
 
 def is_decayed(params: Params) -> Any:
-    """Return which leaves weight decay acts on: matrices, but neither biases nor the scales of norms.
+    """Return which leaves get weight decay: matrices, but neither biases nor the scales of norms.
 
-    Names count beside ranks because the biases of attention heads are matrices too.
+    Names are checked beside ranks, because the biases of attention heads are matrices too.
     """
 
     def decayed(path: tuple[Any, ...], leaf: jax.Array) -> bool:

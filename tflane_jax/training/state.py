@@ -1,4 +1,4 @@
-"""What training carries from step to step: everything that a bit-exact resume needs, and nothing else."""
+"""State of a training between two steps: exactly what a bit-exact resume needs."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import optax
 from flax import struct
 from jaxtyping import Array, Int
 
+from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.rng import stream
-from tflane_jax.training.task import Params, Task, split_statistics
+from tflane_jax.training.task import Trainable
 
 
 @struct.dataclass
 class TrainState:
-    """State after `step` updates; a further leading axis on every leaf when several seeds train together.
+    """State after `step` updates; with several seeds, every leaf has a leading seed axis.
 
     Attributes:
         step: () number of updates made.
         params: the task's parameters, running statistics included.
         ema_params: their exponential moving average, which is what gets evaluated.
         opt_state: of the optimiser.
-        key: () root key of the run; it never changes, streams are derived from it by name and step.
+        key: () root key of the run; it never changes, random streams are derived from it by name and step.
     """
 
     step: Int[Array, "*seeds"]
@@ -34,7 +35,7 @@ class TrainState:
     key: jax.Array
 
 
-def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Array, example: Any) -> TrainState:
+def init_state(task: Trainable, optimizer: optax.GradientTransformation, key: jax.Array, example: Any) -> TrainState:
     """Return the state before the first update."""
     params = task.init(stream(key, "params"), example)
     return TrainState(
@@ -46,7 +47,9 @@ def init_state(task: Task, optimizer: optax.GradientTransformation, key: jax.Arr
     )
 
 
-def init_states(task: Task, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any) -> TrainState:
+def init_states(
+    task: Trainable, optimizer: optax.GradientTransformation, seeds: Sequence[int], example: Any
+) -> TrainState:
     """Return the state of a run: without a seed axis for one seed, with a leading one for several."""
     keys = jnp.stack([jax.random.key(seed) for seed in seeds])
 
@@ -59,13 +62,13 @@ def init_states(task: Task, optimizer: optax.GradientTransformation, seeds: Sequ
 
 
 def _run_once(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function compiled without optimisation: for one call the compiler takes longer than the program."""
+    """Call a function compiled without optimisation, because compiling takes longer than one call."""
     compiled = jax.jit(function).lower(*arguments).compile({"xla_backend_optimization_level": "0"})
     return compiled(*arguments)
 
 
 def with_params(state: TrainState, given: Sequence[Params], optimizer: optax.GradientTransformation) -> TrainState:
-    """Return the state of a run that starts from given parameters, one for each seed, as fine-tuning does."""
+    """Return the state of a run that starts from given parameters, one tree for each seed (fine-tuning)."""
     params: Params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *given) if state.step.ndim else given[0]
     learned, _ = split_statistics(params)
     opt_state = jax.vmap(optimizer.init)(learned) if state.step.ndim else optimizer.init(learned)

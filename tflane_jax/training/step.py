@@ -1,4 +1,4 @@
-"""The update step: loss, gradient, AdamW, moving average; traced once, donated, safe against non-finite numbers."""
+"""The update step: loss, gradient, optimiser, moving average. It is traced once, and its input state is donated."""
 
 from __future__ import annotations
 
@@ -11,56 +11,58 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
 from tflane_jax.training.state import TrainState
-from tflane_jax.training.task import Params, Task, split_statistics
+from tflane_jax.training.task import Trainable
 
 Metrics = dict[str, jax.Array]
 UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 
 
-def make_update_step(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
-    """Return the jitted update (state, batch) -> (state, metrics); the state that goes in is consumed.
+def make_update_step(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
+    """Return the jitted update (state, batch) -> (state, metrics); the input state is donated.
 
-    Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group of its own, "matching/lanes",
-    stays), `grad_norm` before clipping, `learning_rate`, and `finite`.
-    Where the loss or a gradient is not finite, `finite` is False and the state comes out unchanged.
+    Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group, "matching/lanes", stays as it is),
+    `grad_norm` before clipping, `learning_rate`, and `finite`.
+    If the loss or a gradient is not finite, `finite` is False and the state is returned unchanged.
     A second trace (a batch of another shape) raises AssertionError.
     """
     return _guarded(_update(task, optim, steps))
 
 
 def make_multi_seed_step(
-    task: Task, optim: OptimConfig, steps: int, *, batch: Literal["shared", "per_seed"]
+    task: Trainable, optim: OptimConfig, steps: int, *, batch: Literal["shared", "per_seed"]
 ) -> UpdateStep:
     """Return the update of several seeds at once: state and metrics have a leading seed axis.
 
-    Each seed gets what it gets when it trains alone, up to float rounding (batched products round differently).
-
-    A number that is not finite in one seed leaves the states of all of them unchanged.
+    Each seed trains as it would alone, up to float rounding (batched products round differently). A number that is not
+    finite in one seed leaves the states of all seeds unchanged.
 
     Args:
         task, optim, steps: as for `make_update_step`.
-        batch: "per_seed" batches have a leading seed axis, "shared" ones are seen by every seed.
+        batch: "per_seed" batches have a leading seed axis, a "shared" batch serves every seed.
     """
     update = _update(task, optim, steps)
     return _guarded(jax.vmap(update, in_axes=(0, 0 if batch == "per_seed" else None)))
 
 
 def compiled_update(
-    task: Task, optim: OptimConfig, steps: int, seeds: int, state: TrainState, batch: Any
+    task: Trainable, optim: OptimConfig, steps: int, seeds: int, state: TrainState, batch: Any
 ) -> UpdateStep:
-    """Return the update of one or several seeds (batches of their own), compiled for these shapes.
+    """Return the update of one or several seeds (with a batch for each), compiled for these shapes.
 
-    A process compiles it once: trainings that differ in their seeds or in what they start from share it.
+    A process compiles it once: trainings that differ only in seeds or starting parameters use the same program.
     """
     leaves, tree = jax.tree.flatten((state, batch))
     return _compiled(task, optim, steps, seeds, tree, tuple(jax.typeof(leaf) for leaf in leaves))
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(task: Task, optim: OptimConfig, steps: int, seeds: int, tree: Any, types: tuple[Any, ...]) -> UpdateStep:
+def _compiled(
+    task: Trainable, optim: OptimConfig, steps: int, seeds: int, tree: Any, types: tuple[Any, ...]
+) -> UpdateStep:
     if seeds == 1:
         update: Any = make_update_step(task, optim, steps)
     else:
@@ -70,7 +72,7 @@ def _compiled(task: Task, optim: OptimConfig, steps: int, seeds: int, tree: Any,
 
 
 def _guarded(update: UpdateStep) -> UpdateStep:
-    """Compile an update that leaves the state (of every seed) as it was unless all numbers are finite."""
+    """Compile an update that keeps the old state (of every seed) unless all numbers are finite."""
 
     def guarded(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
         new, metrics = update(state, batch)
@@ -81,10 +83,9 @@ def _guarded(update: UpdateStep) -> UpdateStep:
 
 
 def _traced_once(update: UpdateStep) -> UpdateStep:
-    """Refuse a second trace of this very function.
+    """Raise on a second trace of this function.
 
-    Not `chex.assert_max_traces`: that counts by source and call stack, so that training two models from one line of a
-    script would fail.
+    `chex.assert_max_traces` counts by source and call stack: two models trained from one line of a script would fail.
     """
     traces = 0
 
@@ -98,7 +99,7 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
     return checked
 
 
-def _update(task: Task, optim: OptimConfig, steps: int) -> UpdateStep:
+def _update(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
     optimizer, rate = make_optimizer(optim, steps), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
@@ -136,7 +137,7 @@ def moving_average(
 ) -> Params:
     """Return d * average + (1 - d) * params with d = min(decay, (1 + step) / (10 + step)).
 
-    The second bound lets the average forget the initial parameters early, so that short runs can be evaluated by it.
+    The second bound removes the initial parameters from the average early, so that it can evaluate short runs.
     """
     d = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
     return jax.tree.map(lambda a, p: d * a + (1.0 - d) * p, average, params)

@@ -5,8 +5,9 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from tflane_jax.metrics import CenterlineMetrics, detections_from_prediction, truth_from_example
-from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, TrafficElements
+from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
+from tflane_jax.metrics import CenterlineMetrics
+from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph, TrafficElements
 
 
 def make_graph(garbage):
@@ -35,7 +36,7 @@ def make_graph(garbage):
 
 def make_prediction():
     rng = np.random.default_rng(1)
-    return LanePrediction(
+    return CenterlinePrediction(
         points=rng.uniform(-20, 20, (4, 11, 3)).astype(np.float32),
         logits=np.array([[-1.0], [3.0], [0.5], [-200.0]], np.float32),
         successor_logits=rng.normal(size=(4, 4)).astype(np.float32),
@@ -92,7 +93,9 @@ def test_perfect_elements_get_the_full_score():
     box = np.array([[[1, 2], [3, 4]], [[10, 20], [30, 45]], [[5, 6], [7, 8]]], np.float32)
     elements = dataclasses.replace(elements, box=box, lane=np.eye(5, 3, dtype=bool)[:, [1, 0, 2]])
     certain = np.full((5, 1), 9.0, np.float32)
-    predicted = LanePrediction(lanes.points, np.where(lanes.valid[:, None], certain, -9.0), _sure(lanes.successor))
+    predicted = CenterlinePrediction(
+        lanes.points, np.where(lanes.valid[:, None], certain, -9.0), _sure(lanes.successor)
+    )
     attribute = np.where(np.arange(13) == 3, 9.0, -9.0)[None].astype(np.float32)
     said = ElementPrediction(box[1:2], attribute, _sure(elements.lane[:, 1:2]))
     metrics = CenterlineMetrics()
@@ -108,7 +111,7 @@ def _sure(edges):
 
 def test_device_arrays_are_taken_too():
     prediction = make_prediction()
-    on_device = LanePrediction(
+    on_device = CenterlinePrediction(
         *(jnp.asarray(leaf) for leaf in (prediction.points, prediction.logits, prediction.successor_logits))
     )
     np.testing.assert_array_equal(

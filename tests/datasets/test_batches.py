@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.training.batches import batch_indices, batches
+from tflane_jax.datasets.batches import batch_indices, batches
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

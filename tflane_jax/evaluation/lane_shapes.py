@@ -6,25 +6,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import softmax
 
+from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry.lane_shapes import curve_columns
-from tflane_jax.metrics.tusimple import RowLanes
-from tflane_jax.scene import LaneShapePrediction
+from tflane_jax.scene import CurvePrediction
 
 _NO_POINT = -2.0  # TuSimple's mark of a row without a point
 
 
-def lane_scores(prediction: LaneShapePrediction) -> Float[np.ndarray, " q"]:
+def lane_scores(prediction: CurvePrediction) -> Float[np.ndarray, " q"]:
     """Return the probability that each query is a lane (numpy, one example, one layer)."""
     return softmax(np.asarray(prediction.logits), -1)[..., 1]
 
 
-def detected(prediction: LaneShapePrediction) -> Bool[np.ndarray, " q"]:
+def detected(prediction: CurvePrediction) -> Bool[np.ndarray, " q"]:
     """Return which queries are lanes: those of which it is likelier than not."""
     logits = np.asarray(prediction.logits)
     return logits[..., 1] > logits[..., 0]
 
 
-def left_to_right(prediction: LaneShapePrediction) -> Int[np.ndarray, " l"]:
+def left_to_right(prediction: CurvePrediction) -> Int[np.ndarray, " l"]:
     """Return the detected queries by the column in which their lanes end below."""
     queries = np.flatnonzero(detected(prediction))
     curves = np.asarray(prediction.curves, np.float64)[queries]
@@ -32,9 +32,7 @@ def left_to_right(prediction: LaneShapePrediction) -> Int[np.ndarray, " l"]:
     return queries[np.argsort(ends, kind="stable")]
 
 
-def row_lanes(
-    prediction: LaneShapePrediction, rows: Float[np.ndarray, " h"], *, height: float, width: float
-) -> RowLanes:
+def row_lanes(prediction: CurvePrediction, rows: Float[np.ndarray, " h"], *, height: float, width: float) -> RowLanes:
     """Return the detected lanes as x at image rows, -2 outside each lane's extent; nothing is cut off at the borders.
 
     Args:
@@ -50,7 +48,7 @@ def row_lanes(
 
 
 def pixel_points(
-    prediction: LaneShapePrediction, *, height: int, width: int, count: int = 100
+    prediction: CurvePrediction, *, height: int, width: int, count: int = 100
 ) -> list[Int[np.ndarray, "p 2"]]:
     """Return the pixels (column, row) of each detected lane for drawing, at `count` rows of its extent."""
     curves = np.asarray(prediction.curves, np.float64)[detected(prediction)]

@@ -10,10 +10,10 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from tflane_jax.losses.costs import focal_cost
-from tflane_jax.losses.lane_graph import LaneGraphLossConfig, lane_graph_loss, matching_cost
-from tflane_jax.scene import LaneGraph, LanePrediction, Prediction, stack_examples
+from tflane_jax.losses.toponet import TopoNetLossConfig, lane_graph_loss, matching_cost
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, stack_examples
 
-CONFIG = LaneGraphLossConfig()
+CONFIG = TopoNetLossConfig()
 
 
 @partial(jax.jit, static_argnums=2)
@@ -32,7 +32,7 @@ def make_case(seed=0, counts=(3, 5, 0)):
         valid = rng.permutation(np.arange(LANES) < count)
         points = rng.normal(size=(LANES, POINTS, 3)).astype(np.float32) * 10
         graphs.append(graph.replace(points=points, successor=rng.random((LANES, LANES)) < 0.3, valid=valid))
-    prediction = LanePrediction(
+    prediction = CenterlinePrediction(
         points=jnp.asarray(rng.normal(size=(len(counts), LAYERS, QUERIES, POINTS, 3)).astype(np.float32) * 10),
         logits=jnp.asarray(rng.normal(size=(len(counts), LAYERS, QUERIES, 1)).astype(np.float32)),
         successor_logits=jnp.asarray(rng.normal(size=(len(counts), LAYERS, QUERIES, QUERIES)).astype(np.float32)),
@@ -125,7 +125,7 @@ def test_perfect_prediction_is_cheap():
     edges = np.full((3, 1, QUERIES, QUERIES), -20.0, np.float32)
     for b in range(3):
         edges[b, 0, :3, :3] = np.where(lanes.successor[b][np.ix_(order[b, :3], order[b, :3])], 20.0, -20.0)
-    total, _ = jitted_loss(LanePrediction(*map(jnp.asarray, (points, logits, edges))), lanes, CONFIG)
+    total, _ = jitted_loss(CenterlinePrediction(*map(jnp.asarray, (points, logits, edges))), lanes, CONFIG)
     assert float(total) < 1e-4
 
 

@@ -1,14 +1,35 @@
-"""TuSimple's label and prediction files: one JSON record a line."""
+"""TuSimple's label and prediction files: one JSON record a line, `lanes` as x at the rows `h_samples`.
+
+Format: README of github.com/TuSimple/tusimple-benchmark, doc/lane_detection.
+"""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, member, numbers
-from tflane_jax.metrics.tusimple import RowLanes
+
+
+@dataclass(frozen=True)
+class RowLanes:
+    """Lanes of one image, as x at fixed rows.
+
+    Attributes:
+        x: (L, H) pixels; negative where a lane has no point in a row.
+        rows: (H,) the image rows, pixels (`h_samples`); None for predictions, which use those of the truth.
+        run_time: duration of the prediction, milliseconds.
+    """
+
+    x: Float[np.ndarray, "l h"]
+    rows: Float[np.ndarray, " h"] | None = None
+    run_time: float = 0.0
 
 
 def read_predictions(path: Path) -> dict[str, RowLanes]:

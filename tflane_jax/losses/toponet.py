@@ -1,4 +1,4 @@
-"""Loss of a lane graph with its traffic elements: TopoNet's, with deep supervision (specs/modules.md section 5).
+"""TopoNet's loss of a lane graph with its traffic elements, with deep supervision (Li et al. 2023).
 
 Per decoder layer: focal loss on the lane class, L1 on the matched centerlines in metres, focal loss on every entry of
 the predicted adjacency, and the same for traffic elements. Lanes are directed, so a target has one orientation only.
@@ -8,24 +8,43 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_fit
+from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
+from tflane_jax.losses.common import (
+    HostLossConfig,
+    Report,
+    Terms,
+    edge_loss,
+    focal,
+    last_layer,
+    last_layers,
+    matched,
+    positives,
+    total,
+)
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
 from tflane_jax.losses.traffic_elements import ElementLossConfig, clear_padding, element_cost, element_terms
 from tflane_jax.matching import Assignment, match
-from tflane_jax.scene import ElementPrediction, LaneGraph, LanePrediction, Prediction, TrafficElements
-
-Terms = dict[str, Float[Array, " layers"]]
+from tflane_jax.models.auxiliary import AuxiliaryOutputs
+from tflane_jax.scene import (
+    CenterlinePrediction,
+    ElementPrediction,
+    Example,
+    LaneGraph,
+    Prediction,
+    TrafficElements,
+)
 
 
 @dataclass(frozen=True)
-class LaneGraphLossConfig:
+class TopoNetLossConfig(HostLossConfig):
     """Weights of matching costs and loss terms; the defaults are TopoNet's.
 
     Attributes:
@@ -33,10 +52,8 @@ class LaneGraphLossConfig:
         successor_weight, element_lane_weight: of the topologies' losses, means over all pairs of queries.
         alpha, gamma: of every focal term.
         matcher: backend of `matching.match`.
-        control_points: compare Bezier control points fitted to the centerlines, so many, instead of their points
-            (OpenLane-V2's baseline: 5).
         elements: weights of traffic elements.
-        cell_weight: of the auxiliary loss on BEV cells, where the encoder has it (`losses.lane_cells`).
+        cell_weight: see `HostLossConfig`.
     """
 
     class_weight: float = 1.5
@@ -46,18 +63,60 @@ class LaneGraphLossConfig:
     gamma: float = 2.0
     matcher: Literal["scipy", "jax"] = "scipy"
     element_lane_weight: float = 5.0
-    control_points: int | None = None
     elements: ElementLossConfig = ElementLossConfig()
-    cell_weight: float = 1.0
+
+    def loss(
+        self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
+    ) -> tuple[Float[Array, ""], Report]:
+        """Return the loss of a batch and what is recorded of it, see `HostLossConfig.loss`."""
+        return lane_graph_host_loss(self, outputs, auxiliary, batch, host, None)
+
+
+def lane_graph_host_loss(
+    config: TopoNetLossConfig,
+    outputs: Prediction,
+    auxiliary: AuxiliaryOutputs,
+    batch: Example,
+    host: Any,
+    control_points: int | None,
+) -> tuple[Float[Array, ""], Report]:
+    """Return the loss of a host of lane graphs: lanes, elements where it predicts them, and auxiliary losses.
+
+    Args:
+        config: weights.
+        outputs, auxiliary, batch, host: see `HostLossConfig.loss`.
+        control_points: see `matching_cost`.
+    """
+    elements = sizes = None
+    if outputs.elements is not None:
+        if batch.traffic_elements is None or batch.cameras is None:
+            raise UserError(
+                "the model predicts traffic elements, and these data label none: choose data with front images and "
+                "traffic elements, or set task.model.elements to None"
+            )
+        elements, sizes = batch.traffic_elements, batch.cameras.size[:, 0]
+    loss, report = lane_graph_loss(outputs, batch.lanes, config, elements, sizes, control_points)
+    further, more = auxiliary_losses(
+        auxiliary,
+        host.auxiliary,
+        batch.lanes,
+        bev_range=host.encoder.bev_range,
+        cell_weight=config.cell_weight,
+        denoising=partial(lane_denoising_losses, config=config, control_points=control_points),
+    )
+    for term in further:
+        loss += term
+    return loss, report | more
 
 
 def lane_graph_loss(
     prediction: Prediction,
     lanes: LaneGraph,
-    config: LaneGraphLossConfig,
+    config: TopoNetLossConfig,
     elements: TrafficElements | None = None,
     size: Int[Array, "b 2"] | None = None,
-) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    control_points: int | None = None,
+) -> tuple[Float[Array, ""], Report]:
     """Return the loss of a batch and its terms; lanes and elements are matched by one host call each.
 
     Args:
@@ -67,6 +126,7 @@ def lane_graph_loss(
         config: weights.
         elements: ground truth, needed where the prediction has elements.
         size: width and height of the front images, likewise.
+        control_points: see `matching_cost`.
 
     Returns:
         The sum over layers of all weighted terms, and the terms of the last layer under `class`, `points`, `successor`,
@@ -76,14 +136,14 @@ def lane_graph_loss(
     Raises:
         ValueError: a prediction without lanes, or with elements and nothing to compare them with.
     """
-    if prediction.lanes is None:
-        raise ValueError("a lane-graph loss needs predicted lanes")
+    if prediction.centerlines is None:
+        raise ValueError("a lane-graph loss needs predicted centerlines")
     # Padding may hold anything; from here on it holds zeros, so that 0 * padding is 0.
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
-    cost = jax.vmap(lambda p, g: matching_cost(p, g, config))(prediction.lanes, lanes)
+    cost = jax.vmap(lambda p, g: matching_cost(p, g, config, control_points))(prediction.centerlines, lanes)
     assignment = match(cost, lanes.valid[:, None], config.matcher)  # (B, D, N): one host call
-    terms = lane_losses(prediction.lanes, assignment, lanes, config)
-    report = {"matching/lanes": _matched(assignment)}
+    terms = lane_losses(prediction.centerlines, assignment, lanes, config, control_points)
+    report = {"matching/lanes": matched(assignment)}
     if prediction.elements is not None:
         if elements is None or size is None:
             raise ValueError("a loss of predicted traffic elements needs the true ones and the size of their images")
@@ -92,56 +152,60 @@ def lane_graph_loss(
         found = match(jax.vmap(each)(prediction.elements, elements, size), elements.valid[:, None], config.matcher)
         terms |= element_losses(prediction.elements, found, elements, size, config)
         terms["element_lane"] = element_lane_loss(prediction.elements, assignment, found, lanes, elements, config)
-        report["matching/elements"] = _matched(found)
-    total = jnp.stack([term.sum() for term in terms.values()]).sum()
-    return total, {name: term[-1] for name, term in terms.items()} | report
+        report["matching/elements"] = matched(found)
+    return total(terms), last_layer(terms) | report
 
 
 def matching_cost(
-    prediction: LanePrediction, lanes: LaneGraph, config: LaneGraphLossConfig
+    prediction: CenterlinePrediction, lanes: LaneGraph, config: TopoNetLossConfig, control_points: int | None = None
 ) -> Float[Array, "layers q n"]:
-    """Return the cost of giving each lane to each query, for one example; columns of padding are arbitrary."""
+    """Return the cost of giving each lane to each query, for one example; columns of padding are arbitrary.
+
+    With `control_points`, lanes are compared by as many Bezier control points fitted to them, else by their points.
+    """
     cost_class = focal_cost(prediction.logits, config.alpha, config.gamma)  # (D, Q, 1), broadcast over lanes
-    cost_points = pairwise_l1(_lines(prediction.points, config), _lines(lanes.points, config)[None])
+    cost_points = pairwise_l1(_lines(prediction.points, control_points), _lines(lanes.points, control_points)[None])
     return config.class_weight * cost_class + config.points_weight * cost_points
 
 
 def lane_losses(
-    prediction: LanePrediction, assignment: Assignment, lanes: LaneGraph, config: LaneGraphLossConfig
+    prediction: CenterlinePrediction,
+    assignment: Assignment,
+    lanes: LaneGraph,
+    config: TopoNetLossConfig,
+    control_points: int | None = None,
 ) -> Terms:
     """Return the weighted losses `class`, `points` and `successor` of every layer of a batch; no NaN in `lanes`."""
-    layer = jax.vmap(jax.vmap(partial(_lane_sums, config=config), in_axes=(0, 0, 0, None)), in_axes=(0, 0, 0, 0))
+    layer = jax.vmap(
+        jax.vmap(partial(_lane_sums, config=config, control_points=control_points), in_axes=(0, 0, 0, None)),
+        in_axes=(0, 0, 0, 0),
+    )
     classes, points = layer(prediction.points, prediction.logits, assignment, lanes)  # each (B, D)
     edges = lanes.successor & lanes.valid[:, :, None] & lanes.valid[:, None, :]
-    related = _last(assignment, prediction.successor_logits.shape[1])
-    successors = _edge_loss(prediction.successor_logits, related, related, edges, config)
-    positives = _positives(assignment)
+    related = last_layers(assignment, prediction.successor_logits.shape[1])
+    successors = edge_loss(prediction.successor_logits, related, related, edges, config.alpha, config.gamma)
+    count = positives(assignment)
     return {
-        "class": config.class_weight * classes.sum(0) / positives,
-        "points": config.points_weight * points.sum(0) / positives,
+        "class": config.class_weight * classes.sum(0) / count,
+        "points": config.points_weight * points.sum(0) / count,
         "successor": config.successor_weight * successors,
     }
 
 
-def lane_denoising_losses(prediction: LanePrediction, lanes: LaneGraph, config: LaneGraphLossConfig) -> Terms:
+def lane_denoising_losses(
+    prediction: CenterlinePrediction, lanes: LaneGraph, config: TopoNetLossConfig, control_points: int | None = None
+) -> Terms:
     """Return what `lane_losses` does, for noised lanes: query i belongs to lane i, so nothing is matched.
 
     Args:
         prediction: leading axes (batch, copy, layer); see `models.lane_denoising`.
         lanes: truth of the batch; lanes beyond the number of queries are left out, padding may hold anything.
         config: weights.
+        control_points: see `matching_cost`.
     """
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
-    batch, copies, layers, queries = prediction.logits.shape[:4]
-    capacity = lanes.valid.shape[1]
-    own = jnp.arange(capacity)
-    there = lanes.valid & (own < queries)[None]
-    assignment = Assignment(
-        query=jnp.broadcast_to(jnp.where(there, own[None], 0)[:, None, None], (batch, copies, layers, capacity)),
-        matched=jnp.broadcast_to(there[:, None, None], (batch, copies, layers, capacity)),
-    )
-    prediction, assignment = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (prediction, assignment))
-    return lane_losses(prediction, assignment, jax.tree.map(lambda leaf: jnp.repeat(leaf, copies, 0), lanes), config)
+    prediction, assignment, lanes = denoising_pairs(prediction, lanes)
+    return lane_losses(prediction, assignment, lanes, config, control_points)
 
 
 def element_losses(
@@ -149,7 +213,7 @@ def element_losses(
     assignment: Assignment,
     elements: TrafficElements,
     size: Int[Array, "b 2"],
-    config: LaneGraphLossConfig,
+    config: TopoNetLossConfig,
 ) -> Terms:
     """Return the weighted losses `element_class`, `element_box` and `element_iou` of every layer of a batch."""
     weights = config.elements
@@ -157,11 +221,11 @@ def element_losses(
     prediction = prediction.replace(lane_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
     each = jax.vmap(partial(element_terms, config=weights), in_axes=(0, 0, None, None))
     classes, boxes, apart = jax.vmap(each)(prediction, assignment, elements, size)  # each (B, D)
-    positives = _positives(assignment)
+    count = positives(assignment)
     return {
-        "element_class": weights.class_weight * classes.sum(0) / positives,
-        "element_box": weights.box_weight * boxes.sum(0) / positives,
-        "element_iou": weights.iou_weight * apart.sum(0) / positives,
+        "element_class": weights.class_weight * classes.sum(0) / count,
+        "element_box": weights.box_weight * boxes.sum(0) / count,
+        "element_iou": weights.iou_weight * apart.sum(0) / count,
     }
 
 
@@ -171,13 +235,15 @@ def element_lane_loss(
     element_assignment: Assignment,
     lanes: LaneGraph,
     elements: TrafficElements,
-    config: LaneGraphLossConfig,
+    config: TopoNetLossConfig,
 ) -> Float[Array, " layers"]:
     """Return the weighted loss of the lane-element topology of every layer of a batch that predicts it."""
     layers = prediction.lane_logits.shape[1]
     edges = elements.lane & lanes.valid[:, :, None] & elements.valid[:, None, :]
-    rows, columns = _last(lane_assignment, layers), _last(element_assignment, layers)
-    return config.element_lane_weight * _edge_loss(prediction.lane_logits, rows, columns, edges, config)
+    rows, columns = last_layers(lane_assignment, layers), last_layers(element_assignment, layers)
+    return config.element_lane_weight * edge_loss(
+        prediction.lane_logits, rows, columns, edges, config.alpha, config.gamma
+    )
 
 
 def _lane_sums(
@@ -185,57 +251,20 @@ def _lane_sums(
     logits: Float[Array, "q 1"],
     assignment: Assignment,
     lanes: LaneGraph,
-    config: LaneGraphLossConfig,
+    config: TopoNetLossConfig,
+    control_points: int | None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return class sum and points sum of one layer of one example."""
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     is_lane = jnp.zeros(logits.shape).at[query, 0].set(1.0, mode="drop")
-    error = jnp.abs(_lines(points[assignment.query], config) - _lines(lanes.points, config)).sum(-1)
-    return _focal(logits, is_lane, config).sum(), jnp.where(assignment.matched, error, 0.0).sum()
+    error = jnp.abs(_lines(points[assignment.query], control_points) - _lines(lanes.points, control_points)).sum(-1)
+    return focal(logits, is_lane, config.alpha, config.gamma).sum(), jnp.where(assignment.matched, error, 0.0).sum()
 
 
-def _edge_loss(
-    logits: Float[Array, "b layers q r"],
-    rows: Assignment,
-    columns: Assignment,
-    edges: Bool[Array, "b n m"],
-    config: LaneGraphLossConfig,
-) -> Float[Array, " layers"]:
-    """Return the mean focal loss over all pairs of queries of a batch; pairs that are not matched are no edges."""
-
-    def one(logits, rows, columns, edges):
-        row, column = (
-            jnp.where(side.matched, side.query, count)
-            for side, count in zip((rows, columns), logits.shape, strict=True)
-        )
-        true = jnp.zeros(logits.shape).at[row[:, None], column[None, :]].set(edges.astype(jnp.float32), mode="drop")
-        return _focal(logits, true, config).mean() if logits.size else jnp.zeros(())
-
-    return jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)))(logits, rows, columns, edges).mean(0)
-
-
-def _focal(logits, target, config: LaneGraphLossConfig):
-    return optax.losses.sigmoid_focal_loss(logits, target, alpha=config.alpha, gamma=config.gamma)
-
-
-def _lines(points: Float[Array, "*b p 3"], config: LaneGraphLossConfig) -> Float[Array, "*b d"]:
+def _lines(points: Float[Array, "*b p 3"], control_points: int | None) -> Float[Array, "*b d"]:
     """Return what is compared of a centerline: its points or its control points, as one vector."""
-    if config.control_points is not None:
-        fit = bezier_fit(points.shape[-2], config.control_points).astype(points.dtype)
+    if control_points is not None:
+        fit = bezier_fit(points.shape[-2], control_points).astype(points.dtype)
         points = jnp.einsum("kp,...pc->...kc", fit, points)
     return points.reshape(*points.shape[:-2], -1)
-
-
-def _last(assignment: Assignment, layers: int) -> Assignment:
-    """Return the assignments (B, D, N) of the last layers."""
-    return jax.tree.map(lambda leaf: leaf[:, leaf.shape[1] - layers :], assignment)
-
-
-def _positives(assignment: Assignment) -> Float[Array, " layers"]:
-    """Return what sums over a batch are divided by in the reference: its number of positives, at least one."""
-    return jnp.maximum(assignment.matched.sum((0, 2)).astype(jnp.float32), 1.0)
-
-
-def _matched(assignment: Assignment) -> Float[Array, ""]:
-    return assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()

@@ -1,7 +1,7 @@
-"""Which examples a step sees, and having them ready when it starts.
+"""Batches: which examples each step uses, gathered while the step before runs.
 
-Examples come as arrays in memory (stacked, numpy leaves with a leading axis) or as a `datasets.streaming.Streamed`;
-either way gives the same batches.
+Examples are arrays in memory (stacked, numpy leaves with a leading axis) or a `datasets.streaming.Streamed`. Both give
+the same batches.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ __all__ = ["Prepare", "batch_indices", "batches", "count", "first_example", "ord
 def batch_indices(seed: int, step: int, examples: int, batch_size: int) -> Int[np.ndarray, " b"]:
     """Return the examples of one step.
 
-    Every epoch is a permutation of its own, drawn from (seed, epoch), and the batches run through them without gaps: a
-    batch at the seam takes the rest of one epoch and the start of the next. The step alone says where one is, so
-    that a resumed run goes on with the same batches.
+    Every epoch is another permutation, drawn from (seed, epoch). Batches run through the epochs without gaps: a batch
+    may hold the end of one epoch and the start of the next. The indices depend on the step alone, so that a resumed
+    run continues with the same batches.
     """
     epochs, places = np.divmod(step * batch_size + np.arange(batch_size), examples)
     return np.concatenate(
@@ -54,7 +54,7 @@ def first_example(arrays: Any) -> Any:
 
 
 def prepared(batch: Any, prepare: Prepare, seed: int, step: int) -> Any:
-    """Return stacked examples as that step sees them."""
+    """Return stacked examples, augmented as in the given step."""
     size = len(jax.tree.leaves(batch)[0])
     return stack_examples([prepare(_row(batch, i), (seed, step, i)) for i in range(size)])
 
@@ -68,16 +68,16 @@ def batches(
     *,
     share: tuple[int, int] = (0, 1),
 ) -> Generator[Any]:
-    """Yield the batch of each step on the device, the next one being gathered in a thread meanwhile.
+    """Yield the batch of each step on the device; a thread gathers the next one meanwhile.
 
     Args:
-        arrays: examples, see above.
-        seeds: of the run; each has an order of its own, and more than one gives batches a leading seed axis.
-        steps: which steps.
+        arrays: examples, see the module's docstring.
+        seeds: of the run; each has its own order. More than one seed gives batches a leading seed axis.
+        steps: the steps to yield batches for.
         batch_size: examples of a step (and seed).
         prepare: augments each example; called in that thread, or in the workers of a `Streamed`.
-        share: (index, count) of this process among several that divide every batch (`jax.process_index()`,
-            `jax.process_count()`): it gets that part of the rows.
+        share: (index, count) of this process among those that divide every batch (`jax.process_index()`,
+            `jax.process_count()`); it gets its part of the rows.
 
     Raises:
         ValueError: the processes cannot divide a batch evenly.
@@ -123,7 +123,7 @@ def batches(
 def ordered_batches(arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]:
     """Yield all examples once in order: their indices, and a batch (numpy) that begins with them.
 
-    The last batch is filled up with the last example, so that all have one size.
+    The last batch is filled up with copies of the last example, so that all batches have the same size.
     """
     examples = count(arrays)
     starts = range(0, examples, batch_size)
@@ -150,7 +150,7 @@ def _row(batch: Any, index: int) -> Any:
 
 @dataclass(frozen=True)
 class _Order:
-    """The requests of a training: step by step, seed by seed, the places of the batch that are this process's."""
+    """Requests of a training: by step, then by seed, then by place in this process's part of the batch."""
 
     seeds: tuple[int, ...]
     first_step: int
@@ -168,7 +168,7 @@ class _Order:
 
 @dataclass(frozen=True)
 class _InOrder:
-    """The requests of an evaluation; after the last example it comes again."""
+    """Requests of an evaluation, in order; beyond the end the last example is repeated."""
 
     examples: int
 

@@ -1,0 +1,149 @@
+"""Comparisons of which a part fails, further test sets, and what the tables hold."""
+
+import json
+import re
+
+import pytest
+
+from tests.ablations.test_identity import QUICK
+from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations import scores, workers
+from tflane_jax.cli import main
+from tflane_jax.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cheap")
+
+
+def compare(config, out, seeds, *arguments):
+    named = [f"base={config}:baseline", f"tfm={config}"]
+    return main(["compare", *named, "--seeds", *seeds, "--out", str(out), *QUICK, *arguments])
+
+
+def failing(monkeypatch, *endings):
+    """Let trainings fail whose folder ends so."""
+    train_run, trained = workers.train_run, []
+
+    def train(config, folder, **options):
+        trained.append(folder)
+        if folder.as_posix().endswith(endings):
+            raise (UserError("no such data") if "tfm" in str(folder) else RuntimeError("a fault in the program"))
+        return train_run(config, folder, **options)
+
+    monkeypatch.setattr(workers, "train_run", train)
+    return trained
+
+
+def rows(path):
+    lines = [line.strip("|").split("|") for line in path.read_text().splitlines() if line.startswith("|")]
+    names = [cell.strip() for cell in lines[0]]
+    return [dict(zip(names, (cell.strip() for cell in line), strict=True)) for line in lines[2:]]
+
+
+def test_a_failed_training_stops_no_other_and_is_listed(tiny, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        trained = failing(patch, "base/seed_0", "tfm/seed_1")
+        assert compare(tiny, out, "0123", "--test", "few=--data.test 3") == 2
+    assert len(trained) == 8
+    told = capsys.readouterr()
+    assert "2 of 8 trainings failed" in told.err
+    assert re.search(r"base/seed_0 failed: its messages are in \S+base/seed_0\.log \(RuntimeError: a fault", told.err)
+    assert re.search(r"tfm/seed_1 failed: its messages are in \S+tfm/seed_1\.log \(no such data\)", told.err)
+    assert "Traceback" in (out / "base" / "seed_0.log").read_text()
+    assert "tflane: no such data" in (out / "tfm" / "seed_1.log").read_text()
+
+    content = json.loads((out / "comparison.json").read_text())
+    assert {name: list(by_seed) for name, by_seed in content["scores"]["few"]["best"].items()} == {
+        "base": ["1", "2", "3"],
+        "tfm": ["0", "2", "3"],
+        "tfm, no traffic flow at inference": ["0", "2", "3"],
+    }
+    assert len(content["failed"]) == 2
+    last = [row for row in rows(out / "table.md") if row["checkpoint"] == "last"]
+    assert [(row["model"], row["seeds"]) for row in last][:2] == [("base", "1, 2, 3"), ("tfm", "0, 2, 3")]
+    assert "two-sided t-test over the seeds that all models have (2, 3)" in (out / "paired.md").read_text()
+    assert all(row["seeds better"].endswith("of 2") for row in rows(out / "paired.md") if row["model"] == "tfm")
+
+    # The same command trains what is missing.
+    assert compare(tiny, out, "0123", "--test", "few=--data.test 3") == 0
+    assert "two-sided t-test over 4 seeds" in (out / "paired.md").read_text()
+
+
+def test_without_a_control_there_is_a_table_and_no_test(tiny, tmp_path, monkeypatch, capsys):
+    failing(monkeypatch, "base/seed_0", "base/seed_1")
+    assert compare(tiny, tmp_path, "01") == 2
+    printed = capsys.readouterr().out
+    assert "no paired tests (last checkpoint, test split): no run of base" in printed
+    assert "no run of base is complete" in (tmp_path / "table.md").read_text()
+    assert {row["model"] for row in rows(tmp_path / "table.md")} == {"tfm", "tfm, no traffic flow at inference"}
+    assert not (tmp_path / "paired.md").exists()
+
+
+def test_an_evaluation_that_fails_is_listed_too(tiny, tmp_path, monkeypatch, capsys):
+    open_run = scores.open_run
+
+    def opened(folder, step):
+        if folder.as_posix().endswith("tfm/seed_0"):
+            raise UserError("damaged")
+        return open_run(folder, step)
+
+    monkeypatch.setattr(scores, "open_run", opened)
+    assert compare(tiny, tmp_path, "0") == 2
+    assert "1 of 2 trainings failed" in capsys.readouterr().err
+    assert {row["model"] for row in rows(tmp_path / "table.md")} == {"base"}
+
+
+def test_test_sets_have_tables_of_their_own(tiny, tmp_path, capsys):
+    tests = ["--test", "rain=--data.world.severity 1 --data.test 3", "--test", "Long Night=--data.test 4"]
+    assert compare(tiny, tmp_path, "01", *tests) == 0
+    assert "test set rain (--data.world.severity 1 --data.test 3)" in (tmp_path / "table-rain.md").read_text()
+    assert "test set Long Night" in (tmp_path / "paired-long_night.md").read_text()
+    scores = json.loads((tmp_path / "comparison.json").read_text())["scores"]
+    assert {name: set(found) for name, found in scores.items()} == {
+        name: {"last", "best"} for name in ("test", "rain", "Long Night")
+    }
+    capsys.readouterr()
+    assert compare(tiny, tmp_path, "01", "--test", "rain=--optim.lr 1") == 2
+    assert "--optim.lr is none" in capsys.readouterr().err
+    for wrong in (["--test", "rain"], ["--test", "=--data.test 3"], [*tests, *tests]):
+        assert compare(tiny, tmp_path, "01", *wrong) == 2
+
+
+@pytest.mark.parametrize("best", ["2", "4"])
+def test_every_table_has_the_last_and_the_best_checkpoint(tiny, tmp_path, monkeypatch, best):
+    """Which one is best is decided on the validation split."""
+    from tflane_jax.tasks.lane_graph import LaneGraphSystem
+
+    evaluate, counted = LaneGraphSystem.evaluate, []
+
+    def scored(self, task, params, data, batch_size):
+        evaluation = evaluate(self, task, params, data, batch_size)
+        counted.append(None)
+        evaluation.groups["all"]["DET_l"] = 0.9 if str(2 * len(counted)) == best else 0.1
+        return evaluation
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LaneGraphSystem, "evaluate", scored)
+        command = ["compare", f"base={tiny}:baseline", "--seeds", "0", "--out", str(tmp_path), *QUICK]
+        assert main([*command, "--training.eval-every", "2"]) == 0
+    found = [(row["model"], row["checkpoint"]) for row in rows(tmp_path / "table.md")]
+    assert found == [("base", "last"), ("base", "best")]
+    kept = json.loads((tmp_path / "base" / "seed_0.scores.json").read_text())
+    assert {entry["step"] for entry in kept.values()} == {4, int(best)}
+
+
+def test_data_are_loaded_when_they_are_needed(tiny, tmp_path, monkeypatch):
+    from tflane_jax.tasks.lane_graph import LaneGraphSystem
+
+    load, train_run, events = LaneGraphSystem.load, workers.train_run, []
+    monkeypatch.setattr(
+        LaneGraphSystem, "load", lambda self, source, **options: events.append(source.split) or load(self, source)
+    )
+
+    def train(config, folder, **options):
+        events.append(f"train {folder.parent.name}")
+        return train_run(config, folder, **options)
+
+    monkeypatch.setattr(workers, "train_run", train)
+    assert compare(tiny, tmp_path, "0", "--data.test", "5") == 0
+    assert events == ["train base", "train", "val", "train tfm", "train", "val", "test"]

@@ -1,0 +1,90 @@
+"""Runs as a whole, on fake examples: runs of older versions, and settings that are checked before training."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from tests.test_cli import CONFIG as TINY
+from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tests.test_migrations import renamed_back
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config_io import to_json
+from tflane_jax.errors import UserError
+from tflane_jax.models.toponet import paper_config
+from tflane_jax.runs import current_form, open_run, resumable_config, train_run
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.training.adaptive import AdaptiveConfig
+from tflane_jax.training.restarts import RestartsConfig
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    path = tmp_path_factory.mktemp("configs") / "tiny.py"
+    path.write_text(TINY)
+    config = load_config(f"{path}:baseline")
+    return replace(config, evaluation=replace(config.evaluation, pictures=0))
+
+
+def aged(content):
+    """Return a configuration (JSON) as an older version wrote it: another name, and without a newer setting."""
+    old = renamed_back(content, {"OptimConfig": {"optimizer": "matrices"}})
+    del old["training"]["init_partly"]
+    return old
+
+
+def test_a_run_of_an_older_version_opens_and_resumes(config, tmp_path, capsys):
+    folder = tmp_path / "run"
+    train_run(config, folder, progress=False)
+    for path in (folder / "config.json", *(folder / "checkpoints").glob("*/manifest.json")):
+        content = json.loads(path.read_text())
+        new = aged(content) if path.name == "config.json" else content | {"config": aged(content["config"])}
+        path.write_text(json.dumps(new))
+    assert open_run(folder, "last").config == config
+    assert resumable_config(folder) == config
+    capsys.readouterr()
+    assert train_run(config, folder, start="resume", progress=False).step == 4
+    assert capsys.readouterr().err.splitlines() == ["setting training.init_partly is new: default false"]
+    assert json.loads((folder / "config.json").read_text()) == to_json(config)
+    other = replace(config, optim=replace(config.optim, lr=1.0))
+    with pytest.raises(UserError, match=r"another configuration \(optim\.lr: 0\.01 there, 1\.0 here\)"):
+        train_run(other, folder, start="resume", progress=False)
+
+
+def test_the_current_form_of_a_configuration_is_itself(config):
+    assert current_form(to_json(config)) == (to_json(config), [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"training": {"best_metric": "all/DET_1"}},
+            r"training\.best_metric is all/DET_1, .*choose one of .*all/DET_l,",
+        ),
+        ({"training": {"best_metric": "all/OLS"}}, r"training\.best_metric is all/OLS"),
+        (
+            {"optim": {"restarts": RestartsConfig(adaptive=AdaptiveConfig(metric="loss"))}},
+            r"optim\.restarts\.adaptive\.metric is loss",
+        ),
+    ],
+)
+def test_scores_are_checked_by_name_before_anything_is_done(config, tmp_path, changes, message, monkeypatch):
+    monkeypatch.setattr(type(config.task), "load", None)  # no data are looked at
+    parts = {part: replace(getattr(config, part), **settings) for part, settings in changes.items()}
+    with pytest.raises(UserError, match=message):
+        train_run(replace(config, **parts), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_scores_that_an_evaluation_gives_are_known_before(config, tmp_path):
+    result = train_run(config, tmp_path / "run", progress=False)
+    # The fake model predicts traffic elements, the configuration's does not.
+    of_lanes = {name for name in result.metrics if not name.startswith(("all/DET_t", "all/TOP_lt", "all/OLS"))}
+    assert of_lanes == config.task.score_names(config.data, config.evaluation) < result.metrics.keys()
+    images = RunConfig(LaneShapeTask())
+    assert "all/Accuracy" in images.task.score_names(images.data, images.evaluation)
+    paper = RunConfig(LaneGraphTask(paper_config()))
+    more = {name for name in result.metrics if name not in of_lanes}
+    assert paper.task.score_names(paper.data, paper.evaluation) == of_lanes | more

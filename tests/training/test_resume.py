@@ -1,0 +1,88 @@
+"""Resuming runs of older versions, and checkpoints that a later save must not destroy."""
+
+import copy
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from tests.training.stub import LineTask, line_arrays
+from tests.training.stub_run import CONFIG, RESOLVED, run, score
+from tflane_jax.datasets.batches import batch_indices
+from tflane_jax.errors import UserError
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.provenance import read_provenance, thread_setting
+
+
+def exploding_after(step: int) -> dict:
+    """Return a task and arrays whose loss becomes infinite in the first update after a step."""
+    arrays = line_arrays()
+    earlier = {int(i) for s in range(step) for i in batch_indices(0, s, len(arrays["y"]), CONFIG.batch_size)}
+    fresh = [int(i) for i in batch_indices(0, step, len(arrays["y"]), CONFIG.batch_size) if int(i) not in earlier]
+    arrays["x"][fresh[0]] = 1e6
+    return {"task": LineTask(blow_up=1e5), "arrays": arrays}
+
+
+def test_a_loss_that_is_not_finite_after_an_evaluation_leaves_its_checkpoint(tmp_path):
+    config = dataclasses.replace(CONFIG, eval_every=4, checkpoint_every=100)
+    with pytest.raises(UserError, match=r"step 5, seed 0.*is not finite"):
+        run(tmp_path / "run", config=config, **exploding_after(4))
+    checkpoints = Checkpoints(tmp_path / "run" / "checkpoints", best_metric="score")
+    assert checkpoints.steps() == [4]
+    assert checkpoints.best_step() == 4
+    assert checkpoints.manifest(4).metrics == score(checkpoints.params(4))
+
+
+def older(folder, **without):
+    """Rewrite a run's saved configuration as a version without some settings wrote it."""
+    saved = json.loads((folder / "config.json").read_text())
+    for part, name in without.items():
+        del saved[part][name]
+    (folder / "config.json").write_text(json.dumps(saved))
+
+
+def completed(saved):
+    """Add the setting that this version has and an older one had not."""
+    new = copy.deepcopy(saved)
+    new["training"].setdefault("best_metric", "score")
+    return new, [] if "best_metric" in saved["training"] else ["setting training.best_metric is new: default score"]
+
+
+def test_a_run_that_lacks_a_new_setting_resumes_with_its_default(tmp_path, capsys):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=10))
+    older(folder, training="best_metric")
+    run(folder, start="resume", current_form=completed)
+    assert "setting training.best_metric is new: default score\n" in capsys.readouterr().err
+    assert json.loads((folder / "config.json").read_text()) == RESOLVED
+    other = RESOLVED | {"training": RESOLVED["training"] | {"best_metric": "other"}}
+    older(folder, training="best_metric")
+    with pytest.raises(UserError, match=r"another configuration \(training\.best_metric: score there, other here\)"):
+        run(folder, start="resume", current_form=completed, resolved=other)
+
+
+def test_the_number_of_cores_is_recorded_and_a_change_is_told(tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "run"
+    run(folder, config=dataclasses.replace(CONFIG, steps=4))
+    (start,) = read_provenance(folder)
+    assert start["threads"] == thread_setting()
+    assert start["threads"]["cores"] >= 1
+    run(folder, start="resume")
+    assert "bit-identical" not in capsys.readouterr().err
+    monkeypatch.setenv("OMP_NUM_THREADS", "77")
+    run(folder, start="resume")
+    told = capsys.readouterr().err
+    assert "OMP_NUM_THREADS 77: the results are not bit-identical" in told
+    assert read_provenance(folder)[-1]["threads"] == thread_setting() == start["threads"] | {"OMP_NUM_THREADS": "77"}
+
+
+def test_a_checkpoint_is_known_by_its_content(tmp_path):
+    def content(name, **others):
+        run(tmp_path / name, config=dataclasses.replace(CONFIG, steps=4), **others)
+        return Checkpoints(tmp_path / name / "checkpoints").content(4)
+
+    first = content("one")
+    assert first == Checkpoints(tmp_path / "one" / "checkpoints").content(4)
+    moved = {"x": line_arrays()["x"] + np.float32(1), "y": line_arrays()["y"]}
+    assert content("other", arrays=moved) != first

@@ -1,0 +1,167 @@
+"""The trainings of a comparison: folders, identities, and whether a folder already holds the wanted run.
+
+A run is identified by its whole resolved configuration, with exactly one seed, and by the thread setting of the process
+that trains it (`training.provenance.thread_setting`), because results depend on both. A run that starts from another
+one (`training.init_from`) also depends on that run's checkpoint.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.config import RunConfig
+from tflane_jax.config_io import first_difference, to_json
+from tflane_jax.errors import UserError
+from tflane_jax.runs import current_form
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.fine_tuning import origins
+from tflane_jax.training.provenance import read_provenance, thread_setting
+from tflane_jax.training.run_folder import Start, read_config
+
+Tests = Mapping[str, Sequence[str]]
+"""Test sets by name: settings of the data, `--data.name value`, that differ from the configuration's test split."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training.
+
+    Attributes:
+        config: with exactly one seed.
+        folder: of the run.
+        threads: thread setting of the process that trains it.
+        tests: test sets to evaluate it on, beside the configuration's own test split.
+        retrain: whether a run of another configuration in the folder is deleted.
+    """
+
+    config: RunConfig
+    folder: Path
+    threads: Mapping[str, Any] = field(default_factory=thread_setting)
+    tests: Tests = field(default_factory=dict)
+    retrain: bool = False
+
+    @property
+    def log(self) -> Path:
+        """File for messages: everything that a worker process prints, or the error of a training in this process."""
+        return self.folder.with_name(f"{self.folder.name}.log")
+
+    @property
+    def key(self) -> str:
+        """Hash of everything that identifies the run."""
+        text = json.dumps([to_json(self.config), dict(self.threads)], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def difference(self) -> str:
+        """Return how the run in the folder differs from this one; "" if it does not, or the folder holds none."""
+        if not self._exists():
+            return ""
+        try:
+            saved, _ = current_form(read_config(self.folder))
+        except UserError as error:
+            return str(error)
+        if difference := first_difference(saved, to_json(self.config)):
+            return difference
+        # A run that was started before these were recorded is taken as it is.
+        for start in read_provenance(self.folder):
+            if difference := first_difference(start.get("threads", self.threads), dict(self.threads)):
+                return difference
+            if difference := self._other_origin(start.get("init_from", [])):
+                return difference
+        return ""
+
+    def _other_origin(self, recorded: Sequence[Mapping[str, Any]]) -> str:
+        """Return which run of training.init_from is not the recorded one any more; "" if it is, or is gone."""
+        if not recorded:
+            return ""
+        training = self.config.training
+        try:
+            now = origins(training.init_from or "", training.seeds)
+        except UserError:
+            return ""
+        changed = [new["run"] for old, new in zip(recorded, now, strict=True) if old["content"] != new["content"]]
+        return f"training.init_from: {changed[0]} was trained anew since" if changed else ""
+
+    def start(self) -> Start:
+        """Return how the training has to start."""
+        if not self._exists():
+            return "new"
+        return "overwrite" if self.retrain and self.difference() else "resume"
+
+    def is_complete(self) -> bool:
+        """Return whether the folder holds this very run with the checkpoint of its last step."""
+        steps = Checkpoints(self.folder / "checkpoints").steps()
+        return self._exists() and steps[-1:] == [self.config.training.steps] and not self.difference()
+
+    def _exists(self) -> bool:
+        return (self.folder / "config.json").is_file()
+
+    def step(self) -> int:
+        """Return the last step in the run's records, 0 without records; for progress bars."""
+        with contextlib.suppress(FileNotFoundError, IndexError, ValueError):
+            lines = (self.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+            return min(int(json.loads(lines[-1])["step"]), self.config.training.steps)
+        return 0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A training or evaluation that failed, and why."""
+
+    job: Job
+    reason: str
+
+    def __str__(self) -> str:
+        return f"training {self.job.folder} failed: its messages are in {self.job.log} ({self.reason})"
+
+
+def plan_jobs(
+    configs: Mapping[str, RunConfig],
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    threads: Mapping[str, Any],
+    tests: Tests,
+    retrain: bool = False,
+) -> dict[str, list[Job]]:
+    """Return the trainings of each configuration, one for each seed.
+
+    Raises:
+        UserError: a folder holds a run of another configuration or thread setting, and `retrain` is False.
+    """
+    plan = {}
+    for name, folder in file_names(configs).items():
+        plan[name] = []
+        for seed in seeds:
+            config = replace(configs[name], training=replace(configs[name].training, seeds=(seed,)))
+            plan[name].append(Job(config, out / folder / f"seed_{seed}", threads, tests, retrain))
+    differences = [(job, text) for planned in plan.values() for job in planned if (text := job.difference())]
+    if differences and not retrain:
+        job, text = differences[0]
+        more = f", and so do {len(differences) - 1} other folders" if len(differences) > 1 else ""
+        hint = "; --test evaluates finished runs on other data" if text.startswith("data.test") else ""
+        raise UserError(
+            f"{job.folder} holds a run of another configuration ({text}){more}: choose another folder with --out, or "
+            f"train such runs anew with --retrain, which deletes them{hint}"
+        )
+    return plan
+
+
+def file_names(names: Iterable[str]) -> dict[str, str]:
+    """Return a name for files for each name: lower case, letters, digits and underscores.
+
+    Names that would get the same one, or none, also get a hash of the name.
+    """
+    names = list(names)
+    plain = {name: "".join(c if c.isalnum() else "_" for c in name.lower()).strip("_") for name in names}
+    unique = {}
+    for name, slug in plain.items():
+        alone = slug and list(plain.values()).count(slug) == 1
+        mark = hashlib.sha256(name.encode()).hexdigest()[:8]
+        unique[name] = slug if alone else f"{slug or 'run'}-{mark}"
+    return unique

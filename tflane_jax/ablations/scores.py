@@ -1,0 +1,131 @@
+"""Scores of trained runs on test sets, kept beside each run.
+
+A file of scores is valid for one checkpoint (its content), one data source, one evaluation setting and one state of the
+program's code. Whatever else is in the file is ignored.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import tflane_jax
+from tflane_jax.ablations.comparison import Scores
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.config import RunConfig, apply_overrides
+from tflane_jax.config_io import to_json
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
+from tflane_jax.runs import load_test_data, open_run
+from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.loop import TrainingConfig
+
+Which = Literal["last", "best"]
+CHECKPOINTS: tuple[Which, ...] = ("last", "best")
+OWN_TEST = ""
+"""Name of a configuration's own test split."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Scores of one checkpoint on one test set.
+
+    Attributes:
+        step: of the checkpoint.
+        protocol: of the metrics, with its version.
+        ways: scores of each way to use the run: "" as trained, others as `Task.inference_variants` names them.
+    """
+
+    step: int
+    protocol: str
+    ways: dict[str, Scores]
+
+
+def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
+    """Return the configuration whose test split is a named test set; its own for no settings.
+
+    Raises UserError for settings that are not of the data: the others cannot change in a trained model.
+    """
+    for name in settings:
+        if name.startswith("--") and not name.startswith("--data"):
+            raise UserError(f"a test set changes settings of the data (--data...), {name} is none")
+    if not settings:
+        return config
+    return replace(config, data=_changed(replace(config, training=TrainingConfig()), tuple(settings)).data)
+
+
+@functools.lru_cache(maxsize=64)
+def _changed(config: RunConfig, settings: tuple[str, ...]) -> RunConfig:
+    """Apply settings; cached, because this takes a second and is the same for all seeds."""
+    return apply_overrides(config, settings)
+
+
+def measure_all(job: Job) -> None:
+    """Evaluate a finished run on all of its test sets, so that the scores are at hand afterwards."""
+    for settings in ((), *job.tests.values()):
+        for which in CHECKPOINTS:
+            measure(job, with_test_set(job.config, settings), which)
+
+
+def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
+    """Return the scores of a finished run on a test set, evaluated once.
+
+    Args:
+        job: the run.
+        config: whose test split to evaluate on, see `with_test_set`.
+        which: the last checkpoint, or the best one by `training.best_metric` on the validation split.
+
+    Returns:
+        None for "best" if no evaluation gave a finite best metric.
+    """
+    checkpoints = Checkpoints(job.folder / "checkpoints", best_metric=config.training.best_metric)
+    step = checkpoints.best_step() if which == "best" else checkpoints.find("last")
+    if step is None:
+        return None
+    mark = _mark(
+        checkpoint=checkpoints.content(step),
+        source=repr(config.data.source("test")),
+        evaluation=to_json(config.evaluation),
+        code=code_digest(),
+    )
+    path = job.folder.with_name(f"{job.folder.name}.scores.json")
+    kept = {name: entry for name, entry in _read(path) if entry["code"] == code_digest()}
+    if mark not in kept:
+        run = open_run(job.folder, step)
+        task = run.config.task
+        data, ways = load_test_data(config), {"": task} | task.inference_variants()
+        found = {way: used.evaluate(run.params[0], data, config.evaluation) for way, used in ways.items()}
+        scores = {way: evaluation.scores() for way, evaluation in found.items()}
+        kept[mark] = {"code": code_digest(), "step": step, "protocol": found[""].protocol, "ways": scores}
+        write_json(path, kept)
+    entry = kept[mark]
+    return Measured(entry["step"], entry["protocol"], entry["ways"])
+
+
+def _mark(**parts: Any) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the entries of a file of scores that are complete."""
+    with contextlib.suppress(FileNotFoundError, ValueError):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        for mark, entry in content.items() if isinstance(content, dict) else ():
+            if isinstance(entry, dict) and entry.keys() >= {"code", "step", "protocol", "ways"}:
+                yield mark, entry
+
+
+@functools.cache
+def code_digest() -> str:
+    """Return the hash of the package's source files."""
+    package = Path(tflane_jax.__file__).parent
+    digest = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        digest.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()

@@ -1,0 +1,193 @@
+"""Training many runs, one after the other in this process, or several at a time in worker processes.
+
+A training that fails is noted, and the others go on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from tqdm import tqdm
+
+from tflane_jax.ablations.jobs import Failure, Job
+from tflane_jax.ablations.scores import measure_all
+from tflane_jax.errors import UserError
+from tflane_jax.runs import build_data, train_run
+from tflane_jax.training.provenance import thread_setting
+from tflane_jax.training.runtime import configure_jax
+
+_POLL_SECONDS = 0.5
+
+
+def train_all(jobs: Sequence[Job], parallel: int) -> list[Failure]:
+    """Train every job that is not complete, in this process or `parallel` at a time in workers; return what failed."""
+    waiting = [job for job in jobs if not job.is_complete()]
+    return _train_here(waiting) if parallel == 1 else _train_in_workers(waiting, jobs, parallel)
+
+
+def worker_threads(parallel: int) -> dict[str, Any]:
+    """Return the thread setting of each of `parallel` workers; of this process for one."""
+    return thread_setting(len(_cores(0, parallel)) or None) if parallel > 1 else thread_setting()
+
+
+def _cores(slot: int, parallel: int) -> list[int]:
+    """Return the cores of a worker. All workers have the same number, so that results do not depend on the worker."""
+    if not hasattr(os, "sched_getaffinity"):
+        return []
+    every = sorted(os.sched_getaffinity(0))
+    each = max(len(every) // parallel, 1)
+    return [every[(slot * each + i) % len(every)] for i in range(each)]
+
+
+@contextlib.contextmanager
+def noted(job: Job, failures: list[Failure]) -> Iterator[None]:
+    """Add an error inside the block to `failures`, and write it to the job's log, with a traceback if unexpected."""
+    try:
+        yield
+    except Exception as error:
+        known = isinstance(error, UserError)
+        _log(job, f"tflane: {error}" if known else traceback.format_exc())
+        failures.append(Failure(job, str(error) if known else f"{type(error).__name__}: {error}"))
+
+
+def _tell(failures: Sequence[Failure]) -> None:
+    for failure in failures:
+        tqdm.write(f"{failure}; the others go on", file=sys.stderr)
+
+
+def _log(job: Job, text: str) -> None:
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    with job.log.open("a", encoding="utf-8") as log:
+        print(text, file=log)
+
+
+def _train_here(waiting: Sequence[Job]) -> list[Failure]:
+    failures: list[Failure] = []
+    for job in waiting:
+        with noted(job, failures):
+            if train_run(job.config, job.folder, start=job.start()).stopped_by is not None:
+                raise KeyboardInterrupt  # the same command resumes what was written
+        _tell([failure for failure in failures if failure.job is job])
+    return failures
+
+
+def _train_in_workers(waiting: list[Job], jobs: Sequence[Job], parallel: int) -> list[Failure]:
+    failures: list[Failure] = []
+    built: set[Any] = set()
+    with contextlib.ExitStack() as stack:
+        workers = [stack.enter_context(Worker(slot, parallel)) for slot in range(min(parallel, len(waiting)))]
+        total = sum(job.config.training.steps for job in jobs)
+        bar = stack.enter_context(tqdm(total=total, desc=f"train {len(jobs)} runs", unit="step"))
+        while waiting or any(worker.job for worker in workers):
+            for worker in workers:
+                if worker.job is None and waiting:
+                    others = {task for other in workers if other is not worker for task in other.tasks}
+                    # Prefer a model that this worker has compiled, then one that no worker has.
+                    mine = (job for job in waiting if job.config.task in worker.tasks)
+                    fresh = (job for job in waiting if job.config.task not in others)
+                    chosen = next(mine, None) or next(fresh, waiting[0])
+                    waiting.remove(chosen)
+                    with noted(chosen, failures):
+                        _build(chosen, built)
+                        worker.begin(chosen)
+                    _tell([failure for failure in failures if failure.job is chosen])
+            time.sleep(_POLL_SECONDS)
+            bar.update(sum(job.step() for job in jobs) - bar.n)
+            for worker in workers:
+                if (failure := worker.check()) is not None:
+                    failures.append(failure)
+                    _tell([failure])
+    return failures
+
+
+def _build(job: Job, built: set[Any]) -> None:
+    """Make the data that a job needs, with all cores, unless an earlier job needed them too."""
+    for split in ("train", "val", "test"):
+        if (source := job.config.data.source(split)) not in built:
+            build_data(source)
+            built.add(source)
+
+
+class Worker:
+    """A process on its own cores that trains one job after the other, and compiles every model once."""
+
+    def __init__(self, slot: int, parallel: int) -> None:
+        self._cores = _cores(slot, parallel)
+        self.job: Job | None = None
+        self.tasks: set[Any] = set()
+
+    def __enter__(self) -> Worker:
+        self._begin_process()
+        return self
+
+    def _begin_process(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, far = context.Pipe()
+        self._process: Any = context.Process(target=_train_jobs, args=(far, self._cores), daemon=True)
+        self._process.start()
+        far.close()  # so that reading fails, instead of waiting, once the process is gone
+        self.tasks.clear()
+
+    def __exit__(self, *_: object) -> None:
+        if self.job is None and self._process.exitcode is None:
+            with contextlib.suppress(OSError):
+                self._pipe.send(None)
+        else:  # an error ends the comparison: the same command resumes what was written
+            self._process.terminate()
+        self._process.join()
+
+    def begin(self, job: Job) -> None:
+        """Let the process train a job."""
+        if self._process.exitcode is not None:
+            self._begin_process()
+        self.job = job
+        self.tasks.add(job.config.task)
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # a process that is gone is found by `check`
+            self._pipe.send(job)
+
+    def check(self) -> Failure | None:
+        """Return why the current job failed, if it did; a process that is gone is replaced when the next job begins."""
+        if self.job is None or not self._pipe.poll():
+            return None
+        job, self.job = self.job, None
+        try:
+            reason = self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            reason = _death(self._process.exitcode)
+            _log(job, f"tflane: {reason}")
+        return None if reason is None else Failure(job, reason)
+
+
+def _death(code: int) -> str:
+    if code >= 0:
+        return f"its worker process ended with code {code}"
+    name = signal.Signals(-code).name
+    hint = ", as the system does when memory runs out" if name == "SIGKILL" else ""
+    return f"its worker process was killed by {name}{hint}"
+
+
+def _train_jobs(pipe: Any, cores: list[int]) -> None:
+    """Train the jobs that come through the pipe; answer None for each, or why it failed. Messages go to its log."""
+    if cores:
+        os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this
+    with contextlib.suppress(EOFError):  # the comparison is gone
+        while (job := pipe.recv()) is not None:
+            with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
+                configure_jax()
+                failures: list[Failure] = []
+                with noted(job, failures):
+                    result = train_run(job.config, job.folder, start=job.start(), progress=False)
+                    if result.stopped_by is not None:
+                        raise UserError(f"stopped by {signal.Signals(result.stopped_by).name} after step {result.step}")
+                    measure_all(job)
+            pipe.send(failures[0].reason if failures else None)

@@ -1,0 +1,1 @@
+"""What each command takes, one file a group of commands. Nothing slow is imported here."""

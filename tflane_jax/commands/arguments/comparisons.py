@@ -1,0 +1,117 @@
+"""Arguments of the commands that compare and score: compare, sweep, score, demo, bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tflane_jax.commands.arguments.shared import OVERRIDES, command
+
+_FILES = """Protocols and their files:
+  openlane-v2.1-centerline, openlane-v1.0-centerline
+      PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
+      dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
+      of about four: say which one you report. v2.1 is also that of devkit v1.1. Both sides may also be plain .npz or
+      .json files (docs/scoring.md), such as `tflane predict` writes; without traffic elements.
+  openlane-v2.1-lane-segment, lanesegnet
+      The same files of the lane-segment task (TIMESTAMP-ls.json). The first gives the devkit's OLUS, the second the
+      mAP of the LaneSegNet and TF-Lane papers.
+  openlane-v2-f-score
+      The files of the centerline protocols; the devkit's F-score of 3-D lanes.
+  maptr, maptrv2
+      MapTR's nuscmap_results.json and the *_map_anns_val.json that its evaluation writes.
+  tusimple, tusimple-lstr
+      Both files hold one JSON record a line: raw_file, lanes (x at every row, negative where there is none), h_samples
+      (the truth) or run_time in ms (predictions). tusimple-lstr allows 20 s an image instead of 200 ms, like LSTR."""
+
+
+def compare(commands) -> None:
+    """Add `tflane compare`."""
+    parser = command(
+        commands,
+        "compare",
+        "train configurations with several seeds and test their differences",
+        module="compare",
+        function="run",
+        epilog=OVERRIDES,
+    )
+    parser.add_argument(
+        "configs",
+        metavar="[NAME=]FILE[:ABLATION]",
+        nargs="+",
+        help="config files; the first one is what the others are compared with",
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, sharing the cores (default 1)")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/compare"), help="default runs/compare")
+    parser.set_defaults(takes_overrides=True)
+
+
+def sweep(commands) -> None:
+    """Add `tflane sweep`."""
+    parser = command(
+        commands,
+        "sweep",
+        "evaluate trained models while a setting of their test data changes",
+        module="sweep",
+        function="run",
+        epilog=OVERRIDES,
+    )
+    parser.add_argument(
+        "runs",
+        metavar="[NAME=]FOLDER",
+        nargs="+",
+        help="run folders, or folders with one for each seed as compare leaves them",
+    )
+    parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
+    parser.add_argument("--values", nargs="+", required=True, help="of the setting")
+    parser.add_argument("--metrics", nargs="+", help="to show, say all/DET_l gap/recall (default: as compare does)")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
+    parser.set_defaults(takes_overrides=True)
+
+
+def score(commands) -> None:
+    """Add `tflane score`."""
+    parser = command(
+        commands,
+        "score",
+        "score a file of predictions, of any framework, by an official protocol",
+        module="score",
+        function="run",
+        epilog=_FILES,
+    )
+    parser.add_argument("protocol", metavar="PROTOCOL", help="see below")
+    parser.add_argument("predictions", metavar="PREDICTIONS", type=Path, help="file of predictions")
+    parser.add_argument("truth", metavar="GROUND_TRUTH", type=Path, help="file or folder of annotations")
+    parser.add_argument(
+        "--by",
+        choices=("scene", "distance", "occlusion"),
+        help="report parts as well; distance and occlusion: of centerlines",
+    )
+    parser.add_argument(
+        "--bootstrap",
+        type=int,
+        metavar="N",
+        default=0,
+        help="95 percent intervals from N draws of whole scenes (some 200 are enough)",
+    )
+    parser.add_argument(
+        "--out", metavar="STEM", type=Path, default=Path("score"), help="write STEM.md and STEM.json (default score)"
+    )
+
+
+def demo(commands) -> None:
+    """Add `tflane demo`."""
+    parser = command(
+        commands,
+        "demo",
+        "train with and without traffic flow, evaluate both, in under ten minutes",
+        module="demo",
+        function="run",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/demo"), help="default runs/demo")
+
+
+def bench(commands) -> None:
+    """Add `tflane bench`."""
+    parser = command(commands, "bench", "run the benchmarks of a source checkout", module="bench", function="run")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/bench"), help="default runs/bench")

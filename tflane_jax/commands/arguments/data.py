@@ -1,0 +1,70 @@
+"""Arguments of `tflane data`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tflane_jax.commands.arguments.shared import OVERRIDES, SourceName, command, source_arguments, split_arguments
+
+
+def data(commands) -> None:
+    """Add `tflane data`."""
+    parser = commands.add_parser("data", help="look at datasets", description="Look at datasets.")
+    inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    show = command(inner, "show", "draw samples of a dataset and count what is in it", module="data", function="show")
+    show.add_argument("--config", metavar="FILE", help="config file whose data to show (default: the built-in world)")
+    split_arguments(show, "train")
+    show.add_argument("--count", type=int, default=8, help="examples (default 8)")
+    show.add_argument(
+        "--out", metavar="FILE", type=Path, default=Path("samples.png"), help="picture (default samples.png)"
+    )
+    check = command(
+        inner, "check", "count what is in a dataset's folder and list its faults", module="data", function="check"
+    )
+    check.add_argument("root", metavar="PATH", help="folder of the dataset")
+    check.add_argument(
+        "--format",
+        metavar="NAME",
+        type=SourceName(checked=True),
+        default="argoverse2",
+        help="of the dataset (default argoverse2)",
+    )
+    export = command(
+        inner,
+        "export",
+        "write a dataset with cameras in another format",
+        module="data_export",
+        function="run",
+        epilog=OVERRIDES,
+    )
+    export.add_argument("--format", choices=("openlane-v2",), default="openlane-v2", help="default openlane-v2")
+    export.add_argument("--config", metavar="FILE[:NAME]", help="config file whose data to write", required=True)
+    source_arguments(export)
+    export.add_argument(
+        "--splits", choices=("train", "val", "test"), nargs="+", default=["train", "val"], help="default train val"
+    )
+    export.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg as official, png without loss")
+    export.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    export.set_defaults(takes_overrides=True)
+    overlap = command(
+        inner,
+        "overlap",
+        "measure how much two splits show the same places",
+        module="data",
+        function="overlap_of_splits",
+    )
+    overlap.add_argument(
+        "train", metavar="TRAIN", type=Path, help="folder of Argoverse 2 logs, or of OpenLane-V2 segments"
+    )
+    overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same of the other split")
+    overlap.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
+    build = command(
+        inner,
+        "build",
+        "make the built-in world's examples ahead of training",
+        module="data",
+        function="build",
+        epilog=OVERRIDES,
+    )
+    build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
+    build.set_defaults(takes_overrides=True)

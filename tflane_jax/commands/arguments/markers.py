@@ -1,0 +1,95 @@
+"""Arguments of `tflane markers`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tflane_jax.commands.arguments.shared import command
+
+
+def markers(commands) -> None:
+    """Add `tflane markers`."""
+    parser = commands.add_parser(
+        "markers", help="find fiducial markers, and store the lanes that they name", description="Fiducial markers."
+    )
+    inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    _marker_store(inner)
+    detect = command(
+        inner, "detect", "find markers in photos of a calibrated camera", module="markers", function="find"
+    )
+    detect.add_argument("images", metavar="IMAGES", nargs="+", type=Path, help="photos, or folders of photos")
+    detect.add_argument(
+        "--intrinsics",
+        metavar=("FX", "FY", "CX", "CY"),
+        nargs=4,
+        type=float,
+        required=True,
+        help="focal lengths and principal point, pixels from the image's corner",
+    )
+    detect.add_argument(
+        "--distortion",
+        metavar="K",
+        nargs="+",
+        type=float,
+        help="of the lens: OpenCV's K1 K2 P1 P2 [K3 [K4 K5 K6]]; default none",
+    )
+    detect.add_argument("--size", type=float, default=1.0, help="side of the black square, metres (default 1)")
+    detect.add_argument("--height", type=float, default=1.5, help="of the camera above ground, metres (default 1.5)")
+    detect.add_argument("--pitch", type=float, default=0.0, help="of the camera, downwards, degrees (default 0)")
+    detect.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/markers"), help="default runs/markers")
+    curves = command(
+        inner,
+        "curves",
+        "measure how detection and pose get worse with distance, in the built-in world",
+        module="markers",
+        function="curves",
+    )
+    curves.add_argument(
+        "--distances", type=float, nargs="+", default=[5.0 * n for n in range(1, 13)], help="metres (default 5 to 60)"
+    )
+    curves.add_argument(
+        "--scales", type=float, nargs="+", default=[1.0, 0.5], help="sizes of the images, 1 is native (default 1 0.5)"
+    )
+    curves.add_argument("--seeds", type=int, default=8, help="scenes, with three boards each (default 8)")
+    curves.add_argument("--severity", type=float, default=0.5, help="of weather and camera, 0 to 1 (default 0.5)")
+    curves.add_argument(
+        "--sigma-d", type=float, default=40.0, help="of the paper's detection curve in the picture, metres (default 40)"
+    )
+    curves.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    for parser, many in ((detect, False), (curves, True)):
+        parser.add_argument("--family", default="ARUCO_5X5_100", help="of the markers (default ARUCO_5X5_100)")
+        parser.add_argument("--enlarge", type=int, default=1, help="search images so many times larger (default 1)")
+        ways = ("pattern", "subpixel", "none")
+        if many:
+            parser.add_argument(
+                "--corners",
+                choices=ways,
+                nargs="+",
+                default=["pattern", "subpixel"],
+                help="how corners are found (default pattern subpixel)",
+            )
+        else:
+            parser.add_argument("--corners", choices=ways, default="pattern", help="how corners are found")
+
+
+def _marker_store(inner) -> None:
+    store = command(
+        inner, "store", "write which lanes the markers of a log name", module="marker_store", function="run"
+    )
+    store.add_argument(
+        "--log",
+        metavar="SCENE|FOLDER",
+        required=True,
+        help="number of a world scene, or an Argoverse 2 log, which gets virtual markers",
+    )
+    store.add_argument("--out", metavar="FILE", type=Path, default=Path("store.json"), help="default store.json")
+    store.add_argument("--radius", type=float, default=50.0, help="lanes so near to a marker, metres (default 50)")
+    store.add_argument(
+        "--frame",
+        choices=("marker", "survey"),
+        default="marker",
+        help="of the lanes in the file: the marker's, or the map's (default marker)",
+    )
+    store.add_argument("--bike-lanes", choices=("include", "exclude"), default="include", help="default include")
+    store.add_argument("--surveyed", metavar="YYYY-MM-DD", help="day of the survey")
+    store.add_argument("--expires", metavar="YYYY-MM-DD", help="first day on which the entries count no longer")

@@ -1,0 +1,111 @@
+"""Arguments of the commands for one model: train, eval, predict, convert, export, summary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arguments, model_arguments
+
+_PREDICT = """Lane lines in photos of any size:
+  tflane predict RUN photo.jpg folder/          with a model that was trained here
+  tflane predict --config FILE photo.jpg        with the published weights that the config file names
+Photos of another camera than TuSimple's are cut to its field of view where --focal and --horizon say how."""
+
+
+def train(commands) -> None:
+    """Add `tflane train`."""
+    # Its help is printed by the command itself, because with a config it lists that config's settings.
+    parser = command(
+        commands, "train", "train a model", module="train", function="run", epilog=OVERRIDES, add_help=False
+    )
+    parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (.py), or one of its ablations")
+    parser.add_argument("--out", metavar="RUN", type=Path, help="run folder (default runs/<name of the config file>)")
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument(
+        "--resume",
+        action="store_const",
+        const="resume",
+        dest="start",
+        help="go on with the run in --out (its own configuration, --config not needed)",
+    )
+    start.add_argument(
+        "--overwrite", action="store_const", const="overwrite", dest="start", help="delete the run in --out first"
+    )
+    parser.add_argument("-h", "--help", action="store_true", dest="wants_help", help="show this and exit")
+    parser.set_defaults(start="new", takes_overrides=True, usage=parser.format_help())
+
+
+def evaluate(commands) -> None:
+    """Add `tflane eval`."""
+    parser = command(commands, "eval", "evaluate a trained run", module="evaluate", function="run")
+    model_arguments(parser)
+    example_arguments(parser, "test")
+    parser.add_argument(
+        "--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
+    )
+
+
+def predict(commands) -> None:
+    """Add `tflane predict`."""
+    parser = command(
+        commands, "predict", "write predictions and pictures", module="predict", function="run", epilog=_PREDICT
+    )
+    model_arguments(parser, "run folder; then photos or folders of photos, for models of lane lines in one image")
+    example_arguments(parser, "val")
+    parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
+    parser.add_argument(
+        "--threshold", type=float, default=0.3, help="least score of a lane in JSON and pictures (default 0.3)"
+    )
+    parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
+    parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("runs/predict"), help="where to write (default runs/predict)"
+    )
+
+
+def convert(commands) -> None:
+    """Add `tflane convert`."""
+    parser = command(
+        commands, "convert", "turn published PyTorch weights into a run folder", module="convert", function="run"
+    )
+    parser.add_argument("--config", metavar="FILE[:NAME]", required=True, help="config file of the same model")
+    parser.add_argument(
+        "--weights",
+        metavar="FILE",
+        type=Path,
+        help="checkpoint, .pth, .pkl or .npz (default: the one that the config names)",
+    )
+    parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="run folder to write")
+
+
+def export(commands) -> None:
+    """Add `tflane export`."""
+    parser = command(
+        commands,
+        "export",
+        "write a model of lane lines in one image as a StableHLO program",
+        module="export",
+        function="run",
+    )
+    model_arguments(parser)
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, default=Path("model.stablehlo"), help="default model.stablehlo"
+    )
+
+
+def summary(commands) -> None:
+    """Add `tflane summary`."""
+    parser = command(
+        commands,
+        "summary",
+        "count a model's parameters, operations and memory",
+        module="summary",
+        function="run",
+        epilog=OVERRIDES,
+    )
+    parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the default configuration)")
+    parser.add_argument("--depth", type=int, default=1, help="levels of parameter names (default 1)")
+    parser.add_argument("--no-compile", action="store_true", help="count operations only, which takes seconds")
+    parser.add_argument("--no-training", action="store_true", help="leave the training step out")
+    parser.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
+    parser.set_defaults(takes_overrides=True)

@@ -1,0 +1,115 @@
+"""Arguments that several commands share. Nothing slow is imported here."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+OVERRIDES = """Any setting of the configuration can be changed by its dotted name, for example --optim.lr 1e-3.
+`tflane train --config FILE --help` lists them all with their values."""
+
+
+class SourceName:
+    """Type of an argument that names a data source; the list of sources is imported only when it is needed.
+
+    Args:
+        checked: take only sources whose folder can be checked.
+    """
+
+    def __init__(self, *, checked: bool = False):
+        self._checked = checked
+
+    def names(self) -> list[str]:
+        """Return the names that the argument takes."""
+        from tflane_jax.datasets.sources import SOURCES
+
+        return [source.name for source in SOURCES if source.check is not None or not self._checked]
+
+    def __call__(self, text: str) -> str:
+        if text not in self.names():
+            raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join(self.names())}")
+        return text
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser whose help lists the data sources: their import takes a second, so it waits until help is printed."""
+
+    def format_help(self) -> str:
+        """Return the help text."""
+        for action in self._actions:
+            if isinstance(action.type, SourceName):
+                action.metavar = f"{{{','.join(action.type.names())}}}"
+        return super().format_help()
+
+
+def command(commands, name: str, text: str, *, function: str, module: str, epilog: str = "", **more):
+    """Add a command and return its parser.
+
+    Args:
+        commands: what `add_subparsers` gave.
+        name: of the command.
+        text: for help, without capital and full stop.
+        function, module: that do it, `tflane_jax.commands.<module>.<function>`.
+        epilog: end of the help text, printed as it is.
+        **more: see `argparse.ArgumentParser`.
+    """
+    parser = commands.add_parser(
+        name,
+        help=text,
+        description=text[0].upper() + text[1:] + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        **more,
+    )
+    parser.set_defaults(module=module, function=function, takes_overrides=False)
+    return parser
+
+
+def _checkpoint(text: str) -> int | str:
+    if text in ("best", "last"):
+        return text
+    if text.isdecimal():
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a step")
+
+
+def model_arguments(parser: argparse.ArgumentParser, inputs: str = "run folder") -> None:
+    """Add the arguments that name a trained model."""
+    parser.add_argument("inputs", metavar="RUN", nargs="*", type=Path, help=inputs)
+    parser.add_argument(
+        "--config", metavar="FILE[:NAME]", help="instead of a run: a config file that names published weights"
+    )
+    parser.add_argument(
+        "--weights", metavar="FILE", type=Path, help="with --config: file of the weights (default: the config's)"
+    )
+    parser.add_argument(
+        "--checkpoint",
+        metavar="best|last|STEP",
+        type=_checkpoint,
+        help="default best, or last where nothing was evaluated",
+    )
+
+
+def example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
+    """Add the arguments that name examples to predict, `split` being the default."""
+    split_arguments(parser, split)
+    parser.add_argument("--max-instances", type=int, metavar="N", help="use at most N road users; 0 is no traffic flow")
+
+
+def split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
+    """Add the arguments that name one split of the data, `split` being the default."""
+    # No default here: a split that was asked for is refused where the data have none, the default is not.
+    parser.add_argument("--split", choices=("train", "val", "test"), help=f"default {split}")
+    parser.set_defaults(default_split=split)
+    source_arguments(parser)
+
+
+def source_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that name a data source."""
+    parser.add_argument(
+        "--data", metavar="NAME", type=SourceName(), help="use this data source instead of the configuration's"
+    )
+    parser.add_argument("--root", metavar="PATH", help="folder of the data, for sources that are read from a folder")
+    parser.add_argument(
+        "--openlane", metavar="PATH", help="folder of the OpenLane-V2 split files, which --data argoverse2 can use"
+    )

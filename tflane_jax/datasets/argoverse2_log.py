@@ -1,0 +1,233 @@
+"""One Argoverse 2 sensor log: annotations, ego poses and the vector map -> `Log`.
+
+Images and lidar are not read. Two traps of the format: a box is given in the ego frame of its own timestamp, and the
+map's predecessor lists are incomplete, so only successors are read. Format: https://argoverse.github.io/user-guide
+(sensor dataset; annotations.feather, city_SE3_egovehicle.feather, map/).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from tflane_jax.datasets.argoverse2_map import read_map
+from tflane_jax.datasets.openlane_splits import openlane_timestamps
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
+from tflane_jax.scene import RoadUser
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks
+
+ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
+_POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_BOX_COLUMNS = (
+    *_POSE_COLUMNS,
+    "track_uuid",
+    "category",
+    "length_m",
+    "width_m",
+    "height_m",
+    "num_interior_pts",
+)
+# Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
+_FRAMES_PER_KEYFRAME = 5
+
+CATEGORIES: Mapping[str, RoadUser | None] = {
+    "REGULAR_VEHICLE": RoadUser.CAR,
+    "LARGE_VEHICLE": RoadUser.TRUCK,
+    "BOX_TRUCK": RoadUser.TRUCK,
+    "TRUCK": RoadUser.TRUCK,
+    "TRUCK_CAB": RoadUser.TRUCK,
+    "VEHICULAR_TRAILER": RoadUser.TRUCK,
+    "BUS": RoadUser.BUS,
+    "ARTICULATED_BUS": RoadUser.BUS,
+    "SCHOOL_BUS": RoadUser.BUS,
+    "RAILED_VEHICLE": RoadUser.BUS,
+    "MOTORCYCLE": RoadUser.MOTORCYCLE,
+    "MOTORCYCLIST": RoadUser.MOTORCYCLE,
+    "BICYCLE": RoadUser.BICYCLE,
+    "BICYCLIST": RoadUser.BICYCLE,
+    "WHEELED_DEVICE": RoadUser.BICYCLE,
+    "WHEELED_RIDER": RoadUser.BICYCLE,
+    "PEDESTRIAN": RoadUser.PEDESTRIAN,
+    "OFFICIAL_SIGNALER": RoadUser.PEDESTRIAN,
+    "STROLLER": RoadUser.PEDESTRIAN,
+    "WHEELCHAIR": RoadUser.PEDESTRIAN,
+    "DOG": RoadUser.PEDESTRIAN,
+    "ANIMAL": RoadUser.PEDESTRIAN,
+    "BOLLARD": None,
+    "SIGN": None,
+    "STOP_SIGN": None,
+    "CONSTRUCTION_CONE": None,
+    "CONSTRUCTION_BARREL": None,
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
+    "MESSAGE_BOARD_TRAILER": None,
+    "TRAFFIC_LIGHT_TRAILER": None,
+}
+"""Road user of each Argoverse 2 category; None is street furniture, which has tracks but is no traffic."""
+
+Keyframes = Literal["openlane_v2", "annotations"]
+
+
+def load_log(
+    folder: Path,
+    *,
+    keyframes: Keyframes = "openlane_v2",
+    openlane: Path | None = None,
+    categories: Mapping[str, RoadUser | None] = CATEGORIES,
+) -> Log:
+    """Read one log folder.
+
+    Args:
+        folder: holds annotations.feather, city_SE3_egovehicle.feather and map/.
+        keyframes: "openlane_v2" takes the 2 Hz frames of OpenLane-V2, "annotations" every annotated frame (10 Hz).
+        openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps (of the front camera). Without
+            it, or for a log that is not in them, "openlane_v2" takes every fifth annotated frame.
+        categories: road user of each category, None to leave it out.
+
+    Raises:
+        UserError: a file is missing or unreadable, lacks a column, or holds no frame.
+    """
+    folder = Path(folder)
+    pose_times, poses = read_poses(folder)
+    boxes = read_table(folder / ANNOTATIONS, _BOX_COLUMNS)
+    times = np.unique(boxes["timestamp_ns"])
+    if len(times) == 0:
+        raise UserError(
+            f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
+        )
+    tracks = _tracks(boxes, times, categories, folder)
+    moments = times if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
+    if keyframes == "openlane_v2" and openlane is not None:
+        moments = openlane_timestamps(openlane).get(folder.name, moments)
+    nearest = np.abs(moments[:, None] - times).argmin(-1)
+    return Log(
+        name=folder.name,
+        source="argoverse2",
+        map=read_map(folder / "map"),
+        timestamps_ns=times,
+        global_from_ego=_poses_at(times, pose_times, poses, folder),
+        tracks=tracks,
+        actors=tracks,
+        keyframes=tuple(
+            KeyFrame(int(t), pose, int(frame))
+            for t, pose, frame in zip(moments, _poses_at(moments, pose_times, poses, folder), nearest, strict=True)
+        ),
+        seed=zlib.crc32(folder.name.encode()),
+    )
+
+
+def read_table(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Read columns of a feather file; raise UserError naming the file and what it lacks."""
+    try:
+        import pyarrow
+        from pyarrow import feather
+    except ImportError as error:
+        raise UserError("reading Argoverse 2 needs pyarrow: pip install 'tflane_jax[data]'") from error
+    if not path.is_file():
+        raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
+    try:
+        table = feather.read_table(path)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise UserError(f"{path} is not a readable feather file ({error}): download it again") from error
+    missing = [c for c in columns if c not in table.column_names]
+    if missing:
+        raise UserError(f"{path} lacks the column(s) {', '.join(missing)}: it is no Argoverse 2 sensor-dataset file")
+    return {c: table[c].to_numpy() for c in columns}
+
+
+def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4)."""
+    table = read_table(folder / POSES, _POSE_COLUMNS)
+    order = np.argsort(table["timestamp_ns"], kind="stable")
+    return table["timestamp_ns"][order], _pose_of(table)[order]
+
+
+def _pose_of(table: dict[str, np.ndarray]) -> np.ndarray:
+    quaternion = np.stack([table[c] for c in ("qw", "qx", "qy", "qz")], -1)
+    return pose_matrix(matrix_from_quaternion(quaternion), np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1))
+
+
+def _poses_at(times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, folder: Path) -> np.ndarray:
+    """Return the poses whose timestamps are exactly `times`."""
+    if not len(pose_times):
+        raise UserError(f"{folder / POSES} holds no pose: download it again")
+    row = np.minimum(np.searchsorted(pose_times, times), len(pose_times) - 1)
+    missing = times[pose_times[row] != times]
+    if len(missing):
+        raise UserError(
+            f"{folder / POSES} has no pose at {len(missing)} of {len(times)} frames (first {missing[0]}): "
+            "annotations and poses are not of the same log; download both again"
+        )
+    return poses[row]
+
+
+def _tracks(
+    boxes: dict[str, Any], times: np.ndarray, categories: Mapping[str, RoadUser | None], folder: Path
+) -> Tracks:
+    names, category_row = np.unique(boxes["category"].astype(str), return_inverse=True)
+    unknown = [n for n in names if n not in categories]
+    if unknown:
+        raise UserError(
+            f"{folder / ANNOTATIONS} has the unknown category {', '.join(unknown)}: "
+            "add it to `categories` with its road user"
+        )
+    traffic = np.isin(category_row, [i for i, n in enumerate(names) if categories[n] is not None])
+    boxes = {name: column[traffic] for name, column in boxes.items()}
+    uuid, first, k = np.unique(boxes["track_uuid"].astype(str), return_index=True, return_inverse=True)
+    f = np.searchsorted(times, boxes["timestamp_ns"])
+    pose, shape = _pose_of(boxes), (len(times), len(uuid))
+    tracks = Tracks(
+        position=np.zeros((*shape, 3)),
+        yaw=np.zeros(shape),
+        size=np.stack([boxes[c][first] for c in ("length_m", "width_m", "height_m")], -1),
+        category=np.array([categories[c] for c in boxes["category"][first]], np.int32),
+        occluded=np.zeros(shape, bool),
+        valid=np.zeros(shape, bool),
+        uuid=uuid,
+    )
+    tracks.position[f, k] = pose[:, :3, 3]
+    tracks.yaw[f, k] = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
+    tracks.occluded[f, k] = boxes["num_interior_pts"] == 0
+    tracks.valid[f, k] = True
+    return tracks
+
+
+def check_log(folder: Path) -> list[str]:
+    """Return one sentence for each fault of a log folder; none if it can be read."""
+    folder, lacking = Path(folder), []
+    if not folder.is_dir():
+        return [f"{folder} is no folder"]
+    for name, columns in ((ANNOTATIONS, _BOX_COLUMNS), (POSES, _POSE_COLUMNS)):
+        try:
+            read_table(folder / name, columns)
+        except UserError as error:
+            lacking.append(str(error))
+    try:
+        read_map(folder / "map")
+    except UserError as error:
+        lacking.append(str(error))
+    if not lacking:
+        try:
+            load_log(folder)
+        except UserError as error:
+            lacking.append(str(error))
+    return lacking
+
+
+def find_logs(root: Path) -> list[Path]:
+    """Return the log folders, sorted by log id, in a dataset root, a split, a folder of logs, or one log itself.
+
+    Raises UserError if there is none.
+    """
+    root = Path(root)
+    patterns = ("", "*", "*/*", "sensor/*/*")
+    found = {path.parent for p in patterns for path in root.glob(f"{p}/{ANNOTATIONS}".lstrip("/"))}
+    if not found:
+        raise UserError(
+            f"{root} holds no Argoverse 2 log: no {ANNOTATIONS} in it, in */, in */*/ or in sensor/<split>/<log>/"
+        )
+    return sorted(found, key=lambda path: path.name)

@@ -1,0 +1,97 @@
+"""The entry by which a dataset joins the program: `datasets.sources` lists one for every dataset.
+
+A dataset's file defines three things: a frozen dataclass that names one split of it (its *config*), the class that
+opens such a config, and the frozen dataclass that a run configuration holds for all three splits (its *data*). A
+`DataSource` ties them together, so that commands, tasks and configurations never ask which dataset they have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from tflane_jax.datasets.base import Split
+from tflane_jax.datasets.loading import load_or_stream
+from tflane_jax.scene import Example, RoadImage
+
+ConfigT = TypeVar("ConfigT")
+
+
+class SplitData(Protocol):
+    """The examples of a run: a frozen dataclass in `RunConfig.data`. Its class name is saved with every run."""
+
+    def source(self, split: Split) -> Any:
+        """Return the config of a split, of the class `DataSource.config`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What the command line says about the data.
+
+    Attributes:
+        split: from --split, or the command's default.
+        split_given: whether --split was given.
+        configured: the run configuration's own config of this split, of any dataset with the same kind of example.
+        root: from --root; None only for sources without a root.
+        openlane: from --openlane, folder of the OpenLane-V2 split files.
+    """
+
+    split: Split
+    split_given: bool
+    configured: Any
+    root: Path | None = None
+    openlane: Path | None = None
+
+
+@dataclass(frozen=True)
+class FolderCheck:
+    """Result of checking a dataset's folder.
+
+    Attributes:
+        format: name of the format, for the table's title.
+        rows: counts, for a table.
+        faults: sentences, each naming a file or folder; empty for a sound folder.
+    """
+
+    format: str
+    rows: list[dict[str, Any]]
+    faults: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class DataSource(Generic[ConfigT]):
+    """One dataset.
+
+    Attributes:
+        name: value of --data.
+        data: class of `RunConfig.data` for this dataset, see `SplitData`.
+        config: frozen dataclass that names one split.
+        example: kind of example that the dataset gives, `Example` (lane graphs) or `RoadImage` (lane lines).
+        dataset: opens a config; examples are made or read when asked for.
+        choose: returns the config that the command line names. It must honour `Choice.split` or raise UserError.
+        title: name of a config, for titles and files.
+        root: what the folder of --root is, for messages; None for a source that takes no --root.
+        open: (config, progress) -> the dataset as training reads it, for example from a cache; None is `dataset`.
+        load: (opened dataset, progress, fields of `Example` to read) -> what training and evaluation take.
+        sample: config -> one example with the shapes and types of all, made as fast as possible; None is the first.
+        build: (config, progress) -> number of examples, after making them ahead of training; None where nothing is
+            made.
+        check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
+    """
+
+    name: str
+    data: type[Any]
+    config: type[ConfigT]
+    example: type[Example] | type[RoadImage]
+    dataset: Callable[[ConfigT], Any]
+    choose: Callable[[Choice], ConfigT]
+    title: Callable[[ConfigT], str]
+    root: str | None = None
+    open: Callable[[ConfigT, bool], Any] | None = None
+    load: Callable[[Any, bool, Collection[str]], Any] = load_or_stream
+    sample: Callable[[ConfigT], Any] | None = None
+    build: Callable[[ConfigT, bool], int] | None = None
+    check: Callable[[Path], FolderCheck] | None = None

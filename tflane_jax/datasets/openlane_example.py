@@ -1,0 +1,107 @@
+"""OpenLane-V2 annotations -> the parts of an `Example`, at fixed capacities."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.openlane_annotation import Annotation
+from tflane_jax.datasets.view_images import ImageConfig, ImageFit, canvas_size
+from tflane_jax.files.openlane import DENSE_POINTS
+from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.scene import Areas, CameraViews, LaneGraph, TrafficElements
+
+
+def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraViews:
+    """Return empty arrays for the images of the cameras; none is valid."""
+    width, height = canvas_size([fit.size for fit in fits if fit is not None], config.divisor)
+    count = len(fits)
+    return CameraViews(
+        image=np.zeros((count, height, width, 3), np.uint8),
+        size=np.zeros((count, 2), np.int32),
+        intrinsics=np.tile(np.eye(3, dtype=np.float32), (count, 1, 1)),
+        camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)),
+        valid=np.zeros(count, bool),
+    )
+
+
+def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph, Int[np.ndarray, " n"]]:
+    """Return the lanes of an annotation and their indices in it (the nearest ones, where there are more than fit)."""
+    kept = _nearest(found.lines, capacity, "lanes" if found.left is None else "segments")
+    graph, n = LaneGraph.empty(capacity, points), len(kept)
+    if n:
+        graph.points[:n] = _with_points([found.lines[i] for i in kept], points)
+        graph.left[:n] = graph.points[:n] if found.left is None else _with_points([found.left[i] for i in kept], points)
+        graph.right[:n] = (
+            graph.points[:n] if found.right is None else _with_points([found.right[i] for i in kept], points)
+        )
+        graph.left_type[:n], graph.right_type[:n] = found.left_type[kept], found.right_type[kept]
+        graph.is_connector[:n] = found.is_connector[kept]
+        graph.visibility[:n] = 1.0
+        graph.successor[:n, :n] = found.successor[np.ix_(kept, kept)]
+        graph.valid[:n] = True
+    return graph, kept
+
+
+def area_set(found: Annotation, capacity: int, points: int) -> Areas:
+    """Return the areas of an annotation."""
+    kept = _nearest(found.areas, capacity, "areas")
+    areas, n = Areas.empty(capacity, points), len(kept)
+    if n:
+        areas.points[:n] = _with_points([found.areas[i] for i in kept], points)
+        areas.category[:n] = found.area_category[kept]
+        areas.valid[:n] = True
+    return areas
+
+
+def element_set(
+    found: Annotation, out: TrafficElements, lanes: Int[np.ndarray, " n"], fit: ImageFit | None
+) -> TrafficElements:
+    """Fill the traffic elements of an annotation into `out`, without those that the image's cropping removes.
+
+    Args:
+        found: annotation, with boxes in pixels of the file.
+        out: empty elements, filled in place.
+        lanes: indices of the annotated lanes that are the first rows of `out.lane`.
+        fit: scaling and cropping of the front image; None leaves the boxes as they are.
+    """
+    boxes = found.boxes if fit is None else fit.boxes(found.boxes)
+    sides = boxes[:, 1] - boxes[:, 0]
+    seen = np.flatnonzero((sides > 0.0).all(-1))
+    order = seen[np.argsort(-sides[seen].prod(-1), kind="stable")]  # larger in the image is usually nearer
+    kept = np.sort(order[: len(out.valid)])
+    _warn_dropped(len(seen) - len(kept), "elements")
+    n = len(kept)
+    out.box[:n] = boxes[kept]
+    out.category[:n], out.attribute[:n] = found.element_category[kept], found.attribute[kept]
+    out.lane[: len(lanes), :n] = found.lane_element[np.ix_(lanes, kept)]
+    out.valid[:n] = True
+    return out
+
+
+def _nearest(lines: list[np.ndarray], capacity: int, name: str) -> Int[np.ndarray, " n"]:
+    """Return the indices of the `capacity` lines that come nearest to the vehicle, ascending."""
+    distance = [np.linalg.norm(line[:, :2], axis=-1).min() for line in lines]
+    _warn_dropped(len(lines) - capacity, name)
+    return np.sort(np.argsort(distance, kind="stable")[:capacity])
+
+
+def _warn_dropped(count: int, name: str) -> None:
+    if count > 0:
+        message = f"more {name} in a frame than ExampleConfig.{name}: the farthest are left out"
+        warnings.warn(message, TruncationWarning, stacklevel=4)
+
+
+def _with_points(lines: list[np.ndarray], count: int) -> Any:
+    """Return lines with `count` points: as they are, every k-th of a dense line, or resampled."""
+    stride = (DENSE_POINTS - 1) // (count - 1) if count > 1 and (DENSE_POINTS - 1) % (count - 1) == 0 else 0
+    if stride and all(len(line) == DENSE_POINTS for line in lines):
+        return np.stack([line[::stride] for line in lines])
+    if all(len(line) == count for line in lines):
+        return np.stack(lines)
+    return resample_lines(lines, count)

@@ -1,0 +1,78 @@
+"""The only list of data sources. A new dataset is one file that defines a `DataSource`, and one entry here."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, Union
+
+from tflane_jax.datasets import argoverse2, front_views, openlane_v2, procedural, tusimple
+from tflane_jax.datasets.data_source import DataSource
+from tflane_jax.datasets.loading import TRAINING_PARTS
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Example, RoadImage
+
+SOURCES: tuple[DataSource[Any], ...] = (
+    procedural.SOURCE,
+    procedural.CAMERAS,
+    argoverse2.SOURCE,
+    openlane_v2.SOURCE,
+    front_views.SOURCE,
+    tusimple.SOURCE,
+)
+
+
+def data_classes() -> Any:
+    """Return the union of the classes that `RunConfig.data` may have; reading JSON and overrides walk it."""
+    return Union[tuple(dict.fromkeys(source.data for source in SOURCES))]  # noqa: UP007 - the members are computed
+
+
+def source_names(example: type[Example] | type[RoadImage] | None = None) -> list[str]:
+    """Return the values of --data; with `example`, those of the sources that give this kind of example."""
+    return [source.name for source in SOURCES if example in (None, source.example)]
+
+
+def named_source(name: str) -> DataSource[Any]:
+    """Return the source with the given value of --data; raise UserError for an unknown one."""
+    for source in SOURCES:
+        if source.name == name:
+            return source
+    raise UserError(f"there is no data source {name}, only {', '.join(source_names())}")
+
+
+def source_of(config: Any) -> DataSource[Any]:
+    """Return the source of a config, which is what `RunConfig.data.source(split)` gives."""
+    for source in SOURCES:
+        if type(config) is source.config:
+            return source
+    raise TypeError(f"{type(config).__name__} is the config of no data source in datasets/sources.py")
+
+
+def make_dataset(config: Any) -> Any:
+    """Return the dataset of a config without building a cache: a few examples are ready soonest."""
+    return source_of(config).dataset(config)
+
+
+def open_dataset(config: Any, *, progress: bool = True) -> Any:
+    """Return the dataset of a config as training reads it; the built-in world is built once and then cached."""
+    source = source_of(config)
+    return source.dataset(config) if source.open is None else source.open(config, progress)
+
+
+def load(config: Any, *, progress: bool = True, parts: Collection[str] = TRAINING_PARTS) -> Any:
+    """Return the examples of a config as training and evaluation take them; `parts` are fields of `Example`.
+
+    Lane graphs: a stacked `Example`, or a `Streamed` that is read while it is used (OpenLane-V2, and a built-in world
+    larger than `loading.IN_MEMORY`). Road images: `lane_rows.LabelledImages`.
+    """
+    return source_of(config).load(open_dataset(config, progress=progress), progress, parts)
+
+
+def sample(config: Any) -> Any:
+    """Return one example with the shapes and types of all, without building a cache and, if possible, without data."""
+    source = source_of(config)
+    return source.dataset(config).example(0) if source.sample is None else source.sample(config)
+
+
+def source_name(config: Any) -> str:
+    """Return the name of a config for titles and files."""
+    return source_of(config).title(config)

@@ -1,0 +1,59 @@
+"""Examples and predictions as the OpenLane-V2 centerline metrics compare them (host, numpy, one frame)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int
+from scipy.special import expit
+
+from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
+from tflane_jax.scene import CenterlinePrediction, ElementPrediction, LaneGraph, TrafficElements
+
+
+def truth_from_example(lanes: LaneGraph, elements: TrafficElements | None = None) -> LaneTruth:
+    """Return the valid lanes (and traffic elements) of one example."""
+    keep = np.flatnonzero(np.asarray(lanes.valid))
+    truth = None
+    if elements is not None:
+        shown = np.flatnonzero(np.asarray(elements.valid))
+        truth = ElementTruth(
+            boxes=np.asarray(elements.box)[shown],
+            attributes=np.asarray(elements.attribute)[shown],
+            lane=np.asarray(elements.lane)[np.ix_(keep, shown)],
+        )
+    return LaneTruth(
+        points=np.asarray(lanes.points)[keep],
+        successor=np.asarray(lanes.successor)[np.ix_(keep, keep)],
+        visibility=np.asarray(lanes.visibility)[keep],
+        elements=truth,
+    )
+
+
+def detections_from_prediction(
+    prediction: CenterlinePrediction, elements: ElementPrediction | None = None
+) -> LaneDetections:
+    """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
+
+    No score threshold; a traffic element is of the attribute that its query finds likeliest.
+    """
+    scores = expit(np.asarray(prediction.logits)).max(-1)
+    order = np.argsort(-scores, kind="stable")
+    return LaneDetections(
+        points=np.asarray(prediction.points)[order],
+        scores=scores[order],
+        successor=expit(np.asarray(prediction.successor_logits)[np.ix_(order, order)]),
+        elements=None if elements is None else _element_detections(elements, order),
+    )
+
+
+def _element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"]) -> ElementDetections:
+    """Return the elements, best score first, with the lanes in the given order."""
+    confidence = expit(np.asarray(elements.logits))
+    scores = confidence.max(-1)
+    order = np.argsort(-scores, kind="stable")
+    return ElementDetections(
+        boxes=np.asarray(elements.box)[order],
+        attributes=confidence.argmax(-1)[order],
+        scores=scores[order],
+        lane=expit(np.asarray(elements.lane_logits)[np.ix_(lanes, order)]),
+    )

@@ -1,0 +1,114 @@
+"""Examples and predictions as the OpenLane-V2 lane-segment metrics compare them (host, numpy, one frame)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.datasets.openlane_export import segments_on_lanes
+from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
+from tflane_jax.metrics.lane_segment import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
+from tflane_jax.scene import Areas, LaneGraph, TrafficElements
+
+SEGMENT_CLASSES = ("lane_segment", "ped_crossing")
+"""Classes of LaneSegNet's queries."""
+
+
+def segment_truth(
+    segments: LaneGraph, areas: Areas, elements: TrafficElements | None = None, lanes: LaneGraph | None = None
+) -> SegmentTruth:
+    """Return the valid lane segments, areas and traffic elements of one example.
+
+    Crossings stay the rings that the example holds. `tflane score` measures only the two long sides of a crossing in
+    the flavour "LaneSegNet", which needs the corners of the annotation.
+
+    Args:
+        segments: lane segments.
+        areas: crossings and road boundaries.
+        elements: traffic elements; None leaves them out.
+        lanes: centerlines that the rows of `elements.lane` stand for. A segment is governed by the elements of the
+            centerlines on which it lies. None: the rows of `elements.lane` are the segments.
+
+    Raises:
+        ValueError: `elements.lane` has another number of rows.
+    """
+    keep = np.flatnonzero(np.asarray(segments.valid))
+    governed = None
+    if elements is not None:
+        governed = _element_truth(segments, elements, lanes, keep)
+    kept_areas = np.asarray(areas.valid)
+    return SegmentTruth(
+        lanes=LaneTruth(
+            points=np.asarray(segments.points)[keep],
+            successor=np.asarray(segments.successor)[np.ix_(keep, keep)],
+            visibility=np.asarray(segments.visibility)[keep],
+            elements=governed,
+        ),
+        left=np.asarray(segments.left)[keep],
+        right=np.asarray(segments.right)[keep],
+        areas=AreaTruth(np.asarray(areas.points)[kept_areas], np.asarray(areas.category)[kept_areas]),
+    )
+
+
+def segment_detections(
+    centre: Float[np.ndarray, "q p 3"],
+    left: Float[np.ndarray, "q p 3"],
+    right: Float[np.ndarray, "q p 3"],
+    classes: Int[np.ndarray, " q"],
+    scores: Float[np.ndarray, " q"],
+    successor: Float[np.ndarray, "q q"],
+    valid: Bool[np.ndarray, " q"] | None = None,
+    elements: ElementDetections | None = None,
+) -> SegmentDetections:
+    """Return the detections of Q queries, best score first, as lane segments and crossings.
+
+    LaneSegNet's queries are of two classes, `SEGMENT_CLASSES`. The left and right lines of a crossing are its two long
+    sides; the area is the left line followed by the reversed right line, 2 P points.
+
+    Args:
+        centre, left, right: metres, ego frame, in driving direction.
+        classes: index into `SEGMENT_CLASSES`.
+        scores: confidence, 0 to 1.
+        successor: [i, j] confidence that segment j continues segment i, 0 to 1.
+        valid: queries to keep; None keeps all.
+        elements: traffic elements, `lane` (Q, U) with a row for each query; None where the model predicts none.
+    """
+    order = np.argsort(-np.asarray(scores), kind="stable")
+    if valid is not None:
+        order = order[np.asarray(valid)[order]]
+    is_crossing = np.asarray(classes)[order] == SEGMENT_CLASSES.index("ped_crossing")
+    rows, crossings = order[~is_crossing], order[is_crossing]
+    if elements is not None:
+        elements = ElementDetections(
+            elements.boxes, elements.attributes, elements.scores, np.asarray(elements.lane)[rows]
+        )
+    centre, left, right, scores = (np.asarray(array) for array in (centre, left, right, scores))
+    return SegmentDetections(
+        lanes=LaneDetections(centre[rows], scores[rows], np.asarray(successor)[np.ix_(rows, rows)], elements),
+        left=left[rows],
+        right=right[rows],
+        areas=AreaDetections(
+            np.concatenate([left[crossings], right[crossings][:, ::-1]], 1),
+            np.full(len(crossings), CROSSING),
+            scores[crossings],
+        ),
+    )
+
+
+def _element_truth(
+    segments: LaneGraph, elements: TrafficElements, lanes: LaneGraph | None, keep: Int[np.ndarray, " g"]
+) -> ElementTruth:
+    shown = np.flatnonzero(np.asarray(elements.valid))
+    governs = np.asarray(elements.lane, bool)
+    owners = segments if lanes is None else lanes
+    if len(governs) != len(owners.valid):
+        what = "segments" if lanes is None else "centerlines"
+        raise ValueError(f"elements.lane has {len(governs)} rows, expected one for each of {len(owners.valid)} {what}")
+    governs = governs & np.asarray(owners.valid)[:, None]
+    if lanes is not None:
+        governs = segments_on_lanes(segments, lanes) @ governs
+    return ElementTruth(
+        boxes=np.asarray(elements.box)[shown],
+        attributes=np.asarray(elements.attribute)[shown],
+        lane=governs[np.ix_(keep, shown)],
+    )

@@ -1,0 +1,84 @@
+"""Examples and predictions as MapTR's metric compares them: divider, crossing, boundary (host, numpy, one frame)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.datasets.identities import line_distances
+from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
+from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
+
+_DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "ped_crossing", "boundary"))
+# Two neighbouring segments hold the line between them twice: lines nearer than this all along are one, metres.
+_SAME_LINE = 0.2
+
+
+def map_truth(segments: LaneGraph, areas: Areas) -> MapTruth:
+    """Return the map lines of one example: `dividers` of its lane segments, crossings and road boundaries of its areas.
+
+    Points are (x, y), metres, ego frame. Closed lines repeat their first vertex, as in `Areas`.
+    """
+    lines = dividers(segments)
+    valid = np.asarray(areas.valid)
+    category = np.asarray(areas.category)[valid]
+    classes = np.where(category == AreaType.PEDESTRIAN_CROSSING, _CROSSING, _BOUNDARY)
+    return MapTruth(
+        points=[*lines, *np.asarray(areas.points)[valid][..., :2]],
+        classes=np.concatenate([np.full(len(lines), _DIVIDER), classes]),
+    )
+
+
+def dividers(segments: LaneGraph) -> list[Float[np.ndarray, "p 2"]]:
+    """Return the painted side lines of the valid lane segments, each line once.
+
+    A line that lies on another one, in either direction, is left out. The longer of the two stays, and the earlier of
+    equals.
+    """
+    valid = np.asarray(segments.valid)
+    sides = (segments.left, segments.left_type), (segments.right, segments.right_type)
+    painted = [np.asarray(line)[valid & (np.asarray(kind) != LineType.NONE)] for line, kind in sides]
+    lines = np.concatenate(painted)[..., :2].astype(np.float64)
+    if len(lines) == 0:
+        return []
+    lengths = np.linalg.norm(np.diff(lines, axis=1), axis=-1).sum(-1)
+    covered = line_distances(lines, lines)[0].max(-1) < _SAME_LINE
+    kept: list[int] = []
+    for i in np.argsort(-lengths, kind="stable").tolist():
+        if not covered[i, kept].any():
+            kept.append(i)
+    return [lines[i] for i in sorted(kept)]
+
+
+def map_lines(
+    points: Float[np.ndarray, "l p d"], classes: Int[np.ndarray, " l"], valid: Bool[np.ndarray, " l"]
+) -> MapTruth:
+    """Return the valid lines of padded arrays as truth; only x and y of the points are kept.
+
+    Args:
+        points: metres; closed lines repeat their first vertex.
+        classes: index into `metrics.vector_map.CLASSES`.
+        valid: padding is False.
+    """
+    kept = np.asarray(valid)
+    return MapTruth(np.asarray(points)[kept][..., :2], np.asarray(classes)[kept])
+
+
+def map_detections(
+    points: Float[np.ndarray, "q p d"],
+    classes: Int[np.ndarray, " q"],
+    scores: Float[np.ndarray, " q"],
+    valid: Bool[np.ndarray, " q"] | None = None,
+) -> MapDetections:
+    """Return the detected lines, best score first; only x and y of the points are kept.
+
+    Args:
+        points: metres.
+        classes: index into `metrics.vector_map.CLASSES`.
+        scores: confidence, 0 to 1.
+        valid: detections to keep; None keeps all.
+    """
+    order = np.argsort(-np.asarray(scores), kind="stable")
+    if valid is not None:
+        order = order[np.asarray(valid)[order]]
+    return MapDetections(np.asarray(points)[order][..., :2], np.asarray(classes)[order], np.asarray(scores)[order])

@@ -1,0 +1,73 @@
+"""Auxiliary losses that several hosts have: denoised lanes, and lanes by BEV cell. None of the papers has them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.losses.common import Report, Terms, last_layer
+from tflane_jax.losses.lane_cells import lane_cell_loss
+from tflane_jax.matching import Assignment
+from tflane_jax.models.auxiliary import AuxiliaryName, AuxiliaryOutputs
+from tflane_jax.scene import CenterlinePrediction, LaneGraph
+
+
+def auxiliary_losses(
+    outputs: AuxiliaryOutputs,
+    names: Sequence[AuxiliaryName],
+    lanes: LaneGraph,
+    *,
+    bev_range: PerceptionRange,
+    cell_weight: float,
+    denoising: Callable[[CenterlinePrediction, LaneGraph], Terms],
+) -> tuple[list[Float[Array, ""]], Report]:
+    """Return the weighted auxiliary losses of a batch, to be added up in this order, and what is recorded of them.
+
+    Args:
+        outputs: auxiliary outputs, leading axis batch.
+        names: those that the host has.
+        lanes: truth, leading axis batch; padding may hold anything.
+        bev_range: the box that the BEV features cover.
+        cell_weight: of the loss on BEV cells.
+        denoising: weighted losses of denoised lanes by layer, from their predictions and the truth.
+    """
+    losses, report = [], {}
+    for name in names:
+        if name == "denoised":
+            terms = denoising(outputs.denoised, lanes)
+            losses.append(sum(term.sum() for term in terms.values()))
+            report |= {f"denoised_{key}": value for key, value in last_layer(terms).items()}
+        elif name == "lane_cells":
+            each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
+            report["cells"] = cell_weight * each(outputs.lane_cells, lanes, bev_range).mean()
+            losses.append(report["cells"])
+        else:
+            raise ValueError(f"no auxiliary loss is known for {name}")
+    return losses, report
+
+
+def denoising_pairs(
+    prediction: CenterlinePrediction, lanes: LaneGraph
+) -> tuple[CenterlinePrediction, Assignment, LaneGraph]:
+    """Return predictions of noised lanes with their truth, every copy as an example of its own.
+
+    Query i belongs to lane i; lanes beyond the number of queries are left out.
+
+    Args:
+        prediction: leading axes (batch, copy, layer).
+        lanes: truth of the batch.
+    """
+    batch, copies, layers, queries = prediction.logits.shape[:4]
+    capacity = lanes.valid.shape[1]
+    own = jnp.arange(capacity)
+    there = lanes.valid & (own < queries)[None]
+    assignment = Assignment(
+        query=jnp.broadcast_to(jnp.where(there, own[None], 0)[:, None, None], (batch, copies, layers, capacity)),
+        matched=jnp.broadcast_to(there[:, None, None], (batch, copies, layers, capacity)),
+    )
+    prediction, assignment = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (prediction, assignment))
+    return prediction, assignment, jax.tree.map(lambda leaf: jnp.repeat(leaf, copies, 0), lanes)

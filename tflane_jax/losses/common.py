@@ -1,0 +1,108 @@
+"""What the losses of all hosts share: their interface, sums over matched queries, topology losses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.matching import Assignment
+from tflane_jax.models.auxiliary import AuxiliaryOutputs
+from tflane_jax.scene import Example, Prediction
+
+Terms = dict[str, Float[Array, " layers"]]
+"""Weighted loss terms by name, one value for each decoder layer."""
+Report = dict[str, Float[Array, ""]]
+"""Numbers to record: the last layer's terms, and counts."""
+
+
+@dataclass(frozen=True)
+class HostLossConfig:
+    """Weights of a host's loss; every host derives its own, in a file of its own.
+
+    Attributes:
+        cell_weight: of the auxiliary loss on BEV cells, where the host has it (`losses.lane_cells`).
+    """
+
+    cell_weight: float = 1.0
+
+    open_base: ClassVar[bool] = True
+    """Settings of this type accept any subclass, see `config_io.subclasses`."""
+
+    def loss(
+        self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
+    ) -> tuple[Float[Array, ""], Report]:
+        """Return the loss of a batch and what is recorded of it.
+
+        Args:
+            outputs: predictions of every decoder layer, leading axes (batch, layer).
+            auxiliary: auxiliary outputs, leading axis batch.
+            batch: examples with truth, leading axis batch.
+            host: the host's configuration.
+
+        Raises:
+            UserError: the truth lacks what the host predicts.
+        """
+        raise NotImplementedError
+
+
+def total(terms: Terms) -> Float[Array, ""]:
+    """Return the sum of all terms over all layers."""
+    return jnp.stack([term.sum() for term in terms.values()]).sum()
+
+
+def last_layer(terms: Terms) -> Report:
+    """Return the terms of the last layer."""
+    return {name: term[-1] for name, term in terms.items()}
+
+
+def edge_loss(
+    logits: Float[Array, "b layers q r"],
+    rows: Assignment,
+    columns: Assignment,
+    edges: Bool[Array, "b n m"],
+    alpha: float,
+    gamma: float,
+) -> Float[Array, " layers"]:
+    """Return the mean focal loss over all pairs of queries of a batch; pairs that are not matched are no edges.
+
+    Args:
+        logits: predicted edges.
+        rows, columns: which truth each query is matched with, on either side.
+        edges: true edges.
+        alpha, gamma: of the focal loss.
+    """
+
+    def one(logits, rows, columns, edges):
+        row, column = (
+            jnp.where(side.matched, side.query, count)
+            for side, count in zip((rows, columns), logits.shape, strict=True)
+        )
+        true = jnp.zeros(logits.shape).at[row[:, None], column[None, :]].set(edges.astype(jnp.float32), mode="drop")
+        return focal(logits, true, alpha, gamma).mean() if logits.size else jnp.zeros(())
+
+    return jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)))(logits, rows, columns, edges).mean(0)
+
+
+def focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], alpha: float, gamma: float) -> Float[Array, "*b"]:
+    """Return the sigmoid focal loss, elementwise."""
+    return optax.losses.sigmoid_focal_loss(logits, target, alpha=alpha, gamma=gamma)
+
+
+def last_layers(assignment: Assignment, layers: int) -> Assignment:
+    """Return the assignments (B, D, N) of the last `layers` layers."""
+    return jax.tree.map(lambda leaf: leaf[:, leaf.shape[1] - layers :], assignment)
+
+
+def positives(assignment: Assignment) -> Float[Array, " layers"]:
+    """Return the number of matched queries of a batch, at least one: the normaliser of sums in the reference code."""
+    return jnp.maximum(assignment.matched.sum((0, 2)).astype(jnp.float32), 1.0)
+
+
+def matched(assignment: Assignment) -> Float[Array, ""]:
+    """Return the mean number of matched targets of an example, in the last layer."""
+    return assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()

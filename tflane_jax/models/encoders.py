@@ -1,0 +1,66 @@
+"""The encoders that a host can have: from cameras, or from the evidence raster, to BEV features."""
+
+from __future__ import annotations
+
+from tflane_jax.errors import UserError
+from tflane_jax.models.bev_encoder import BevMemory
+from tflane_jax.models.camera_encoder import CameraEncoder, CameraEncoderConfig, EncoderOutput
+from tflane_jax.models.element_decoder import ElementDecoderConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
+from tflane_jax.models.prior import BevHook
+from tflane_jax.scene import Example
+
+EncoderConfig = EvidenceEncoderConfig | CameraEncoderConfig
+
+
+def make_encoder(config: EncoderConfig) -> EvidenceEncoder | CameraEncoder:
+    """Return the encoder of a host."""
+    return EvidenceEncoder(config) if isinstance(config, EvidenceEncoderConfig) else CameraEncoder(config)
+
+
+def encode_example(
+    encoder: EvidenceEncoder | CameraEncoder,
+    example: Example,
+    memory: BevMemory | None,
+    *,
+    train: bool,
+    hook: BevHook | None = None,
+) -> EncoderOutput:
+    """Return the encoder's output for one example.
+
+    Args:
+        encoder: of the host.
+        example: one frame.
+        memory: BEV features of the frame before; None without.
+        train: dropout, and the statistics of the batch in batch norms.
+        hook: what the priors add in every layer.
+
+    Raises:
+        UserError: the example lacks what the encoder reads.
+    """
+    if isinstance(encoder, CameraEncoder):
+        return encoder(example, memory, train=train, fuse=hook)
+    if example.bev is None:
+        raise UserError(
+            "the model reads BEV evidence, and these data have none (bev is None): choose data with evidence, or a "
+            "model with cameras"
+        )
+    return EncoderOutput(encoder(example.bev, hook))
+
+
+def start_bev_memory(config: EncoderConfig) -> BevMemory | None:
+    """Return the BEV memory before the first frame of a sequence; None for an encoder without memory."""
+    return BevMemory.empty(config.bev) if isinstance(config, CameraEncoderConfig) else None
+
+
+def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoderConfig | None) -> None:
+    """Raise UserError where traffic elements have no front view, or another number of layers than the lane decoder."""
+    if elements is None:
+        return
+    if not isinstance(encoder, CameraEncoderConfig):
+        raise UserError("traffic elements are found in the front camera's image: give the model an encoder of cameras")
+    if elements.layers != layers:
+        raise UserError(
+            f"the decoders of elements and lanes go layer by layer, and have {elements.layers} and {layers}: "
+            "set elements.layers and decoder.layers to one number"
+        )

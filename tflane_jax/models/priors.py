@@ -1,0 +1,110 @@
+"""The priors that a host can take: the one list of them, and the steps that treat all alike.
+
+A new prior is a file of its own, with a `Prior` and its configuration, and one line in `PriorsConfig`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from tflane_jax.models.marker_fusion import MarkerFusionConfig
+from tflane_jax.models.prior import BevCells, BevHook, HostQueries, HostSpec, Prior, PriorConfig
+from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
+from tflane_jax.scene import Example
+
+ByPrior = dict[str, Any]
+"""Something of each prior (observation, tokens, memory), by its name in `PriorsConfig`."""
+
+
+@dataclass(frozen=True)
+class PriorsConfig:
+    """Which priors a host takes, each None where it does without; they are fused in this order.
+
+    Attributes:
+        traffic_flow: tracks of other road users, into the queries (TF-Lane).
+        sd_map: an SD map, into the BEV features (SMERF).
+        markers: fiducial markers, into the BEV features (Wu and Hu).
+    """
+
+    traffic_flow: TrafficFlowConfig | None = None
+    sd_map: SdMapModuleConfig | None = None
+    markers: MarkerFusionConfig | None = None
+
+    def build(self, host: HostSpec) -> dict[str, Prior]:
+        """Return the priors that are configured, by name."""
+        configs: dict[str, PriorConfig | None] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {name: config.build(host) for name, config in configs.items() if config is not None}
+
+
+def start_memories(priors: Mapping[str, Prior]) -> ByPrior:
+    """Return the memories before the first frame of a sequence, of the priors that have one."""
+    memories = {name: prior.start() for name, prior in priors.items()}
+    return {name: memory for name, memory in memories.items() if memory is not None}
+
+
+def observe(priors: Mapping[str, Prior], example: Example, memories: ByPrior) -> tuple[ByPrior, ByPrior]:
+    """Return the observations of one frame, and the memories for the next.
+
+    Args:
+        priors: of the host.
+        example: one frame.
+        memories: of the frame before; a prior without an entry sees the frame on its own.
+    """
+    observations, following = {}, {}
+    for name, prior in priors.items():
+        observations[name], memory = prior.observe(example, memories.get(name))
+        if memory is not None:
+            following[name] = memory
+    return observations, following
+
+
+def observe_clip(priors: Mapping[str, Prior], clip: Example) -> ByPrior:
+    """Return the observations of the successive frames of one scene (a leading axis on every leaf)."""
+    start = start_memories(priors)
+    remembering = {name: prior for name, prior in priors.items() if name in start}
+    alone = {name: prior for name, prior in priors.items() if name not in start}
+
+    def body(memories: ByPrior, frame: Example) -> tuple[ByPrior, ByPrior]:
+        observations, memories = observe(remembering, frame, memories)
+        return memories, observations
+
+    observations = jax.vmap(lambda frame: observe(alone, frame, {})[0])(clip) if alone else {}
+    return observations | (lax.scan(body, start, clip)[1] if remembering else {})
+
+
+def encode(priors: Mapping[str, Prior], observations: ByPrior, *, deterministic: bool) -> ByPrior:
+    """Return the tokens of every prior."""
+    return {name: prior.encode(observations[name], deterministic=deterministic) for name, prior in priors.items()}
+
+
+def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> BevHook | None:
+    """Return what the priors add to every layer of a BEV encoder; None where no prior adds anything."""
+    fusing = {name: prior for name, prior in priors.items() if prior.fuses_into_bev()}
+    if not fusing:
+        return None
+
+    def fuse(layer: int, places: Any, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
+        centers = host.bev_range.denormalise(jnp.asarray(places))
+        for name, prior in fusing.items():
+            bev = prior.into_bev(tokens[name], layer, BevCells(bev, position, centers))
+        return bev
+
+    return fuse
+
+
+def fuse_into_queries(
+    priors: Mapping[str, Prior], tokens: ByPrior, layer: int, queries: HostQueries
+) -> Float[Array, "q d"]:
+    """Return the queries in front of a decoder layer with every prior fused in."""
+    for name, prior in priors.items():
+        queries = queries._replace(features=prior.into_queries(tokens[name], layer, queries))
+    return queries.features

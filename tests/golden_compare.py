@@ -32,7 +32,7 @@ def compare(
 
     Args:
         case: the fixture.
-        outputs: from the case's parameters and inputs; jitted, with only the differentiated inputs traced.
+        outputs: from the case's parameters and inputs; jitted, with inputs of float32 traced and others as they are.
         ignore: outputs that the test does not compute.
         params: the parameters to differentiate, where not all of the case's.
         tolerance: of outputs, |a - b| <= tolerance (1 + |b|).
@@ -49,10 +49,11 @@ def compare(
 
 def _compare(case, outputs, ignore, params, tolerance, tolerances, absolute):
     params = case.params if params is None else params
-    varied = {name: value for name, value in case.inputs.items() if _has_gradient(case, f"in/{name}")}
+    traced = {name: value for name, value in case.inputs.items() if value.dtype == np.float32}
+    varied = {name: traced.pop(name) for name in list(traced) if _has_gradient(case, f"in/{name}")}
 
-    def run(params, varied):
-        made = outputs(params, case.inputs | varied)
+    def run(params, varied, traced):
+        made = outputs(params, case.inputs | traced | varied)
         out, beside = made if isinstance(made, tuple) else (made, None)
         if uncomputed := sorted(case.weights.keys() - out.keys()):
             pytest.fail(f"{case.meta.get('name')}: the gradient is of outputs that are not computed: {uncomputed}")
@@ -60,9 +61,9 @@ def _compare(case, outputs, ignore, params, tolerance, tolerances, absolute):
 
     if case.gradients:
         step = jax.jit(jax.value_and_grad(run, argnums=(0, 1), has_aux=True))
-        (total, (out, beside)), by = step(params, varied)
+        (total, (out, beside)), by = step(params, varied, traced)
     else:
-        (total, (out, beside)), by = jax.jit(run)(params, varied), None
+        (total, (out, beside)), by = jax.jit(run)(params, varied, traced), None
     expected = {name: value for name, value in case.outputs.items() if name not in ignore}
     if not case.weights:
         expected.pop("grad_scalar", None)

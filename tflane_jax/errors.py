@@ -1,8 +1,8 @@
-"""Errors meant for the person at the keyboard."""
+"""The error that the command line shows to its user."""
 
 
 class UserError(Exception):
-    """Something that the user can put right: one message that names the thing and the remedy.
+    """A mistake that the user can correct. The message names the cause and the remedy.
 
     The command line prints the message without a traceback and exits with code 2.
     """

@@ -1,4 +1,6 @@
-"""A trained monocular model as one StableHLO file: any batch size, weights inside, runs without this package.
+"""Export of a trained monocular model as one StableHLO file with its weights, for any batch size.
+
+The file runs with jax alone, without this package:
 
 from jax import export
 program = export.deserialize(open("lstr.stablehlo", "rb").read())
@@ -62,7 +64,7 @@ def load_program(path: Path) -> export.Exported:
         return export.deserialize(bytearray(path.read_bytes()))
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}") from error
-    except Exception as error:  # flatbuffers complain in many ways
+    except Exception as error:  # a damaged flatbuffer raises many types
         raise UserError(f"{path} is no exported program, or damaged: write it again with tflane export") from error
 
 

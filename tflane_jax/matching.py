@@ -22,11 +22,11 @@ _COST_LIMIT = 1e6
 
 @struct.dataclass
 class Assignment:
-    """Which query serves which target.
+    """The query matched with each target.
 
     Attributes:
         query: (N,) query index of each target; 0 where not matched.
-        matched: (N,) the target is valid and got a query (there may be more targets than queries).
+        matched: (N,) the target is valid and has a query; there may be more targets than queries.
     """
 
     query: Int[Array, "*b n"]
@@ -39,10 +39,10 @@ def match(
     """Return the assignment of least total cost between queries and valid targets; no gradient flows.
 
     Args:
-        cost: cost of giving target n to query q; what stands at invalid targets is never looked at. Costs are clipped
-            to +-1e6, and NaN counts as 1e6, so that a diverging model fails at the loss and not in here.
-        valid: targets that exist.
-        backend: "scipy" calls the host; "jax" stays on the device.
+        cost: cost of giving target n to query q; ignored at invalid targets. Costs are clipped to +-1e6 and NaN counts
+            as 1e6, so that a diverging model fails at the loss and not here.
+        valid: false for padded targets.
+        backend: "scipy" runs on the host, "jax" on the device.
     """
     cost = lax.stop_gradient(cost).astype(jnp.float32)
     cost = jnp.nan_to_num(jnp.clip(cost, -_COST_LIMIT, _COST_LIMIT), nan=_COST_LIMIT)
@@ -62,7 +62,7 @@ def match(
 
 
 def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Solve every problem of the leading axes with scipy; -1 where a target stays without a query.
+    """Solve every problem of the leading axes with scipy; -1 for a target without a query.
 
     Module-level and numpy-only: jax may call it from any thread.
     """
@@ -81,8 +81,8 @@ def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Solve one problem by successive shortest augmenting paths (Jonker-Volgenant); -1 for targets without a query.
 
-    One path per valid target, so that padding costs nothing. Spare columns stand in for "no query" when there are
-    more targets than queries; they are dearer than any real assignment.
+    One path per valid target, so that padding costs nothing. With more targets than queries, spare columns mean "no
+    query"; they cost more than any assignment.
     """
     queries, targets = cost.shape
     spare = max(targets - queries, 0)
@@ -111,7 +111,7 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
         path = (reach, jnp.full(columns, -1), jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
         reach, via, done, _, shortest, end = lax.while_loop(searching, grow, path)
 
-        # Potentials of everything inside the tree move by what is left of the shortest path.
+        # Potentials inside the tree change by the rest of the shortest path.
         gain = jnp.where(done, shortest - reach, 0.0)
         holders = jnp.where(done & (owner >= 0), owner, targets)  # index `targets` is dropped
         u = u.at[holders].add(gain, mode="drop").at[start].add(shortest)

@@ -1,6 +1,6 @@
-"""What a model costs, from shapes alone: parameters by part, operations and memory of prediction and training step.
+"""The cost of a model from its shapes: parameters by part, operations and memory of prediction and training step.
 
-Nothing is computed and no data are read, so that a paper-size model can be looked at on a laptop.
+Nothing is computed and no data are read, so a model of the paper's size can be summarised on a laptop.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import Any
 import jax
 
 from tflane_jax.scene import shapes_of
+from tflane_jax.tasks.base import Task
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
-from tflane_jax.training.task import Trainable
 
 MIB = 2**20
 
@@ -30,9 +30,9 @@ class Program:
         name: what it computes.
         batch: examples at a time.
         gflop: floating-point operations, 10^9 (a multiplication with its addition counts two).
-        memory: MiB that must be there at once: arguments, results and what lies between; None if not compiled.
-        between: MiB of it that are intermediate results.
-        compile_s: seconds that compiling took.
+        memory: peak MiB of arguments, results and intermediate results; None if not compiled.
+        between: MiB of intermediate results.
+        compile_s: duration of compilation, seconds.
     """
 
     name: str
@@ -52,27 +52,26 @@ def parameter_counts(params: Any, depth: int = 1) -> dict[str, int]:
     return counts
 
 
-def shapes_of_params(task: Trainable, example: Any) -> Any:
-    """Return the shapes of a task's parameters; raises as the model does where an example does not fit it."""
+def shapes_of_params(task: Task[Any, Any], example: Any) -> Any:
+    """Return the shapes of a task's parameters; raises what the model raises for an example that does not fit."""
     return jax.eval_shape(task.init, jax.random.key(0), _trained_on(task, example))
 
 
-def _trained_on(task: Trainable, example: Any) -> Any:
-    """Return the shapes of what a task trains on: the example, or a clip of them."""
-    clip = getattr(task, "clip", 1)
-    return example if clip == 1 else shapes_of(example, clip)
+def _trained_on(task: Task[Any, Any], example: Any) -> Any:
+    """Return the shapes of one training input: the example, or a clip of examples."""
+    return example if task.frames == 1 else shapes_of(example, task.frames)
 
 
-def prediction_program(task: Trainable, example: Any, *, compiled: bool = True) -> Program:
-    """Return what one answer costs; `example` holds shapes."""
+def prediction_program(task: Task[Any, Any], example: Any, *, compiled: bool = True) -> Program:
+    """Return the cost of predicting one example; `example` holds shapes."""
     lowered = jax.jit(task.predict).lower(shapes_of_params(task, example), example)
     return _program("prediction", 1, lowered, compiled)
 
 
 def training_program(
-    task: Trainable, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
+    task: Task[Any, Any], example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
-    """Return what a whole update costs: loss, gradient, optimiser, moving average; of clips for a task of clips."""
+    """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
     example = _trained_on(task, example)
     optimizer, step = make_optimizer(optim, 1000), make_update_step(task, optim, 1000)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
@@ -88,7 +87,7 @@ def _program(name: str, batch: int, lowered: Any, compiled: bool) -> Program:
     began = time.perf_counter()
     memory = lowered.compile().memory_analysis()
     seconds = time.perf_counter() - began
-    # Arguments that are donated come back as results in the same place.
+    # Donated arguments and the results that take their place share memory.
     whole = memory.argument_size_in_bytes + memory.output_size_in_bytes - memory.alias_size_in_bytes
     between = memory.temp_size_in_bytes
     return Program(name, batch, gflop, (whole + between) / MIB, between / MIB, seconds)

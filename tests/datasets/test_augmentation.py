@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from tflane_jax.datasets import augmentation
 from tflane_jax.datasets.augmentation import (
     GREY,
-    NO_AUGMENTATION,
     AugmentationConfig,
     augment,
     colour_map,
@@ -23,6 +22,7 @@ from tflane_jax.scene import LaneLines, RoadImage
 
 HEIGHT, WIDTH = 90, 160
 ALWAYS = AugmentationConfig(geometry=1.0)
+NO_AUGMENTATION = AugmentationConfig(geometry=0.0, brightness=0.0, contrast=0.0, saturation=0.0, lighting=0.0)
 GEOMETRY = replace(NO_AUGMENTATION, geometry=1.0)
 FLIP = replace(GEOMETRY, rotation=0.0, flip=1.0, crop=1.0)
 COLOUR = replace(ALWAYS, geometry=0.0)

@@ -104,7 +104,14 @@ def test_digest_covers_the_world_and_what_it_stands_on(monkeypatch):
     monkeypatch.setattr(ast, "parse", spy)
     cache.source_digest.__wrapped__()
     package = ROOT / "tflane_jax"
-    for file in ("scene.py", "logs.py", "geometry/poses.py", "datasets/procedural.py", "world/line_of_sight.py"):
+    files = (
+        "scene/truth.py",
+        "scene/logs.py",
+        "geometry/poses.py",
+        "datasets/procedural.py",
+        "world/bev/line_of_sight.py",
+    )
+    for file in files:
         assert (package / file).read_text() in read, file
 
 

@@ -27,7 +27,7 @@ def labelled(record, camera):
     return boxes, lidar2cam, record["cam_instances"][camera]
 
 
-# In CAM_FRONT_LEFT no labelled centre lies inside the image (specs/data_formats.md section 6).
+# In CAM_FRONT_LEFT no labelled centre lies inside the image.
 @pytest.mark.parametrize("camera", ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"])
 def test_box_centres_are_where_they_are_labelled(keyframe, camera):
     """Through the ego frame, as an example holds it: K (camera_from_ego ego_from_lidar) centre."""

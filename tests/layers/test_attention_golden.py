@@ -55,7 +55,7 @@ def biased_attention(params, arrays, allowed, bias):
         x = arrays[name] @ params[name]["kernel"] + params[name]["bias"][None, None]
         return x.reshape(*x.shape[:2], heads, dim).swapaxes(1, 2)
 
-    channels = dim + keys
+    allowed, channels = jnp.asarray(allowed), dim + keys
     query = jnp.concatenate([project("query") * math.sqrt(channels / dim), bias * math.sqrt(channels)], -1)
     key = project("key")
     key = jnp.concatenate([key, jnp.broadcast_to(jnp.eye(keys), (*key.shape[:3], keys))], -1)

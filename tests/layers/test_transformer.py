@@ -42,7 +42,7 @@ def allowed(case, mask_names, padding_names, batch, queries, keys, heads):
         elif mask.ndim == 3:
             mask = mask.reshape(batch, heads, queries, keys)
         pairs = pairs & ~mask.astype(bool)
-    return pairs
+    return jnp.asarray(pairs)
 
 
 def known_inputs(case, names):

@@ -84,11 +84,13 @@ def test_golden_distances_and_matches(case):
             np.testing.assert_array_equal(matches, [official[f"out_lane_match_{t}"] for t in LANE_THRESHOLDS])
             assert np.isnan(topology["TOP_ll"][:, f]).all() == (frame.lanes == 0)
             if frame.lanes and not tied:
-                mean = frame.topology.sum(-1) / (2 * frame.lanes)
+                mean = frame.topology["v2.1"].sum(-1) / (2 * frame.lanes)
                 np.testing.assert_allclose(mean, topology["TOP_ll"][:, f], atol=1e-6)
             elements = frame.elements
             if elements is not None and elements.vertices and not tied:
-                np.testing.assert_allclose(elements.topology / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6)
+                np.testing.assert_allclose(
+                    elements.topology["v2.1"] / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6
+                )
 
 
 @pytest.mark.golden

@@ -12,7 +12,7 @@ from tests.metrics.cases import hand_frame, random_frame, reordered
 from tests.metrics.fixtures import expected_cases, load_frames
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics, GroupedCenterlineMetrics, LaneDetections, LaneTruth
-from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, iou_distance, match_frame
+from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, iou_distance, match_frame, nearest_lanes
 
 VERSIONS = {"v2.1": "", "v1.0": "v1_0_"}
 CASES = list(expected_cases())
@@ -31,7 +31,7 @@ def evaluate(frames, metrics: Any = None) -> Any:
 def test_golden_totals(case, version):
     expected = expected_cases()[case]
     official = expected[version.replace(".", "_")]
-    result = evaluate([frame[:2] for frame in load_frames(case)], CenterlineMetrics(version))
+    result = evaluate([frame[:2] for frame in load_frames(case)], CenterlineMetrics((version,)))
     if "error" in official:
         assert not {"TOP_ll", "TOP_lt", "OLS"} & result.keys()
         return
@@ -44,6 +44,27 @@ def test_golden_totals(case, version):
         np.testing.assert_allclose(per_threshold, official["DET_l_per_threshold"], atol=1e-6)
         per_attribute = [result[f"DET_t@{i}"] for i in range(13)]
         np.testing.assert_allclose(per_attribute, official["DET_t_per_attribute"], atol=1e-6)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("versions", [("v2.1", "v1.0"), ("v1.0", "v2.1")])
+@pytest.mark.parametrize("case", CASES)
+def test_golden_versions_side_by_side(case, versions):
+    """One pass gives the official numbers of both versions, to the last bit those of a pass for each."""
+    frames = [frame[:2] for frame in load_frames(case)]
+    both = evaluate(frames, CenterlineMetrics(versions))
+    first, second = (evaluate(frames, CenterlineMetrics((version,))) for version in versions)
+    changed = ("TOP_ll", "TOP_lt", "OLS")
+    renamed = {f"{name}_{versions[1]}": second[name] for name in changed if name in second}
+    assert both == first | renamed
+    expected = expected_cases()[case]
+    official = expected[versions[1].replace(".", "_")]
+    if "error" in official:
+        assert renamed == {}
+        return
+    stable = official | expected[f"{VERSIONS[versions[1]]}stable_sort_differs"]
+    for name in changed:
+        assert both[f"{name}_{versions[1]}"] == pytest.approx(stable[name], abs=1e-6), name
 
 
 @pytest.mark.golden
@@ -65,7 +86,7 @@ def test_golden_frames(case):
         np.testing.assert_array_equal(np.where(frame.hits, frame.nearest, -1), matches)
         assert np.isnan(topology["TOP_ll"][:, f]).all() == (frame.lanes == 0)
         if frame.lanes and not expected["tie_sensitive"]:
-            mean = frame.topology.sum(-1) / (2 * frame.lanes)
+            mean = frame.topology["v2.1"].sum(-1) / (2 * frame.lanes)
             np.testing.assert_allclose(mean, topology["TOP_ll"][:, f], atol=1e-6)
         elements = frame.elements
         assert elements is not None
@@ -74,7 +95,9 @@ def test_golden_frames(case):
         boxes = truth.elements.boxes, detections.elements.boxes
         np.testing.assert_allclose(iou_distance(*boxes), official["out_te_dist"], atol=1e-6)
         if elements.vertices and not expected["tie_sensitive"]:
-            np.testing.assert_allclose(elements.topology / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6)
+            np.testing.assert_allclose(
+                elements.topology["v2.1"] / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6
+            )
 
 
 def test_by_hand():
@@ -98,13 +121,41 @@ def test_by_hand():
 
 
 def test_version_1_0_by_hand():
-    metrics = CenterlineMetrics("v1.0")
+    metrics = CenterlineMetrics(("v1.0",))
     result = evaluate([hand_frame()], metrics)
     # At 2 and 3 m the three lowest of ten levels keep the first detection alone and find no edge; on the others the
     # false edges of lane C rank first, so A and B have precision 1/2.
     assert result["TOP_ll"] == pytest.approx(2 * 0.7 * 1.0 / 18)
     assert result["DET_l"] == pytest.approx(18 / 33)
     assert metrics.protocol == "OpenLane-V2 centerline v1.0"
+
+
+def test_both_versions_take_one_matching(monkeypatch):
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return nearest_lanes(*arguments)
+
+    monkeypatch.setattr("tflane_jax.metrics.centerline_matching.nearest_lanes", counted)
+    metrics = GroupedCenterlineMetrics(versions=("v2.1", "v1.0"))
+    result = evaluate([hand_frame()], metrics)
+    assert len(calls) == 1
+    assert result["all"]["TOP_ll"] == pytest.approx((0 + 2 + 2) / 18)
+    assert result["all"]["TOP_ll_v1.0"] == pytest.approx(2 * 0.7 * 1.0 / 18)
+    assert result["all"]["OLS_v1.0"] < result["all"]["OLS"]
+    assert "TOP_ll_v1.0" in result["occluded"]
+    assert metrics.protocol.startswith("OpenLane-V2 centerline v2.1, v1.0 where the name says so, occluded")
+    part = GroupedCenterlineMetrics(versions=("v2.1", "v1.0"))
+    assert metrics.merge(part).compute() == result
+    with pytest.raises(UserError, match="cannot merge"):
+        metrics.merge(GroupedCenterlineMetrics())
+
+
+@pytest.mark.parametrize("versions", [(), ("v2.0",), ("v2.1", "v2.1"), "v2.1"])
+def test_versions_that_do_not_exist_are_named(versions):
+    with pytest.raises(UserError, match="versions of the topology score"):
+        CenterlineMetrics(versions)
 
 
 def test_groups_by_hand():
@@ -133,16 +184,16 @@ def test_threshold_of_occlusion_is_strict_and_configurable():
 @given(seed=st.integers(0, 10**6), version=st.sampled_from(list(VERSIONS)))
 def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
     frames = [random_frame(seed + i, lanes=5 * (i != 1), detections=9 * (i != 2)) for i in range(4)]
-    whole, first, second = (GroupedCenterlineMetrics(version=version) for _ in range(3))
+    whole, first, second = (GroupedCenterlineMetrics(versions=(version,)) for _ in range(3))
     expected = evaluate(frames, whole)
     evaluate(frames[:2], first)
     evaluate(frames[2:], second)
     assert first.merge(second).compute() == expected
-    assert expected["all"] == evaluate(frames, CenterlineMetrics(version))
+    assert expected["all"] == evaluate(frames, CenterlineMetrics((version,)))
     order = np.random.default_rng(seed).permutation(9)
     mixed = [(reordered(d, order[: len(d.scores)] if len(d.scores) else []), t) for d, t in frames if len(d.scores)]
     kept = [(d, t) for d, t in frames if len(d.scores)]
-    assert evaluate(mixed, CenterlineMetrics(version)) == evaluate(kept, CenterlineMetrics(version))
+    assert evaluate(mixed, CenterlineMetrics((version,))) == evaluate(kept, CenterlineMetrics((version,)))
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)
@@ -155,7 +206,7 @@ def test_groups_share_out_lanes_vertices_and_detections(seed):
         assert sum(part.lanes for part in parts) == frame.lanes
         assert sum(len(part.scores) for part in parts) == len(frame.scores)
         np.testing.assert_array_equal(sum(part.hits.sum(-1) for part in parts), frame.hits.sum(-1))
-        np.testing.assert_allclose(sum(part.topology.sum(-1) for part in parts), frame.topology.sum(-1))
+        np.testing.assert_allclose(sum(part.topology["v2.1"].sum(-1) for part in parts), frame.topology["v2.1"].sum(-1))
 
 
 def test_perfect_detections():
@@ -181,7 +232,7 @@ def test_nothing_at_all():
     grouped = evaluate([(detections, empty)], GroupedCenterlineMetrics())
     assert grouped["all"]["DET_l"] == 0.0
     assert grouped["clear"]["DET_l"] == 1.0  # false positives of a frame without lanes count only in "all"
-    assert "TOP_ll" not in evaluate([(detections, empty)], CenterlineMetrics("v1.0"))
+    assert "TOP_ll" not in evaluate([(detections, empty)], CenterlineMetrics(("v1.0",)))
 
 
 def broken(**changes):
@@ -208,7 +259,7 @@ def test_arrays_that_do_not_fit(frame, message):
 def test_misuse_is_named():
     detections, truth = hand_frame()
     with pytest.raises(UserError, match="one version"):
-        CenterlineMetrics("v1.0").merge(CenterlineMetrics("v2.1"))
+        CenterlineMetrics(("v1.0",)).merge(CenterlineMetrics(("v2.1",)))
     with pytest.raises(UserError, match="cannot merge"):
         GroupedCenterlineMetrics(("all",)).merge(GroupedCenterlineMetrics())
     unknown = dataclasses.replace(truth, visibility=None)

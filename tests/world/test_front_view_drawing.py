@@ -8,11 +8,11 @@ from tflane_jax.world.front_view.ground import image_columns, look_at_ground, ro
 from tflane_jax.world.front_view.road import HighwayConfig, Stripe, draw_highway
 from tflane_jax.world.front_view.roadside import draw_roadside
 from tflane_jax.world.front_view.stripes import draw_stripe
-from tflane_jax.world.front_view.surface import noise_tile
 from tflane_jax.world.front_view.traffic import FrontTraffic, ground_shadows
 from tflane_jax.world.front_view.vehicles import vehicle_solids
 from tflane_jax.world.front_view.views import draw_front_scene
 from tflane_jax.world.render.camera import NEAR, FrontCameraConfig, camera_pose, draw_camera, lift
+from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import Solid, draw_solids
 
 SCENES = st.integers(0, 3 * 10**8 - 1)

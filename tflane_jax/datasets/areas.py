@@ -1,4 +1,8 @@
-"""Crossings and road boundaries of OpenLane-V2 from a map and a pose (specs/data_formats.md section 3, steps 8, 9)."""
+"""Pedestrian crossings and road boundaries of OpenLane-V2 from a vector map and an ego pose.
+
+The conversion code of OpenLane-V2 is not public; docs/reference/openlane_v2_truth.md (steps 8 and 9) gives the rules
+and their sources.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import clip_to_range, resample_lines
 from tflane_jax.scene import Areas, AreaType
 
-# Road boundaries are cut this far inside the range, as MapTR and (by its figures) OpenLane-V2 do; metres.
+# Metres. MapTR cuts road boundaries this far inside the range; figures of OpenLane-V2 agree with it.
 BOUNDARY_MARGIN = 0.2
 
 
@@ -22,10 +26,12 @@ def crop_areas(
     capacity: int,
     points: int,
 ) -> tuple[Areas, int]:
-    """Return crossings that meet the range, whole (step 8), and road boundaries cut `BOUNDARY_MARGIN` inside it
-    (step 9), and how many of them found no room (the farthest)."""
+    """Return the areas near the vehicle, ego frame, and how many of them (the farthest) exceeded the capacity.
+
+    Crossings that meet the range stay whole; road boundaries are cut `BOUNDARY_MARGIN` inside the range.
+    """
     crossings = prepared.crossings.moved(ego_from_global)
-    # A ring that meets the range crosses its border or lies inside; none is so large as to surround it.
+    # A ring that meets the range crosses its border or lies inside it; no crossing is large enough to surround it.
     rings = [crossings.line(i) for i in crossings.near(range_)]
     rings = [ring for ring in rings if clip_to_range(ring, range_)]
     low, high = BOUNDARY_MARGIN, -BOUNDARY_MARGIN
@@ -45,7 +51,7 @@ def crop_areas(
 
 
 def clip_ring(line: np.ndarray, range_: PerceptionRange) -> list[np.ndarray]:
-    """Cut a line at the range; of a closed ring, the pieces at its arbitrary seam are joined again."""
+    """Cut a line at the range. The pieces of a closed ring are joined again where its first point lies in the range."""
     pieces = clip_to_range(line, range_)
     closed = np.array_equal(line[0], line[-1])
     if closed and len(pieces) > 1 and all(np.array_equal(p, line[0]) for p in (pieces[0][0], pieces[-1][-1])):

@@ -1,4 +1,4 @@
-"""The vector map of an Argoverse 2 sensor log (specs/data_formats.md sections 1.1 and 3)."""
+"""The vector map of an Argoverse 2 sensor log: `map/log_map_archive_*.json` -> `VectorMap`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 
 MAP_PATTERN = "log_map_archive_*.json"
-# Argoverse 2's own interface makes centerlines of ten points.
+# Argoverse 2's own API makes centerlines of ten points.
 _CENTERLINE_POINTS = 10
 
 
 def read_map(folder: Path) -> VectorMap:
-    """Read the map json in `folder`; raise UserError where it is missing or not what it should be."""
+    """Read the map file in `folder`; raise UserError if it is missing or damaged."""
     path = find_map(folder)
     if path is None:
         raise UserError(f"{folder} holds no {MAP_PATTERN}: download the log's map folder")
@@ -44,7 +44,7 @@ def find_map(folder: Path) -> Path | None:
 def line_type(mark: str) -> LineType:
     """Return the OpenLane-V2 type of an Argoverse 2 marking.
 
-    Of a mixed marking the first word counts; OpenLane-V2 documents no rule for them.
+    The first word of a mixed marking decides; OpenLane-V2 documents no rule for them.
     """
     if mark in ("NONE", "UNKNOWN"):
         return LineType.NONE
@@ -80,14 +80,14 @@ def _crossing(record: dict[str, Any]) -> np.ndarray:
 
 
 def _boundaries(areas: list[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Return the closed rings of the union of drivable areas; the height is that of the nearest map vertex."""
+    """Return the closed rings of the union of drivable areas, each point at the height of the nearest map vertex."""
     try:
         import shapely
     except ImportError as error:
         raise UserError("reading Argoverse 2 needs shapely: pip install 'tflane_jax[data]'") from error
     if not areas:
         return ()
-    # A zero buffer mends rings that touch themselves.
+    # A zero buffer repairs rings that touch themselves.
     union = shapely.union_all([shapely.Polygon(a[:, :2]).buffer(0) for a in areas])
     rings = [ring for part in shapely.get_parts(union) for ring in (part.exterior, *part.interiors)]
     vertices = np.concatenate(areas)

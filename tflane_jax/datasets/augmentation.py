@@ -1,7 +1,8 @@
-"""Random changes of a training example: geometry, colour and lighting, by default LSTR's (specs/modules.md 2.8).
+"""Random augmentation of road images: geometry, colour and lighting, by default LSTR's recipe.
 
-On the host with numpy and OpenCV: all geometry is one affine warp, all colour one affine map of RGB. What stands in
-padding never reaches the result, and the pixels that a warp leaves without an image are black and not valid.
+Runs on the host with numpy and OpenCV: all geometry is one affine warp, all colour one affine map of RGB. The content
+of padding never reaches the result; pixels that the warp does not cover are black and invalid. Source: the training
+settings of LSTR, https://github.com/liuruijin17/LSTR.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from tflane_jax.scene import LaneLines, RoadImage
 Seed = int | Sequence[int]
 
 GREY = np.array([0.299, 0.587, 0.114])
-"""Share of red, green and blue in grey (ITU-R BT.601, as OpenCV has it)."""
+"""Weights of red, green and blue in grey (ITU-R BT.601, as in OpenCV)."""
 
 # Principal components of the colours of natural images in [0, 1] (Krizhevsky et al. 2012), with CornerNet's numbers.
-# Rows are red, green, blue; the reference has them the other way round, because its images are BGR.
+# Rows are red, green, blue; the reference has the opposite order, because its images are BGR.
 PCA_VALUES = np.array([0.2141788, 0.01817699, 0.00341571])
 PCA_VECTORS = np.array(
     [
@@ -35,14 +36,14 @@ PCA_VECTORS = np.array(
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """What may happen to an example; the defaults are LSTR's recipe.
+    """Strength of each augmentation; the defaults are LSTR's recipe.
 
     Attributes:
-        geometry: probability that rotation, flip and crop are drawn at all.
-        rotation: most rotation about the centre to either side, radians.
-        flip: probability of a mirror image, where geometry is drawn.
-        crop: share of height and of width that remains, anywhere in the image, and is enlarged to its size.
-        brightness, contrast, saturation: most change of each factor from 1; they are applied in random order.
+        geometry: probability of rotation, flip and crop.
+        rotation: maximum rotation about the centre to either side, radians.
+        flip: probability of a mirror image, given that geometry is applied.
+        crop: fraction of height and width that is cut out anywhere in the image and enlarged to its size.
+        brightness, contrast, saturation: maximum change of each factor from 1; they are applied in random order.
         lighting: standard deviation of the change along the principal components of colour.
     """
 
@@ -56,18 +57,15 @@ class AugmentationConfig:
     lighting: float = 0.1
 
 
-NO_AUGMENTATION = AugmentationConfig(geometry=0.0, brightness=0.0, contrast=0.0, saturation=0.0, lighting=0.0)
-
-
 def augment(example: RoadImage, config: AugmentationConfig, seed: Seed) -> RoadImage:
-    """Return one example changed at random, or itself where nothing was drawn; the same seed gives the same bits.
+    """Return one example with random changes; the same seed gives the same bits.
 
-    Points that leave the image become invalid, points keep ascending rows and lines their order from left to right by
-    the first point; a line that the warp leaves with fewer than two points is dropped.
+    Points that leave the image become invalid. Rows stay ascending within a line, and lines stay sorted from left to
+    right by their first point. A line that the warp leaves with fewer than two points is dropped.
 
     Args:
         example: numpy.
-        config: what may happen.
+        config: strength of the changes.
         seed: an integer or several, such as (run seed, epoch, index).
     """
     geometry, colour = np.random.default_rng(seed).spawn(2)
@@ -123,14 +121,14 @@ def warp_example(example: RoadImage, warp: Float[np.ndarray, "3 3"]) -> RoadImag
 
 
 def warp_lines(lines: LaneLines, warp: Float[np.ndarray, "3 3"], height: int, width: int) -> LaneLines:
-    """Return lines under an affine map of the pixels of an image; see `augment` for what becomes of them."""
+    """Return lines under an affine map of the image's pixels; see `augment` for dropped and sorted points."""
     size = np.array([width, height], np.float64)
     before = np.asarray(lines.point_valid & lines.valid[:, None])
     points = np.where(before[..., None], lines.points, 0.0).astype(np.float64)
     points = ((points * size) @ warp[:2, :2].T + warp[:2, 2]) / size
     valid = before & ((points >= 0.0) & (points <= 1.0)).all(-1)
 
-    # Steep turns can swap the rows of points: sort the valid ones among the places that they hold.
+    # Strong rotations can swap the rows of points: sort the valid ones among their own places.
     places = np.argsort(~valid, axis=-1, kind="stable")
     order = np.argsort(np.where(valid, points[..., 1], np.inf), axis=-1, kind="stable")
     arranged = np.zeros_like(points)
@@ -160,7 +158,7 @@ def colour_map(
         light: added at the end.
         mean_grey: of the original image, in [0, 1].
     """
-    blended = np.zeros((3, 3, 4))  # what each blends with: nothing, mean grey, grey
+    blended = np.zeros((3, 3, 4))  # each factor blends with: nothing, mean grey, grey
     blended[1, :, 3] = mean_grey
     blended[2, :, :3] = GREY
     colour = np.eye(3, 4)

@@ -1,9 +1,8 @@
 """Datasets built once and kept on disk as memory-mappable arrays.
 
-An entry is a folder with one .npy file per leaf of an example and an `index.json`. Its name carries a
-fingerprint of the dataset's configuration and of the code that makes examples, so that a changed world never
-reads stale examples. Entries appear whole or not at all: they are built beside their place under a lock and
-renamed into it.
+An entry is a folder with one .npy file per leaf of an example and an `index.json`. Its name contains a fingerprint of
+the dataset's configuration and of the code that makes examples, so a changed world never reads stale examples. An entry
+appears whole or not at all: it is built under a lock beside its final path and then renamed.
 """
 
 from __future__ import annotations
@@ -32,13 +31,12 @@ from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 
-# The code that decides what an example is, relative to the package.
+# Packages whose code determines the examples.
 _SOURCES = ("scene", "geometry", "world", "markers", "datasets")
 
 
 class Cacheable(IndexedExamples, Protocol):
-    """A dataset that its configuration describes completely, and that can be sent to worker processes
-    (pickle)."""
+    """A dataset that its configuration describes completely, and that can be pickled for worker processes."""
 
     @property
     def config(self) -> object:
@@ -54,13 +52,13 @@ def cache_root() -> Path:
 def cached(
     dataset: Cacheable, *, root: Path | None = None, workers: int | None = None, progress: bool = True
 ) -> CachedDataset:
-    """Return the dataset read from its cache entry, which is built first where it is missing or damaged.
+    """Return the dataset read from its cache entry, which is built first if it is missing or damaged.
 
     Args:
-        dataset: what to keep; its examples all have the same shapes.
+        dataset: its examples all have the same shapes.
         root: folder of the entries, default `cache_root()`.
-        workers: processes that build, default one per core; the result does not depend on it. More than one
-            needs the caller's script to be guarded by `if __name__ == "__main__":`.
+        workers: processes that build, default one per core; the result does not depend on it. For more than one the
+            caller's script must be guarded by `if __name__ == "__main__":`.
         progress: show a bar with rate and time left while building.
 
     Raises:
@@ -86,7 +84,7 @@ def cached(
 
 
 def fingerprint(dataset: Cacheable) -> str:
-    """Return the hash of everything that an entry depends on: configuration, code and numpy's version."""
+    """Return the hash of all that an entry depends on: configuration, code and the version of numpy."""
     digest = hashlib.sha256()
     for text in (_kind(dataset), repr(dataset.config), np.__version__, source_digest()):
         digest.update(text.encode() + b"\0")
@@ -99,7 +97,7 @@ def _kind(dataset: IndexedExamples) -> str:
 
 @functools.cache
 def source_digest() -> str:
-    """Return the hash of the code that makes examples; comments, docstrings and layout do not count."""
+    """Return the hash of the code that makes examples, without comments, docstrings and layout."""
     package = Path(tflane_jax.__file__).parent
     found = [path for name in _SOURCES for path in (package / name, *(package / name).rglob("*.py"))]
     digest = hashlib.sha256()
@@ -110,7 +108,7 @@ def source_digest() -> str:
 
 
 def _code(source: str) -> str:
-    """Return a text that is the same for two sources that differ in comments, docstrings and layout only."""
+    """Return a text of the source that does not depend on comments, docstrings and layout."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         documented = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
@@ -120,14 +118,13 @@ def _code(source: str) -> str:
 
 
 class DamagedEntry(Exception):
-    """A cache entry that is not whole."""
+    """A cache entry is incomplete or altered."""
 
 
 class CachedDataset:
-    """A dataset read from a cache entry; arrays are memory-mapped and read when looked at.
+    """A dataset read from a cache entry; arrays are memory-mapped and read on access.
 
-    Raises FileNotFoundError where there is no entry and `DamagedEntry` where a file is missing, truncated or
-    altered in length.
+    Raises FileNotFoundError if there is no entry, and `DamagedEntry` if a file is missing or has another length.
     """
 
     def __init__(self, folder: Path):
@@ -183,7 +180,7 @@ class CachedDataset:
         return read
 
     def nbytes(self, parts: Collection[str]) -> int:
-        """Return how much memory these fields of all examples take."""
+        """Return the bytes that these fields of all examples take in memory."""
         return sum(array.nbytes for name, array in self._leaves().items() if name.split(".")[0] in parts)
 
     def _leaves(self) -> dict[str, np.ndarray]:
@@ -191,9 +188,8 @@ class CachedDataset:
 
 
 def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: bool) -> None:
-    """Build the entry beside its place and rename it into place."""
-    # Whoever holds the lock is the only builder, so what lies here was left behind by a build that was
-    # killed.
+    """Build the entry beside its final path and rename it."""
+    # The lock makes this the only builder, so any such folder was left behind by a killed build.
     for stale in folder.parent.glob(f"{folder.name}.building-*"):
         shutil.rmtree(stale, ignore_errors=True)
     template, _ = frame_leaves(dataset, 0)
@@ -221,18 +217,18 @@ def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: 
 
 
 def _summary(path: Path) -> dict[str, int]:
-    """Return what tells whether a leaf's file is still whole."""
+    """Return size and checksum of a leaf's file."""
     values = np.load(path, mmap_mode="r")
     return {"bytes": path.stat().st_size, "crc32": zlib.crc32(values.reshape(-1).view(np.uint8))}
 
 
 @contextlib.contextmanager
 def _only_builder(folder: Path) -> Iterator[None]:
-    """Hold the entry's lock, which the system releases even where the process is killed."""
+    """Hold the entry's lock, which the system releases even if the process is killed."""
     try:
         import fcntl
     except ImportError:
-        # Windows has no such locks: there, building one entry twice at once is not guarded against.
+        # Windows has no such locks; there, nothing prevents two processes from building one entry at once.
         yield
         return
     with open(folder.with_name(folder.name + ".lock"), "w") as lock:
@@ -245,7 +241,7 @@ def _only_builder(folder: Path) -> Iterator[None]:
 
 
 def _explain(error: OSError, root: Path) -> Exception:
-    """Return a message with a remedy for a failure to write below `root`, and any other error as it is."""
+    """Return a UserError with a remedy for a failure to write below `root`; return any other error unchanged."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         remedy = "free space there, ask for fewer scenes, or set TFLANE_CACHE to a folder on another disk"
     elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):

@@ -1,8 +1,8 @@
-"""Merge lane segments into the centerlines of OpenLane-V2 (specs/data_formats.md section 3, step 7).
+"""Merge lane segments into the centerlines of OpenLane-V2.
 
-A lane segment ends wherever a marking or a neighbour changes; a centerline of OpenLane-V2 ends only at forks
-and merges. So A -> B become one lane where B is A's only successor and A is B's only predecessor, on the full
-map, before anything is cropped.
+A lane segment ends wherever a marking or a neighbour changes; a centerline of OpenLane-V2 ends only at forks and
+merges (docs/reference/openlane_v2_truth.md, step 7). A and B become one lane if B is A's only successor and A is B's
+only predecessor. This is decided on the full map, before cropping.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ class MergedLanes:
 def merge_chains(segments: dict[int, LaneSegment]) -> MergedLanes:
     """Join lane segments over every one-to-one joint.
 
-    Predecessors are the inverse of `successors` (the predecessor lists of Argoverse 2 are incomplete).
-    Successors that the map does not hold count as forks but lead nowhere. A closed loop of one-to-one joints
-    is cut at its lowest id and succeeds itself.
+    Predecessors are the inverse of `successors`, because the predecessor lists of Argoverse 2 are incomplete. A
+    successor outside the map counts as a branch but gives no edge. A closed loop of one-to-one joints is cut at its
+    lowest id and is its own successor.
     """
     next_of = _one_to_one(segments)
     follows = {b: a for a, b in next_of.items()}
     heads = [s for s in segments if s not in follows]
     members = {head: _walk(head, next_of) for head in heads}
     walked = {s for chain in members.values() for s in chain}
-    # What no head reaches lies on closed loops.
+    # Segments that no head reaches lie on closed loops.
     for segment in sorted(segments):
         if segment not in walked:
             members[segment] = _walk(segment, next_of)
@@ -75,7 +75,7 @@ def _walk(head: int, next_of: dict[int, int]) -> list[int]:
 
 def _join(parts: list[LaneSegment], chain_of: dict[int, int]) -> LaneSegment:
     def label(values: list[int], lines: list[np.ndarray]) -> int:
-        """Return the value that covers most length; the first of equals."""
+        """Return the value that covers the greatest length; the first one in a tie."""
         lengths = [arc_length(line)[-1] for line in lines]
         return max(values, key=lambda v: sum(n for x, n in zip(values, lengths, strict=True) if x == v))
 
@@ -95,7 +95,7 @@ def _join(parts: list[LaneSegment], chain_of: dict[int, int]) -> LaneSegment:
 
 
 def _concatenate(lines: Sequence[np.ndarray]) -> np.ndarray:
-    """Concatenate lines, keeping a joint that two of them share once."""
+    """Concatenate lines; a point where two of them join is kept once."""
     points = np.concatenate(lines)
     joint = np.cumsum([len(line) for line in lines[:-1]], dtype=int)
     repeated = np.linalg.norm(points[joint, :2] - points[joint - 1, :2], axis=-1) < _SAME_POINT

@@ -1,4 +1,4 @@
-"""Turn one moment of a `Log` into an `Example`: what the sensor and the priors say there, and the truth."""
+"""One key frame of a `Log` -> `Example`: sensor evidence, priors and ground truth."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from tflane_jax.world.roads.sd_map import make_sd_map
 
 
 def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tuple[TrafficFlow, int]:
-    """Return the tracks of the last `history` frames strictly before the key frame's own, and how many instances
-    found no room (the farthest at their nearest).
+    """Return the tracks of the `history` frames before the key frame, and how many exceeded the capacity.
 
-    Each frame's boxes are in the ego frame of that frame; TF-Lane Eq. (1) moves them into the key frame's.
-    Missing frames stand invalid at the front; instances that no frame holds are left out.
+    The log holds each frame's boxes in the ego frame of that frame; TF-Lane Eq. (1) moves them into the ego frame of
+    the key frame. Where the log starts later, the first frames of the result are invalid. Of more instances than
+    `capacity`, those whose nearest position is farthest are left out.
     """
     moment, tracks = log.keyframes[keyframe], log.tracks
     frames = np.arange(max(moment.track_frame - history, 0), moment.track_frame)
@@ -52,7 +52,7 @@ def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tup
 def occluder_boxes(log: Log, keyframe: int) -> Float[np.ndarray, "k 7"]:
     """Return every actor at the key frame as rows x, y, length, width, yaw, height, base_z = 0, ego frame.
 
-    The boxes stand on the flat ground on which line of sight is asked, whatever the slope of the real road.
+    The boxes are put on flat ground, on which line of sight is tested, whatever the slope of the real road.
     """
     moment, actors = log.keyframes[keyframe], log.actors
     present = np.flatnonzero(actors.valid[moment.track_frame])
@@ -65,7 +65,7 @@ def occluder_boxes(log: Log, keyframe: int) -> Float[np.ndarray, "k 7"]:
 def _moved(
     tracks: Tracks, frames: np.ndarray, rows: np.ndarray, poses: np.ndarray, target: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (F, K, 3) and yaws (F, K) of some tracks in some frames, moved into the target's frame."""
+    """Return positions (F, K, 3) and yaws (F, K) of tracks `rows` in `frames`, in the ego frame of pose `target`."""
     target_from_frame = relative_pose(target, poses[frames])  # Eq. (1)
     position = transform_points(target_from_frame, tracks.position[frames[:, None], rows])
     yaw = tracks.yaw[frames[:, None], rows] + pose_yaw(target_from_frame)[:, None]
@@ -75,9 +75,8 @@ def _moved(
 def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     """Return the example of one key frame: numpy arrays of the sizes in `config`, no batch axis.
 
-    A log without history (its first frame) or without road users gives a valid example with an empty traffic
-    flow. Warns (`TruncationWarning`) where something in range finds no room. Raises UserError where the configured
-    cameras can make no images.
+    The traffic flow is empty at the first frame of a log and in a log without road users. Warns (`TruncationWarning`)
+    if more is in range than a capacity. Raises UserError if the configured cameras can make no images.
     """
     moment = log.keyframes[keyframe]
     ego_from_global = invert_pose(moment.global_from_ego)
@@ -168,7 +167,7 @@ def _buildings(log: Log, ego_from_global: np.ndarray) -> Float[np.ndarray, "b 5"
 
 
 def _attributes(log: Log, frame: int) -> Int[np.ndarray, " m"]:
-    """Return what each of the map's traffic elements shows in a track frame."""
+    """Return the attribute of each of the map's traffic elements in a track frame."""
     if log.element_attribute is not None:
         return log.element_attribute[frame]
     return np.array([element.attribute for element in log.map.elements], int)

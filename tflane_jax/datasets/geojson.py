@@ -1,7 +1,7 @@
 """SD maps from GeoJSON files, such as OpenStreetMap's exports: LineStrings in WGS84 around a place.
 
 A line's category is its property `category`, one of the names of `CATEGORIES`, or follows from its OpenStreetMap tag
-`highway` (`HIGHWAYS`; values that are not listed there are "other"). Points and polygons are passed over.
+`highway` (`HIGHWAYS`; values that are not listed there are "other"). Points and polygons are ignored.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
 
-# Names of SMERF's categories (specs/modules.md section 9).
+# Names of SMERF's categories (https://github.com/NVlabs/SMERF).
 CATEGORIES = {
     "road": SdCategory.ROAD,
     "cross_walk": SdCategory.CROSSWALK,
@@ -63,7 +63,7 @@ _AXIS, _ECCENTRICITY = 6_378_137.0, 6.694379990141e-3
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the vehicle is.
+    """Pose of the vehicle.
 
     Attributes:
         latitude, longitude: WGS84, degrees.
@@ -92,8 +92,8 @@ def read_geojson(path: str | Path) -> RoadLines:
     """Read the lines of a FeatureCollection.
 
     Raises:
-        UserError: naming the file, the feature (by its place, from 0, and its id) and the remedy, where the file is no
-            GeoJSON in WGS84, a line has no category, or its coordinates are none on Earth.
+        UserError: the file is no GeoJSON in WGS84, a line has no category, or its coordinates are not on Earth. The
+            message names the file, the feature (by its number, from 0, and its id) and the remedy.
     """
     lines, category = [], []
     for name, feature in _features(Path(path)):
@@ -112,10 +112,10 @@ def read_geojson(path: str | Path) -> RoadLines:
 
 
 def sd_map_around(roads: RoadLines, origin: Origin, config: SdMapConfig) -> SdMap:
-    """Return the part of a map that lies around the vehicle, in its ego frame.
+    """Return the part of a map around the vehicle, in its ego frame.
 
-    Only `lines`, `points` and `range` of the config are looked at: a real map has faults of its own. Warns
-    (`TruncationWarning`) where lines find no room.
+    Only `lines`, `points` and `range` of the config are used: a real map has real faults, so none are simulated. Warns
+    (`TruncationWarning`) if more lines are in range than the capacity.
     """
     lines = [to_ego(line, origin) for line in roads.lines]
     sd_map, dropped = pack_lines(
@@ -150,7 +150,7 @@ def to_ego(line: Float[np.ndarray, "n 2"], origin: Origin) -> Float[np.ndarray, 
 
 
 def _features(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the features of a file, each with the words that name it in an error."""
+    """Yield the features of a file, each with its name for error messages."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

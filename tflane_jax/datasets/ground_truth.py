@@ -1,7 +1,8 @@
-"""Lanes and traffic elements of OpenLane-V2 from a vector map and a pose (specs/data_formats.md section 3).
+"""Lanes and traffic elements of OpenLane-V2 from a vector map and an ego pose.
 
-Lanes come in two flavours, lane segments as the map holds them and centerlines merged over one-to-one joints;
-both are moved into the ego frame, cut at the perception range and resampled.
+Lanes come in two flavours: the map's lane segments, and centerlines merged over one-to-one joints. Both are moved into
+the ego frame, cut at the perception range and resampled. The conversion code of OpenLane-V2 is not public;
+docs/reference/openlane_v2_truth.md gives the rules and their sources.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from tflane_jax.scene.logs import MapElement
 from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.cameras.sensor import ElementViews
 
-# A traffic element farther away than this is not part of the truth; metres.
+# Metres; traffic elements farther away are not ground truth.
 ELEMENT_DISTANCE = 60.0
-# Points on each centerline at which visibility is asked: about one for each metre of the longest lanes.
+# Points on each centerline at which line of sight is tested: about one per metre of the longest lanes.
 _SIGHT_SAMPLES = 101
 
 
@@ -31,9 +32,9 @@ class CroppedLanes:
     """Lanes inside the range.
 
     Attributes:
-        graph: the truth.
-        lane: (capacity,) number of the map lane that each valid row is a piece of.
-        dropped: how many lanes found no room (the farthest).
+        graph: the ground truth.
+        lane: (n,) map lane of which each of the n valid rows is a piece.
+        dropped: number of lanes left out because the capacity was exceeded (the farthest).
     """
 
     graph: LaneGraph
@@ -51,13 +52,18 @@ def lane_graph(
     boxes: Float[np.ndarray, "k 7"],
     buildings: Float[np.ndarray, "b 5"],
 ) -> CroppedLanes:
-    """Move, cut and resample lanes (steps 1 to 7).
+    """Return the lanes in range: moved into the ego frame, cut and resampled.
 
-    A centerline that the border cuts into several pieces gives several lanes. [i, j] of `successor` is true
-    where piece i holds the end of its lane, piece j the start of its lane, and the map joins the two lanes.
+    A centerline that the border cuts into several pieces gives several lanes. `successor[i, j]` is true if piece i
+    contains the end of its lane, piece j contains the start of its lane, and the map connects the two lanes.
 
     Args:
-        boxes, buildings: what stands in the line of sight (see `hidden_points`), ego frame.
+        lanes: of the map, in one flavour, global frame.
+        ego_from_global: pose.
+        range_: perception range, ego frame.
+        capacity: lanes in the result; of more, the farthest are left out.
+        points: points on each lane.
+        boxes, buildings: obstacles to the line of sight (see `hidden_points`), ego frame.
     """
     pieces = _crop(lanes, ego_from_global, range_)
     distance = [np.linalg.norm(p.centerline[:, :2], axis=-1).min() for p in pieces]
@@ -85,7 +91,7 @@ def lane_graph(
 
 @dataclass(frozen=True)
 class _Piece:
-    """What the range leaves of a lane: its lines in the ego frame and whether its own start and end are in it."""
+    """A piece of a lane inside the range, ego frame, and whether it contains the lane's start and end."""
 
     lane: int
     centerline: np.ndarray
@@ -119,8 +125,8 @@ def _crop(lanes: MapLanes, ego_from_global: np.ndarray, range_: PerceptionRange)
 def _boundary_of(part: np.ndarray, line: np.ndarray, whole: np.ndarray, range_: PerceptionRange) -> np.ndarray:
     """Return the piece of a boundary that belongs to a piece of its centerline.
 
-    Of several pieces inside the range, the one nearest to the centerline's; of none, the stretch of the
-    boundary that runs beside it.
+    If several pieces of the boundary are inside the range, the one nearest to the middle of the centerline's piece; if
+    none is, the part of the boundary at the same fractions of its length.
     """
     inside = clip_to_range(line, range_)
     if len(inside) == 1:
@@ -153,15 +159,19 @@ def traffic_elements(
     capacity: int,
     seen: ElementViews | None = None,
 ) -> tuple[TrafficElements, int]:
-    """Return lights and signs, tied to the merged centerlines whose segments they govern, and how many found no room
-    (the farthest).
+    """Return lights and signs with the centerlines that they govern, and how many exceeded the capacity.
 
-    Without an image, those in range and nearer than `ELEMENT_DISTANCE` are the truth; with one, those seen in it.
+    Ground truth are the elements visible in the front image. Without an image, they are those in range and nearer than
+    `ELEMENT_DISTANCE`. Of more than the capacity, the farthest are left out.
 
     Args:
-        elements, attribute: the map's elements and what each shows at this moment.
-        lanes: cut from `prepared.centerlines`.
-        seen: the elements in the front image, None where there is no image.
+        elements, attribute: the map's elements and the attribute of each at this moment.
+        prepared: the map.
+        lanes: lanes in range, cut from `prepared.centerlines`.
+        ego_from_global: pose.
+        range_: perception range, ego frame.
+        capacity: elements in the result.
+        seen: the elements in the front image; None if there is no image.
     """
     out = TrafficElements.empty(capacity, len(lanes.graph.valid))
     if not elements:

@@ -1,8 +1,8 @@
-"""Names for lanes, areas and traffic elements that stay the same from frame to frame.
+"""Ids for lanes, areas and traffic elements that stay the same from frame to frame.
 
-Examples have no ids. What stands in one frame where something stood in the frame before, moved by the ego motion, is
-the same thing, as long as it is the only one so near; a lane that the border of the perception range cuts elsewhere
-still lies on itself.
+Examples have no ids. An item gets the id of the item of the previous frame that, after ego-motion compensation, is
+matched to it (Hungarian assignment) and nearer than a threshold. A lane that the border of the perception range cuts at
+another place still lies on its previous line.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene import Example
 
-# Farther apart than this (metres), two things are not the same. Resampled chords of one curve differ by less.
+# Metres; items farther apart are different. Resampled polylines of one curve differ by less.
 _SAME = 0.75
 _FAR = 1e6
 
@@ -24,22 +24,25 @@ _FAR = 1e6
 def line_distances(
     lines: Float[np.ndarray, "n p 3"], others: Float[np.ndarray, "m q 3"]
 ) -> tuple[Float[np.ndarray, "n m p"], Float[np.ndarray, "n m p"]]:
-    """Return the ground-plane distance from every vertex to every other line, metres, and the place on that line
-    nearest to it (0 at its first vertex, q - 1 at its last); q >= 2."""
+    """Return the ground-plane distance from every vertex to every other line, and the nearest place on that line.
+
+    Distances are in metres. A place is a vertex number with a fraction, from 0 at the first vertex to q - 1 at the
+    last. Lines need q >= 2 vertices.
+    """
     points, start, step = lines[:, None, :, None, :2], others[:, :-1, :2], np.diff(others[..., :2], axis=1)
     square = (step**2).sum(-1)
     start, step = start[None, :, None], step[None, :, None]
-    share = ((points - start) * step).sum(-1) / np.where(square > 0.0, square, 1.0)[None, :, None]
-    share = np.clip(share, 0.0, 1.0)
-    distance = np.linalg.norm(start + share[..., None] * step - points, axis=-1)
+    fraction = ((points - start) * step).sum(-1) / np.where(square > 0.0, square, 1.0)[None, :, None]
+    fraction = np.clip(fraction, 0.0, 1.0)
+    distance = np.linalg.norm(start + fraction[..., None] * step - points, axis=-1)
     nearest = distance.argmin(-1)[..., None]
-    place = nearest + np.take_along_axis(share, nearest, -1)
+    place = nearest + np.take_along_axis(fraction, nearest, -1)
     return np.take_along_axis(distance, nearest, -1)[..., 0], place[..., 0]
 
 
 @dataclass
 class _Kind:
-    """Things of one kind in the latest frame: their shapes and labels, and the ids of valid rows."""
+    """Items of one kind in the latest frame: shapes, labels and ids of the valid rows."""
 
     lines: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
     label: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
@@ -47,10 +50,10 @@ class _Kind:
 
 
 class Identities:
-    """Ids of one scene's things, frame after frame.
+    """Ids of one scene's items, frame by frame.
 
     Attributes:
-        lanes, segments, areas, elements: id by row of the latest example, for valid rows.
+        lanes, segments, areas, elements: from row of the latest example to id, for valid rows.
     """
 
     def __init__(self) -> None:
@@ -62,7 +65,7 @@ class Identities:
         self._count = 0
 
     def step(self, example: Example) -> None:
-        """Take the next frame of the scene; one whose `has_previous` is false starts afresh."""
+        """Take the next frame of the scene; a frame whose `has_previous` is false starts a new scene."""
         if not example.has_previous:
             self._before = {}
         ego_from_previous = invert_pose(np.asarray(example.previous_from_ego, np.float64))
@@ -72,7 +75,7 @@ class Identities:
         self.areas = self._next("area", areas.points, areas.category, areas.valid, ego_from_previous)
         self.elements = {}
         if elements is not None:
-            # An element is a point; where positions are not known, all are at the origin and nothing is recognised.
+            # An element is a point. Datasets without positions put all of them at the origin.
             place = np.repeat(np.asarray(elements.position)[:, None], 2, 1)
             self.elements = self._next("element", place, elements.category, elements.valid, ego_from_previous)
 
@@ -99,8 +102,11 @@ class Identities:
 
 
 def _separation(now: _Kind, before: _Kind) -> Float[np.ndarray, "n m"]:
-    """Return how far two things are apart: the mean distance of the one that lies more on the other (a line may be cut
-    shorter), plus a little of the other direction to choose among lines that share a stretch."""
+    """Return the distance of items: the smaller of the two mean distances from one to the other.
+
+    The smaller one, because a line may be cut shorter. A small part of the other direction decides between lines that
+    overlap in part.
+    """
     there = line_distances(now.lines, before.lines)[0].mean(-1)
     back = line_distances(before.lines, now.lines)[0].mean(-1).T
     known = np.abs(now.lines).max((1, 2)) > 0.0  # not an element whose position is not known

@@ -12,13 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.base import TruncationWarning
-from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.tusimple import NO_POINT, RowLanes
 from tflane_jax.scene import LaneLines, RoadImage
 
 ROWS = np.arange(160.0, 720.0, 10.0)
 """(56,) rows of the points of a line, pixels of an image of height `ROWS_HEIGHT`."""
 ROWS_HEIGHT = 720
-_NO_POINT = -2.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ def row_lanes(lines: LaneLines, height: float = ROWS_HEIGHT, width: float = 1280
     u, v = points[..., 0], points[..., 1]
     if valid.shape[1] != len(ROWS) or (valid & ~(np.abs(v * ROWS_HEIGHT - ROWS) < 0.01)).any():
         raise ValueError("the lines' points do not stand at TuSimple's rows: give lines that were not augmented")
-    return RowLanes(np.where(valid & (u >= 0.0), u * width, _NO_POINT), ROWS * (height / ROWS_HEIGHT))
+    return RowLanes(np.where(valid & (u >= 0.0), u * width, NO_POINT), ROWS * (height / ROWS_HEIGHT))
 
 
 def _at_rows(

@@ -1,4 +1,4 @@
-"""Examples as flat, named arrays ("lanes.points"), the form in which they are stored, and back."""
+"""Examples as flat, named arrays ("lanes.points"), as they are stored, and back."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tflane_jax.scene import (
     TrafficFlow,
 )
 
-# The parts of an example that are containers of their own; its other fields are arrays.
+# Fields of `Example` that are containers; its other fields are arrays.
 PARTS = {
     "traffic_flow": TrafficFlow,
     "markers": MarkerObservations,
@@ -33,8 +33,7 @@ PARTS = {
     "cameras": CameraViews,
 }
 
-
-# The same of an example of the monocular task.
+# The same of `RoadImage`.
 IMAGE_PARTS = {"lines": LaneLines}
 
 

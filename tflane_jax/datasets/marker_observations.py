@@ -1,4 +1,4 @@
-"""The marker prior of a log's key frames: its markers, the store of what they name, and what is detected of them."""
+"""The marker prior at a log's key frames: its markers, their store of lanes, and simulated detections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = 
 
 
 def markers_of(log: Log) -> PlacedMarkers:
-    """Return the markers of a log; a log without any (real data) gets virtual ones, as in the paper (section IV-A)."""
+    """Return the markers of a log; real logs have none and get virtual ones (marker paper, section IV-A)."""
     return place_markers(log.map, log.seed) if log.markers is None else log.markers
 
 
@@ -37,8 +37,8 @@ def store_of_log(
     Args:
         log: of the built-in world, or real.
         radius: of the circle around each marker, metres.
-        bike_lanes: keep lanes closed to motor vehicles.
-        surveyed, expires: written to all entries.
+        bike_lanes: whether to keep bicycle lanes.
+        surveyed, expires: dates written to all entries.
     """
     lanes = prepare_map(log.map, bike_lanes=bike_lanes).centerlines.lanes
     return store_of(
@@ -52,7 +52,7 @@ def store_of_log(
 
 
 def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarkers, MarkerStore]:
-    """Return the markers of a log and their store, which are made once for all its frames."""
+    """Return the markers of a log and their store, made once for all its frames."""
     key = (id(log), radius, bike_lanes)
     if key not in _REMEMBERED:
         _REMEMBERED[key] = markers_of(log), store_of_log(log, radius=radius, bike_lanes=bike_lanes)
@@ -63,9 +63,9 @@ def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarker
 def marker_observations(
     log: Log, keyframe: int, config: MarkerConfig, range_: PerceptionRange, *, bike_lanes: bool
 ) -> MarkerObservations:
-    """Return what a simulated detector and the store tell at a key frame.
+    """Return the detected markers with their lanes from the store at a key frame; detections are simulated.
 
-    Warns (`TruncationWarning`) where markers or lanes in range find no room.
+    Warns (`TruncationWarning`) if more markers or lanes are in range than a capacity.
     """
     simulation, (markers, store) = config.simulation, _remembered(log, config.radius, bike_lanes)
     moment, before = log.keyframes[keyframe], moment_before(log, keyframe, simulation.residual_interval)

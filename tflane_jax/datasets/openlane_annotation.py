@@ -1,4 +1,4 @@
-"""The annotation of an OpenLane-V2 frame as arrays, checked, in whichever flavour it comes."""
+"""The annotation of an OpenLane-V2 frame, of either flavour, as checked arrays."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from tflane_jax.files.openlane import (
 
 @dataclass(frozen=True)
 class Annotation:
-    """Truth of one frame: N lanes, E traffic elements, A areas; ego frame, metres, and pixels of the front image.
+    """Ground truth of one frame: N lanes and A areas (ego frame, metres), E traffic elements (front image, pixels).
 
     Attributes:
         lines: N centerlines (n, 3).
         left, right: N boundaries; None in the centerline flavour.
         left_type, right_type: (N,) `scene.LineType`.
-        is_connector: (N,); false where the file does not say.
+        is_connector: (N,); false if the file has no entry.
         successor: (N, N).
         boxes: (E, 2, 2) top-left and bottom-right corners.
         element_category, attribute: (E,).
@@ -57,8 +57,8 @@ def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
     """Return an annotation.
 
     Raises:
-        UserError: names the entry that is missing, has another shape than the lanes and elements ask for, or is out of
-            range.
+        UserError: an entry is missing, out of range, or does not fit the numbers of lanes and elements; the message
+            names it.
     """
     lines = read_lines(record, names.lanes, names.line, where)
     boxes, attribute = read_elements(record, where)

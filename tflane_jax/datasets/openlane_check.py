@@ -1,7 +1,7 @@
-"""Is a folder of OpenLane-V2 whole and sane? Counts, and a sentence for everything that is wrong.
+"""Check a folder of OpenLane-V2: counts of each split, and one sentence for each fault.
 
-Every frame's files are read as for training; images are looked for and their first and last bytes checked, but not
-decoded, so that a whole subset takes minutes.
+Every frame's files are read as for training. Of images only existence, first and last bytes are checked; they are not
+decoded, so a whole subset takes minutes.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 
-# A vehicle that is faster than this (metres a second) has jumped: its poses are damaged.
+# Metres per second; a higher speed between two frames means damaged poses.
 _FASTEST = 70.0
-# First and last bytes of whole images.
+# First and last bytes of intact images.
 _MARKS = {".jpg": (b"\xff\xd8", b"\xff\xd9"), ".png": (b"\x89PNG", b"IEND\xaeB`\x82")}
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas")
 
 
 @dataclass(frozen=True)
 class OpenLaneCheck:
-    """What a check found.
+    """Result of a check.
 
     Attributes:
         subset: A or B, by the cameras of the first frame.
@@ -53,7 +53,7 @@ class OpenLaneCheck:
 
 
 def check_openlane_v2(root: Path, *, progress: bool = True) -> OpenLaneCheck:
-    """Check every split that a split file names or a folder holds.
+    """Check every split that split files or folders contain.
 
     Raises UserError where there is no frame at all.
     """
@@ -112,7 +112,7 @@ def _frames_on_disk(root: Path) -> dict[Split, list[FrameKey]]:
 
 
 def _subset(root: Path, key: FrameKey) -> SubsetName:
-    """Return the subset whose cameras the frame has, A where that cannot be told."""
+    """Return the subset whose cameras the frame has; A if it has none."""
     for name in SUBSETS:
         for suffix in (CENTERLINE.suffix, SEGMENT.suffix):
             try:
@@ -126,7 +126,7 @@ def _subset(root: Path, key: FrameKey) -> SubsetName:
 def _check_frame(
     root: Path, key: FrameKey, subset: SubsetName, counts: Counter[str], faults: list[str]
 ) -> FrameFile | None:
-    """Check the files of one frame; return the one that could be read."""
+    """Check the files of one frame and return the first readable one."""
     first: FrameFile | None = None
     elements = None
     for names, kind in ((CENTERLINE, "lanes"), (SEGMENT, "lane segments")):
@@ -184,7 +184,7 @@ def _check_cameras(frame: FrameFile) -> Iterator[str]:
 
 
 def _check_image(path: Path) -> str | None:
-    """Return what is wrong with an image file."""
+    """Return the fault of an image file, or None."""
     try:
         with open(path, "rb") as file:
             start = file.read(4)

@@ -1,15 +1,12 @@
-"""Any dataset with cameras written in OpenLane-V2's layout, for the official repositories and for `openlane_v2`.
+"""Write any dataset with cameras in OpenLane-V2's layout, for the official repositories and for `openlane_v2`.
 
-An example has no ids: lanes, areas and elements keep theirs from frame to frame where they stay where they were
-(`datasets.identities`). What an example does not tell is derived: which lane segments an element governs, from the
-centerlines that they lie on.
+Examples have no ids; `datasets.identities` gives lanes, areas and elements ids that last from frame to frame. Which
+lane segments an element governs is not in an example either; it is derived from the centerlines that they lie on.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +19,7 @@ from tflane_jax.datasets.base import Dataset, FrameInfo, Split
 from tflane_jax.datasets.identities import Identities, line_distances
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, info_path
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import replacing
 from tflane_jax.files.images import opencv
 from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKey
 from tflane_jax.geometry import invert_pose
@@ -31,36 +29,35 @@ from tflane_jax.scene import CameraViews, Example, LaneGraph, TrafficElements
 ImageFormat = Literal["jpg", "png"]
 VERSION = "tflane_jax 1"
 _JPEG_QUALITY = 95
-# Timestamps of a world start at zero; with this start they have the digits of real ones, so that their order as text is
-# their order in time. Nanoseconds.
+# Nanoseconds. Timestamps of the built-in world start at zero; this offset gives them as many digits as real ones, so
+# that their order as text is their order in time.
 _START_NS = {"A": 315_000_000_000_000_000, "B": 1_500_000_000_000_000_000}
-# A segment lies on a centerline whose points all of its own are nearer to than this; metres.
+# Metres; a segment lies on a centerline if all of its points are nearer than this.
 _ON_LANE = 0.5
 
 
 def export_openlane_v2(
     datasets: Mapping[Split, Dataset], out: Path, *, images: ImageFormat = "jpg", progress: bool = True
 ) -> Path:
-    """Write datasets as a folder of OpenLane-V2, one for each split; it appears whole or not at all.
+    """Write one dataset per split as a folder of OpenLane-V2, which appears whole or not at all.
 
-    Seven cameras make it subset A, six subset B. Scenes become segments in order of appearance; `meta_data` keeps their
-    names. Times below a year get a fixed start (see `meta_data.time_offset_ns`).
+    Seven cameras give subset A, six subset B. Scenes become segments in order of appearance; `meta_data` keeps their
+    names. Timestamps below a fixed start get it added (see `meta_data.time_offset_ns`).
 
     Args:
-        datasets: whose examples have cameras; the frames of a scene stand together and in time order.
-        out: folder that does not exist yet, or is empty.
+        datasets: their examples have cameras; frames are sorted by scene and time.
+        out: folder that does not exist yet or is empty.
         images: "jpg" as official, "png" without loss.
         progress: show a bar with rate and time left.
 
     Raises:
-        UserError: the folder holds something or cannot be written, a dataset is empty or has no cameras, or not six or
-            seven of them.
+        UserError: the folder is not empty or cannot be written, a dataset is empty, or its examples do not have six or
+            seven cameras.
     """
     if out.is_dir() and any(out.iterdir()):
         raise UserError(f"{out} is not empty: choose another folder")
-    writing = out.with_name(f".{out.name}.writing-{os.getpid()}")
-    try:
-        writing.mkdir(parents=True)
+    with replacing(out) as writing:
+        writing.mkdir()
         subset, content = None, {}
         for split, dataset in datasets.items():
             subset = _subset_of(dataset, subset)
@@ -68,13 +65,6 @@ def export_openlane_v2(
         if subset is None:
             raise UserError("nothing to export: name at least one split")
         _write_json(writing / SUBSETS[subset].data_dict, content)
-        if out.is_dir():
-            out.rmdir()
-        writing.rename(out)
-    except OSError as error:
-        raise UserError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(writing, ignore_errors=True)
     return out
 
 
@@ -134,7 +124,7 @@ def _frame(key: FrameKey, info: FrameInfo, subset: SubsetName, offset: int) -> d
 def _sensors(
     cameras: CameraViews, root: Path, key: FrameKey, subset: SubsetName, images: ImageFormat
 ) -> dict[str, Any]:
-    """Write the images of a frame; a camera that delivered none is left out."""
+    """Write the images of a frame and return its sensors; cameras without an image are left out."""
     sensors = {}
     for i, name in enumerate(SUBSETS[subset].cameras):
         if not cameras.valid[i]:
@@ -198,8 +188,11 @@ def segment_annotation(example: Example, ids: Identities) -> dict[str, Any]:
 
 
 def dense(line: Float[np.ndarray, "p 3"], count: int = DENSE_POINTS) -> Float[np.ndarray, "count 3"]:
-    """Return a line with `count` points: between its own where they fit in evenly, so that every k-th point is one of
-    them again; equally spaced otherwise."""
+    """Return a line with `count` points.
+
+    If `count - 1` is a multiple of the line's segments, every k-th point is one of its own. Otherwise the points are
+    equally spaced.
+    """
     pieces = len(line) - 1
     if pieces < 1 or (count - 1) % pieces:
         return resample(line, count)
@@ -208,7 +201,7 @@ def dense(line: Float[np.ndarray, "p 3"], count: int = DENSE_POINTS) -> Float[np
 
 
 def segments_on_lanes(segments: LaneGraph, lanes: LaneGraph) -> Bool[np.ndarray, "s n"]:
-    """Return which segments lie on which centerlines, in the same direction; nothing where either is not valid."""
+    """Return which valid segments lie on which valid centerlines, in the same direction."""
     out = np.zeros((len(segments.valid), len(lanes.valid)), bool)
     rows, columns = np.flatnonzero(segments.valid), np.flatnonzero(lanes.valid)
     if not len(rows) or not len(columns):
@@ -220,12 +213,12 @@ def segments_on_lanes(segments: LaneGraph, lanes: LaneGraph) -> Bool[np.ndarray,
 
 
 def _governed(example: Example) -> Bool[np.ndarray, "n e"]:
-    """Return which lanes each valid element governs; nothing where there are no elements."""
+    """Return which lanes each valid element governs."""
     elements = example.traffic_elements
     if elements is None:
         return np.zeros((len(example.lanes.valid), 0), bool)
     lane = np.zeros((len(example.lanes.valid), len(elements.valid)), bool)
-    if len(elements.lane) == len(lane):  # the rows of a lane-segment dataset are segments, whose lanes are not known
+    if len(elements.lane) == len(lane):  # else the rows are lane segments, whose centerlines are unknown
         lane = np.asarray(elements.lane) & np.asarray(example.lanes.valid)[:, None]
     return lane[:, np.flatnonzero(elements.valid)]
 

@@ -4,8 +4,8 @@
     <root>/<split>/<segment>/info/<timestamp>.json, -ls.json   one frame, in the centerline and the lane-segment flavour
     <root>/<split>/<segment>/image/<camera>/<timestamp>.jpg
 
-Subset A comes from Argoverse 2 (seven cameras, nanoseconds), subset B from nuScenes (six, microseconds). Source: shared
-specs/data_formats.md section 2.
+Subset A comes from Argoverse 2 (seven cameras, nanoseconds), subset B from nuScenes (six cameras, microseconds).
+Format: https://github.com/OpenDriveLab/OpenLane-V2/blob/master/data/README.md
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import pose_matrix
 
 SubsetName = Literal["A", "B"]
-# A rotation matrix may differ from an orthonormal one by so much in any entry; the files have float32 digits.
+# Largest deviation of a rotation matrix from orthonormality, per entry; the files have float32 digits.
 _ORTHONORMAL = 1e-4
 
 
 @dataclass(frozen=True)
 class Subset:
-    """What tells the two subsets apart.
+    """Constants of a subset.
 
     Attributes:
-        cameras: names; the first looks ahead, and traffic elements are labelled in its image.
+        cameras: names; the first is the front camera, in whose image traffic elements are labelled.
         sizes: width and height of each camera's original images, pixels.
-        tick_ns: nanoseconds of one unit of the timestamps.
+        tick_ns: unit of the timestamps, nanoseconds.
         first_segment: number of the first segment of each split.
         data_dict: name of the split file.
     """
@@ -79,10 +79,9 @@ class FrameCamera:
     """One camera of one frame.
 
     Attributes:
-        name: as the dataset calls it.
+        name: in the dataset.
         image: file.
-        intrinsics: (3, 3), pixels of the file; the lens distortion that stands beside it is left out, as by TopoNet
-            and LaneSegNet.
+        intrinsics: (3, 3), pixels of the file; lens distortion is ignored, as in TopoNet and LaneSegNet.
         ego_from_camera: (4, 4).
     """
 
@@ -99,8 +98,8 @@ class FrameFile:
     Attributes:
         path: of the file.
         global_from_ego: (4, 4) float64.
-        cameras: in the order of the subset; None for one that the frame does not have.
-        annotation: untrusted, see `openlane_files`; None where the frame has none, as in the test split.
+        cameras: in the order of the subset; None for a camera that the frame lacks.
+        annotation: unchecked JSON, see `openlane_annotation`; None in the test split.
     """
 
     path: Path
@@ -110,13 +109,13 @@ class FrameFile:
 
 
 def subset_of(root: Path) -> SubsetName:
-    """Return the subset that a folder's split file names; A where there is none, or both."""
+    """Return the subset of the split file in a folder; A if there is none or both."""
     has = {name: (root / subset.data_dict).is_file() for name, subset in SUBSETS.items()}
     return "B" if has["B"] and not has["A"] else "A"
 
 
 def info_path(root: Path, key: FrameKey, suffix: str = "") -> Path:
-    """Return the file of a frame; `suffix` is that of `openlane_files.FieldNames`."""
+    """Return the file of a frame; `suffix` is `files.openlane.FieldNames.suffix`."""
     return root / key.split / key.segment / "info" / f"{key.timestamp}{suffix}.json"
 
 
@@ -126,9 +125,9 @@ def list_frames(root: Path, split: str, subset: SubsetName, data_dict: str | Non
     Args:
         root: of the dataset.
         split: train, val or test.
-        subset: whose split file is looked for.
-        data_dict: name of a split file under `root`; None takes the subset's where it is there, and otherwise lists the
-            folders, "folders" always lists them.
+        subset: its split file is the default.
+        data_dict: name of a split file under `root`; "folders" lists the folders instead. None takes the subset's split
+            file if it exists, else lists the folders.
 
     Raises:
         UserError: a folder or split file that is missing, is damaged, or names no frame of this split.
@@ -169,11 +168,11 @@ def _time(key: FrameKey, root: Path) -> int:
 
 
 def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") -> FrameFile:
-    """Return one frame's file; the images are not looked at.
+    """Return the content of one frame's file; images are not read.
 
     Raises:
-        UserError: it is missing or damaged, lacks an entry, has a camera that the subset does not know, or a rotation
-            that is none.
+        UserError: the file is missing or damaged, lacks an entry, has a camera of another subset, or a matrix that is
+            no rotation.
     """
     path = info_path(root, key, suffix)
     content, where = load_json(path), str(path)

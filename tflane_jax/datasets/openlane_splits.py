@@ -1,4 +1,4 @@
-"""OpenLane-V2 split files: which frames of which Argoverse 2 logs it holds (specs/data_formats.md section 2.1)."""
+"""OpenLane-V2 split files: which frames of which Argoverse 2 logs it holds ."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 
-SPLITS, LOGS = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
+SPLIT_FILE, LOG_FILE = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
 
 
 @functools.lru_cache(maxsize=4)
 def openlane_timestamps(folder: Path) -> dict[str, np.ndarray]:
-    """Return the frame timestamps (F,) int64 of every Argoverse 2 log that is a segment of subset A, ascending.
+    """Return the ascending frame timestamps (F,), int64 nanoseconds, of every Argoverse 2 log in subset A, by log id.
 
     Args:
         folder: holds OpenLane-V2/data_dict_subset_A.json and subset_A_segment_to_av2_log.json (segment to log id).
 
-    Raises UserError where one of them is missing or damaged.
+    Raises UserError where one of the files is missing or damaged.
     """
-    frames, logs = (_read_json(Path(folder) / name) for name in (SPLITS, LOGS))
+    frames, logs = (_read_json(Path(folder) / name) for name in (SPLIT_FILE, LOG_FILE))
     return {
         logs[split][segment]: np.sort([int(name.removesuffix(".json")) for name in names])
         for split, segments in frames.items()

@@ -1,7 +1,7 @@
-"""Do two splits show the same places? Training and validation drives that pass the same spot leak the map.
+"""How much two splits show the same places: drives of both splits past the same spot leak the map.
 
-The official splits of nuScenes and OpenLane-V2 do: a model that has learnt the map of a place by heart scores there
-without seeing anything. This compares ego positions and says how much of a validation split lies near training frames.
+The official splits of nuScenes and OpenLane-V2 overlap, so a model can score by memorising the map of a place. This
+compares ego positions and reports which fraction of a validation split lies near training frames.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member, numbers
 
 RADII = (5.0, 10.0, 20.0, 50.0)
-_POSE_INTERVAL = 0.1  # seconds between the poses of a log that are looked at; the files have 170 a second
+_POSE_INTERVAL = 0.1  # seconds between the poses of a log that are compared; the files have 170 per second
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Where one recording went.
+    """Ego positions of one recording.
 
     Attributes:
         name: of the recording.
-        area: whose coordinates the positions are in, a city; positions of different areas are never compared.
+        area: city whose coordinates the positions use; positions of different areas are never compared.
         positions: (F, 2) metres.
     """
 
@@ -43,7 +43,7 @@ def read_drives(root: Path) -> list[Drive]:
     OpenLane-V2's files do not name the city: their drives all get the area "unknown".
 
     Raises:
-        UserError: neither is there, or a file cannot be read.
+        UserError: the folder holds neither, or a file cannot be read.
     """
     root = Path(root)
     files = sorted(p for p in root.glob("**/info/*.json") if not p.stem.endswith("-ls"))
@@ -68,13 +68,13 @@ def _log_drive(folder: Path) -> Drive:
 
 @dataclass(frozen=True)
 class Overlap:
-    """How near validation comes to training.
+    """Distances from validation frames to training frames.
 
     Attributes:
-        names: (V,) validation drives.
-        distances: of each, (F,) from every frame to the nearest training frame of the same area, metres; inf where
-            there is none.
-        nearest: (V,) the training drive that comes nearest, "-" where there is none.
+        names: V validation drives.
+        distances: V arrays (F,), from every frame to the nearest training frame of the same area, metres; inf if the
+            area has none.
+        nearest: V names, the training drive that comes nearest; "-" if the area has none.
     """
 
     names: tuple[str, ...]
@@ -82,7 +82,7 @@ class Overlap:
     nearest: tuple[str, ...]
 
     def rows(self) -> list[dict[str, float]]:
-        """Return, for each of `RADII`, the share of validation frames and of drives with a training frame so near."""
+        """Return the fractions of validation frames and drives with a training frame within each of `RADII`."""
         frames = np.concatenate(self.distances)
         closest = np.array([d.min() for d in self.distances])
         return [
@@ -91,10 +91,15 @@ class Overlap:
         ]
 
     def worst(self, count: int = 10) -> list[dict[str, float | str]]:
-        """Return the validation drives that overlap most at 20 m: share of their frames, least distance, with whom."""
+        """Return the validation drives that overlap most: fraction within 20 m, least distance, nearest drive."""
         rows: list[dict[str, float | str]] = [
-            {"drive": name, "frames within 20 m": float((d <= 20.0).mean()), "least m": float(d.min()), "nearest": who}
-            for name, d, who in zip(self.names, self.distances, self.nearest, strict=True)
+            {
+                "drive": name,
+                "frames within 20 m": float((d <= 20.0).mean()),
+                "least m": float(d.min()),
+                "nearest": other,
+            }
+            for name, d, other in zip(self.names, self.distances, self.nearest, strict=True)
             if np.isfinite(d.min())
         ]
         return sorted(rows, key=lambda row: (-float(row["frames within 20 m"]), float(row["least m"])))[:count]

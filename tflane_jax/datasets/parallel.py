@@ -1,9 +1,8 @@
 """Filling .npy files with the examples of a dataset, in parallel worker processes.
 
-Every example has its own slot in files laid out beforehand, so that the bytes do not depend on the number of
-workers or on the order in which they finish, and no array travels between processes. Slots are written with
-plain `write`, not through memory maps: on a full disk a write raises OSError where a memory map kills the
-process.
+Every example has its own slot in files of known layout. The bytes therefore do not depend on the number of workers or
+on the order in which they finish, and no array is sent between processes. Slots are written with plain `write`, not
+through memory maps: on a full disk a write raises OSError, a memory map kills the process.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.errors import UserError
 
-# Examples handed to a worker at a time. Divisible by scenes of 1, 2, 3, 4, 6, 8 and 12 frames, which are then
-# made once.
+# Examples per task of a worker. A multiple of 1, 2, 3, 4, 6, 8 and 12, so that scenes of that many frames are simulated
+# once.
 BLOCK = 24
 
-# What a worker runs in: one core each, and never the accelerator of the training process.
+# Environment of a worker: one core each, and never the accelerator of the training process.
 _WORKER_ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -41,7 +40,7 @@ _WORKER_ENVIRONMENT = {
 
 
 def frame_leaves(dataset: IndexedExamples, index: int) -> tuple[dict[str, np.ndarray], str]:
-    """Return the arrays of one example, with those of its `FrameInfo` under "info.", and its scene's name."""
+    """Return the arrays of one example, those of its `FrameInfo` under "info.", and the name of its scene."""
     info = dataset.info(index)
     leaves = example_leaves(dataset.example(index))
     leaves["info.timestamp_ns"] = np.asarray(info.timestamp_ns, np.int64)
@@ -56,7 +55,7 @@ def leaf_path(folder: Path, name: str) -> Path:
 
 @dataclass(frozen=True)
 class Slot:
-    """Where a leaf's file holds its values, and what each example's value is.
+    """Layout of the file of one leaf.
 
     Attributes:
         start: bytes before the first example's value.
@@ -70,7 +69,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class _Job:
-    """What every worker needs to know."""
+    """Arguments of every worker."""
 
     folder: Path
     dataset: IndexedExamples
@@ -80,18 +79,20 @@ class _Job:
 def fill(
     folder: Path, dataset: IndexedExamples, template: dict[str, np.ndarray], *, workers: int, progress: bool
 ) -> list[str]:
-    """Write every example of `dataset` below `folder`, one .npy file per leaf, and return each one's scene
-    name.
+    """Write every example of `dataset` below `folder`, one .npy file per leaf, and return their scene names.
 
     Args:
         folder: empty.
-        dataset: what to write.
+        dataset: can be pickled for the workers.
         template: `frame_leaves` of any example, for names, shapes and types.
-        workers: processes; with one, or no more examples than a block, this process does the work itself.
+        workers: processes; with one, or with at most `BLOCK` examples, this process does the work itself.
         progress: show a bar with rate and time left.
 
-    Raises OSError (disk full, no permission), whatever the dataset raises, ValueError where examples differ
-    in shape, and UserError where a worker dies.
+    Raises:
+        OSError: disk full, or no permission.
+        ValueError: examples differ in shape.
+        UserError: a worker died.
+        Exception: what the dataset raises.
     """
     count = len(dataset)
     slots = {name: _lay_out(folder, name, leaf, count) for name, leaf in template.items()}
@@ -121,7 +122,7 @@ def _lay_out(folder: Path, name: str, leaf: np.ndarray, count: int) -> Slot:
 
 
 def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, list[str]]]:
-    """Yield indices and the scene names of their examples as they are finished."""
+    """Yield indices and the scene names of their examples as blocks finish."""
     if workers <= 1:
         for index in itertools.chain.from_iterable(blocks):
             one = range(index, index + 1)
@@ -175,7 +176,7 @@ def _write_examples(job: _Job, indices: range) -> list[str]:
 
 
 def _check(job: _Job, index: int, leaves: dict[str, np.ndarray]) -> None:
-    """Raise ValueError where an example is not made like the first one."""
+    """Raise ValueError where an example has other shapes or types than the first one."""
     found = {name: (leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
     expected = {name: (slot.shape, slot.dtype) for name, slot in job.slots.items()}
     for name in sorted(found.keys() | expected.keys()):
@@ -192,14 +193,13 @@ _worker_job: _Job
 def _start_worker(job: _Job) -> None:
     global _worker_job
     _worker_job = job
-    # Ctrl-C reaches the whole process group; only the parent reacts, and ends the pool in order.
+    # Ctrl-C reaches the whole process group; only the parent handles it and shuts the pool down.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End this worker when the parent is killed, which a worker waiting for its next block would never
-    notice."""
+    """End this worker when the parent is killed: a worker that waits for its next block would not notice."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

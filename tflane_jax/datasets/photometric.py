@@ -1,9 +1,10 @@
-"""Random colours of multi-view images, as every camera system of the papers trains with, and GridMask.
+"""Photometric distortion of multi-view images, which every camera system of the papers trains with, and GridMask.
 
-Photometric distortion is mmdetection's (brightness, contrast, saturation, hue, channel swap; contrast before or after
-the colours), drawn for each view on its own, as BEVFormer does. The originals work on floats without bounds; here
-images are uint8, so that what leaves 0 to 255 is cut off. GridMask is Chen et al. 2020 in BEVFormer's setting: squares
-without rotation, one mask for all views. Source: shared specs/modules.md section 13.
+Photometric distortion is mmdetection's `PhotoMetricDistortion` (brightness, contrast, saturation, hue, channel swap;
+contrast before or after the colours), drawn for each view separately, as in BEVFormer
+(https://github.com/fundamentalvision/BEVFormer). The originals work on unbounded floats; here images are uint8, so
+values are clipped to 0 to 255. GridMask (Chen et al. 2020, https://arxiv.org/abs/2001.04086) has BEVFormer's setting:
+squares without rotation, one mask for all views.
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ from jaxtyping import Bool, UInt8
 from tflane_jax.files.images import opencv
 from tflane_jax.scene import CameraViews, Example
 
-# What a hidden square shows: the mean of ImageNet, which normalisation turns to zero as in the original.
+# Colour of a hidden square: the mean of ImageNet, which normalisation turns into zero as in the original.
 _HIDDEN = np.array([124, 116, 104], np.uint8)
 
 
 @dataclass(frozen=True)
 class PhotometricConfig:
-    """What may happen to the images of an example.
+    """Strength of the changes to the images of an example.
 
     Attributes:
-        probability: of each of the five changes, on its own.
-        brightness: most that is added to all channels, of 255.
-        contrast: least and most factor on all channels.
-        saturation: least and most factor.
-        hue: most that is added, degrees.
-        swap: probability of another order of the channels.
-        grid_mask: probability of a GridMask; the papers that use one have 0.7.
-        grid_ratio: share of its period that stays in either direction.
+        probability: of brightness, contrast, saturation and hue, independently.
+        brightness: maximum that is added to all channels, of 255.
+        contrast: minimum and maximum factor on all channels.
+        saturation: minimum and maximum factor.
+        hue: maximum that is added, degrees.
+        swap: probability of a random order of the channels.
+        grid_mask: probability of a GridMask; papers that use one have 0.7.
+        grid_ratio: fraction of the period that stays visible in either direction.
     """
 
     probability: float = 0.5
@@ -47,18 +48,18 @@ class PhotometricConfig:
 
 
 def augment_example(example: Example, config: PhotometricConfig, seed: int | Sequence[int]) -> Example:
-    """Return an example with its images changed; one without cameras as it is."""
+    """Return an example with its images changed at random; without cameras it is unchanged."""
     if example.cameras is None:
         return example
     return replace(example, cameras=augment_views(example.cameras, config, seed))
 
 
 def augment_views(cameras: CameraViews, config: PhotometricConfig, seed: int | Sequence[int]) -> CameraViews:
-    """Return images changed at random; the same seed gives the same bits. Padding and calibration stay.
+    """Return images changed at random; the same seed gives the same bits. Padding and calibration are unchanged.
 
     Args:
         cameras: numpy.
-        config: what may happen.
+        config: strength of the changes.
         seed: an integer or several, such as (run seed, step, index).
     """
     masking, *colours = np.random.default_rng(seed).spawn(1 + len(cameras.valid))
@@ -79,7 +80,7 @@ def distort(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return one RGB image with its brightness, contrast, saturation, hue and channels changed at random (a copy)."""
     cv2 = opencv()
-    # All draws are made whatever happens, so that a setting changes nothing else.
+    # All random numbers are drawn in every case, so that a setting changes only its own effect.
     changes = rng.uniform(size=4) < config.probability
     early, swapped = rng.uniform() < 0.5, rng.uniform() < config.swap
     brightness = rng.uniform(-config.brightness, config.brightness)
@@ -97,7 +98,7 @@ def distort(
         if changes[2]:
             colour[..., 1] = np.minimum(colour[..., 1] * np.float32(saturation), 1.0)
         if changes[3]:
-            colour[..., 0] += np.float32(hue)  # OpenCV goes round the circle; np.mod would take as long as all the rest
+            colour[..., 0] += np.float32(hue)  # OpenCV wraps hue around; np.mod would take as long as all other steps
         out = cv2.cvtColor(colour, cv2.COLOR_HSV2RGB)
     if changes[1] and not early:
         out *= np.float32(contrast)
@@ -111,8 +112,8 @@ def draw_grid(
 ) -> Bool[np.ndarray, "h w"] | None:
     """Return which pixels a grid of squares hides, or None for no grid.
 
-    The period is anything from 2 pixels to the image's height; a square is hidden where both the row and the column lie
-    outside the share of the period that stays.
+    The period is between 2 pixels and the image's height. A pixel is hidden if both its row and its column lie outside
+    the visible fraction of the period.
     """
     chance, period, row, column = rng.uniform(size=4)
     if chance >= config.grid_mask or height < 3:

@@ -12,9 +12,9 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv, resize
 
 HEIGHT, WIDTH = 360, 640
-"""What the network sees, pixels (specs/modules.md section 2.1)."""
+"""Size of the network's input, pixels (LSTR: Liu et al. 2021; docs/reference/lstr.md)."""
 
-# TuSimple's camera, as shares of its 1280 x 720 image. Horizon: median row in which the straight lines of a frame meet,
+# TuSimple's camera, as fractions of its 1280 x 720 image. Horizon: median row in which the straight lines of a frame meet,
 # over the 574 of 2,858 label records with three or more of them (row 238.7; 90 % within 227 to 249).
 HORIZON = 0.331
 # Assumed, not measured: TuSimple gives no calibration of its lane images, flat straight lanes look the same through any
@@ -22,7 +22,7 @@ HORIZON = 0.331
 # calibration of TuSimple's velocity benchmark as others quote it, 714 pixels of 1280.
 FOCAL = 714.15 / 1280
 
-# A focal length with which TuSimple's view would be a smaller share of a photo's width is in wrong units.
+# If TuSimple's view is a smaller fraction of the photo's width than this, the focal length is in wrong units.
 _LEAST_SEEN = 0.1
 
 
@@ -57,16 +57,16 @@ class Placement:
     height: int
 
     def to_photo(self, points: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
-        """Return points (u, v), shares of the network's image, as columns and rows of the photo."""
+        """Return points (u, v), fractions of the network's image, as columns and rows of the photo."""
         return np.asarray(points, np.float64) * (self.width, self.height) + (self.left, self.top)
 
     def to_network(self, points: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
-        """Return columns and rows of the photo as shares (u, v) of the network's image."""
+        """Return columns and rows of the photo as fractions (u, v) of the network's image."""
         return (np.asarray(points, np.float64) - (self.left, self.top)) / (self.width, self.height)
 
 
 class FittedPhoto(NamedTuple):
-    """A photo as the network sees it: image, which of its pixels show the photo (all), and the way back."""
+    """A photo as the network's input: image, valid pixels (all), and the placement that maps points back."""
 
     image: UInt8[np.ndarray, "360 640 3"]
     image_valid: Bool[np.ndarray, "360 640"]
@@ -74,11 +74,11 @@ class FittedPhoto(NamedTuple):
 
 
 def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = None) -> FittedPhoto:
-    """Return what the network should see of a photo of any size.
+    """Return the network's view of a photo of any size.
 
-    Without a camera the whole photo is stretched to the network's size, as by the reference. What is known of the
-    camera removes what TuSimple's would not have seen: a horizon cuts rows off the top until it lies where TuSimple's
-    does; a focal length shorter than TuSimple's cuts the sides and, with a horizon, the bottom.
+    Without a camera the whole photo is stretched to the network's size, as by the reference. A known camera removes
+    what TuSimple's camera would not have seen. A horizon cuts rows off the top until it has TuSimple's height; a focal
+    length shorter than TuSimple's cuts the sides and, with a horizon, the bottom.
 
     Nothing is padded and the aspect is not kept. With the published LSTR weights on TuSimple frames cut to other shapes
     (ten frames, all seen in training), padding and cutting to 16:9 did worse than stretching in most shapes (1280 x 540

@@ -1,4 +1,4 @@
-"""A vector map made ready for many frames: lanes in both flavours, packed so that a frame moves them at once."""
+"""A vector map prepared for many frames: lanes in both flavours, packed so that one product moves them all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tflane_jax.world.bev.map_samples import MapSamples, sample_map
 
 @dataclass(frozen=True)
 class PackedLines:
-    """Polylines of a map in one array, so that a frame moves all of them with one product.
+    """Polylines of a map in one array, so that one matrix product moves all of them into a frame.
 
     Attributes:
         points: (M, 3) all points, one line after the other.
@@ -59,7 +59,7 @@ class MapLanes:
     Attributes:
         lanes: L lanes, global frame.
         centerline, left, right: L packed lines each.
-        edges: (E, 2) lane numbers: the second succeeds the first.
+        edges: (E, 2) lane numbers; the second is a successor of the first.
     """
 
     lanes: tuple[LaneSegment, ...]
@@ -84,11 +84,11 @@ class MapLanes:
 
 @dataclass(frozen=True)
 class PreparedMap:
-    """A map made ready for many frames.
+    """A map prepared for many frames.
 
     Attributes:
-        segments, centerlines: both flavours of its lanes.
-        chain_of: number in `centerlines` of the chain that holds a segment id.
+        segments, centerlines: its lanes in both flavours.
+        chain_of: from segment id to the number of its merged lane in `centerlines`.
         crossings, boundaries: packed lines.
         samples: dense points for the bird's-eye-view sensor.
     """
@@ -105,11 +105,11 @@ _PREPARED: dict[tuple[int, bool], PreparedMap] = {}
 
 
 def prepare_map(vector_map: VectorMap, *, bike_lanes: bool) -> PreparedMap:
-    """Merge, pack and sample a map; remembered for as long as the map lives.
+    """Merge, pack and sample a map; the result is cached for the lifetime of the map object.
 
     Args:
-        bike_lanes: keep lanes closed to motor vehicles (unknown of the official ground truth; MapTRv2 keeps
-            them).
+        vector_map: global frame.
+        bike_lanes: whether to keep bicycle lanes. Whether the official ground truth does is unknown; MapTRv2 does.
     """
     key = (id(vector_map), bike_lanes)
     if key not in _PREPARED:

@@ -1,7 +1,7 @@
-"""Datasets too large for memory: examples are loaded by workers shortly before they are needed, with grain.
+"""Datasets too large for memory: workers load examples shortly before they are needed, with grain.
 
-Which example comes when is decided by whoever asks (`datasets.batches`: by seed and step alone), so that neither the
-number of workers nor a stop in between changes anything, and the position is the step that the checkpoint holds.
+The caller decides the order of examples (`datasets.batches`, from seed and step alone). Neither the number of workers
+nor an interruption changes it, and the position in the data is the step in the checkpoint.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from tflane_jax.errors import UserError
 
 @dataclass(frozen=True)
 class StreamingConfig:
-    """Workers; they change the speed and nothing else.
+    """Workers; they change only the speed.
 
     Attributes:
-        threads: that load examples, in each process; 0 loads when an example is asked for.
-        ahead: examples loaded ahead of the one that is needed, in each process.
-        processes: further processes to load in, for datasets whose making holds Python's lock (decoding images does
-            not). They need the caller's script to be guarded by `if __name__ == "__main__":`.
+        threads: threads that load examples, in each process; 0 loads an example on request.
+        ahead: examples loaded ahead of the current one, in each process.
+        processes: further processes that load, for datasets whose code holds Python's global lock (decoding images
+            does not). The caller's script must then be guarded by `if __name__ == "__main__":`.
     """
 
     threads: int = 4
@@ -32,14 +32,14 @@ class StreamingConfig:
 
 
 class Request(NamedTuple):
-    """One example that is wanted: its index, and the key (run seed, step, place in the batch) of its augmentation."""
+    """A requested example: its index, and the key (run seed, step, place in the batch) of its augmentation."""
 
     index: int
     key: tuple[int, int, int]
 
 
 Prepare = Callable[[Any, tuple[int, int, int]], Any]
-"""(an example, numpy, and the run's seed, the step and the place in the batch) -> what the step sees of it."""
+"""Augmentation: (example in numpy, (run seed, step, place in the batch)) -> example for the training step."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Streamed:
     """A dataset that is read while it is used.
 
     Attributes:
-        dataset: its examples all have the same shapes; it is called by several threads, or sent to processes (pickle).
+        dataset: its examples all have the same shapes; several threads call it, or it is pickled for processes.
         config: workers.
-        select: what to keep of an example, None is all of it.
+        select: example -> the part of it to keep; None keeps all.
     """
 
     dataset: IndexedExamples
@@ -60,20 +60,21 @@ class Streamed:
         return len(self.dataset)
 
     def example(self, index: int) -> Any:
-        """Return one example, of it what is selected."""
+        """Return the selected part of one example."""
         example = self.dataset.example(index)
         return example if self.select is None else self.select(example)
 
     def stream(self, requests: Callable[[int], Request], count: int, prepare: Prepare | None = None) -> Generator[Any]:
-        """Yield the examples that requests 0 to count - 1 name, in this order.
+        """Yield the examples of requests 0 to count - 1, in this order.
 
         Args:
-            requests: called in workers.
-            count: how many.
+            requests: number -> request; called in workers.
+            count: number of examples.
             prepare: applied to every example, in the worker that loads it.
 
         Raises:
-            UserError: grain is not installed, or settings that cannot work; and what `dataset.example` raises.
+            UserError: grain is not installed, or the settings are out of range.
+            Exception: what `dataset.example` raises.
         """
         if min(self.config.threads, self.config.processes) < 0 or self.config.ahead < 1:
             raise UserError(f"{self.config}: threads and processes must be at least 0, ahead at least 1")
@@ -106,7 +107,7 @@ class _Load:
 
 
 def _mark_flags_as_parsed() -> None:
-    """Let grain start processes in a program that has no absl flags: it asks for one of its own."""
+    """Let grain start processes in a program that does not parse absl flags: grain reads a flag of its own."""
     from absl import flags
 
     if not flags.FLAGS.is_parsed():

@@ -1,6 +1,7 @@
-"""Camera images made ready for a model: cut, resized, padded to one size; intrinsics and boxes follow.
+"""Camera images prepared for a model: cropped, resized and padded to one size, with intrinsics and boxes to match.
 
-Presets are the papers' (specs/modules.md section 13).
+The presets are those of the published code: TopoNet (https://github.com/OpenDriveLab/TopoNet), OpenLane-V2's baseline
+(https://github.com/OpenDriveLab/OpenLane-V2) and SMERF (https://github.com/NVlabs/SMERF).
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from tflane_jax.geometry.cameras import crop_intrinsics, resize_intrinsics
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """What happens to the images of every frame, in this order.
+    """Cropping and scaling of the images of every frame, in this order.
 
     Attributes:
-        front_rows: rows [first, last) of the front image that stay; all where it is None.
-        front_size: width and height to which the front image is stretched; its own where it is None.
+        front_rows: rows [first, last) of the front image that are kept; None keeps all.
+        front_size: width and height to which the front image is stretched; None does not stretch it.
         scale: factor on width and height of every image, rounded down to whole pixels.
-        divisor: the array that holds all images has a width and a height divisible by it.
+        divisor: width and height of the array that holds all images are multiples of it.
     """
 
     front_rows: tuple[int, int] | None = None
@@ -42,11 +43,11 @@ BASELINE_LARGE = ImageConfig(front_size=(2048, 1550))
 
 @dataclass(frozen=True)
 class ImageFit:
-    """What happens to one camera's images.
+    """Cropping and scaling of one camera's images.
 
     Attributes:
         source: width and height of the files, pixels.
-        rows: that stay.
+        rows: rows [first, last) of the files that are kept.
         size: width and height of the result, pixels.
     """
 
@@ -60,7 +61,7 @@ class ImageFit:
         return self.size[0] / self.source[0], self.size[1] / (self.rows[1] - self.rows[0])
 
     def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Return the image; reductions to less than half are averaged over areas, others bilinear."""
+        """Return the resized image: area averages below half size, else bilinear."""
         cv2 = opencv()
         kind = cv2.INTER_AREA if min(self.scale) < 0.5 else cv2.INTER_LINEAR
         part = image[self.rows[0] : self.rows[1]]
@@ -71,17 +72,17 @@ class ImageFit:
         return resize_intrinsics(crop_intrinsics(intrinsics, (0.0, float(self.rows[0]))), self.scale)
 
     def boxes(self, boxes: Float[np.ndarray, "e 2 2"]) -> Float[np.ndarray, "e 2 2"]:
-        """Return boxes (top-left and bottom-right corners) in the result, cut at its border.
+        """Return boxes (top-left and bottom-right corners) in the result, clipped at its border.
 
-        One that lies wholly outside comes out without an area.
+        A box that lies wholly outside gets zero area.
         """
         return np.clip((boxes - (0.0, self.rows[0])) * self.scale, 0.0, self.size)
 
 
 def fit_image(width: int, height: int, config: ImageConfig, *, front: bool) -> ImageFit:
-    """Return what happens to the images of a camera whose files have this size.
+    """Return the cropping and scaling for a camera whose files have this size.
 
-    Raises UserError where they have not the rows that should stay, or nothing would remain.
+    Raises UserError if the files lack the rows to keep, or no pixel would remain.
     """
     rows = (0, height)
     if front and config.front_rows is not None:

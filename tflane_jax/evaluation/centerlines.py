@@ -34,7 +34,7 @@ def detections_from_prediction(
 ) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
-    No score threshold; a traffic element is of the attribute that its query finds likeliest.
+    No score threshold. The attribute of a traffic element is the one with the highest score of its query.
     """
     scores = expit(np.asarray(prediction.logits)).max(-1)
     order = np.argsort(-scores, kind="stable")

@@ -26,7 +26,7 @@ def segment_truth(
         segments: lane segments.
         areas: crossings and road boundaries.
         elements: traffic elements; None leaves them out.
-        lanes: centerlines that the rows of `elements.lane` stand for. A segment is governed by the elements of the
+        lanes: centerlines, the rows of `elements.lane`. A segment is governed by the elements of the
             centerlines on which it lies. None: the rows of `elements.lane` are the segments.
 
     Raises:

@@ -1,4 +1,7 @@
-"""Predicted lane curves as what is measured, written and drawn: points in the image (specs/modules.md section 2.6)."""
+"""Predicted lane shapes as points in the image, for TuSimple's metric, files and pictures (host, numpy, one image).
+
+Decoding as by LSTR (Liu et al. 2021): docs/reference/lstr.md.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import softmax
 
-from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.files.tusimple import NO_POINT, RowLanes
 from tflane_jax.geometry.lane_shapes import curve_columns
 from tflane_jax.scene import CurvePrediction
-
-_NO_POINT = -2.0  # TuSimple's mark of a row without a point
 
 
 def lane_scores(prediction: CurvePrediction) -> Float[np.ndarray, " q"]:
@@ -19,13 +20,13 @@ def lane_scores(prediction: CurvePrediction) -> Float[np.ndarray, " q"]:
 
 
 def detected(prediction: CurvePrediction) -> Bool[np.ndarray, " q"]:
-    """Return which queries are lanes: those of which it is likelier than not."""
+    """Return which queries are lanes: those whose lane logit is the larger one."""
     logits = np.asarray(prediction.logits)
     return logits[..., 1] > logits[..., 0]
 
 
 def left_to_right(prediction: CurvePrediction) -> Int[np.ndarray, " l"]:
-    """Return the detected queries by the column in which their lanes end below."""
+    """Return the detected queries, ordered by the column of their lower end."""
     queries = np.flatnonzero(detected(prediction))
     curves = np.asarray(prediction.curves, np.float64)[queries]
     ends = curve_columns(curves[:, 2:], curves[:, 1:2])[:, 0]
@@ -33,7 +34,7 @@ def left_to_right(prediction: CurvePrediction) -> Int[np.ndarray, " l"]:
 
 
 def row_lanes(prediction: CurvePrediction, rows: Float[np.ndarray, " h"], *, height: float, width: float) -> RowLanes:
-    """Return the detected lanes as x at image rows, -2 outside each lane's extent; nothing is cut off at the borders.
+    """Return the detected lanes as x at image rows, -2 outside each lane's extent; columns may lie outside the image.
 
     Args:
         prediction: one example, one layer, numpy.
@@ -41,10 +42,10 @@ def row_lanes(prediction: CurvePrediction, rows: Float[np.ndarray, " h"], *, hei
         height, width: of the image, pixels.
     """
     curves = np.asarray(prediction.curves)[detected(prediction)]
-    share = np.asarray(rows, np.float32) / height
-    columns = curve_columns(curves[:, 2:], share[None]) * width
-    inside = (share >= curves[:, :1]) & (share <= curves[:, 1:2])
-    return RowLanes(np.where(inside, columns, _NO_POINT))
+    fraction = np.asarray(rows, np.float32) / height
+    columns = curve_columns(curves[:, 2:], fraction[None]) * width
+    inside = (fraction >= curves[:, :1]) & (fraction <= curves[:, 1:2])
+    return RowLanes(np.where(inside, columns, NO_POINT))
 
 
 def pixel_points(

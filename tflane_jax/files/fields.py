@@ -1,4 +1,7 @@
-"""Reading fields of untrusted files: each function returns a checked array or says what is wrong, and where."""
+"""Fields of untrusted files, checked as they are read.
+
+Every function returns the value or raises UserError. `where` names the place in the file for the message.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from tflane_jax.files.plain_pickle import load_plain_pickle
 
 
 def load_file(path: Path) -> Any:
-    """Return what a .json or a .pkl file holds; raises UserError that names the file."""
+    """Return the content of a .json or .pkl file; raises UserError that names the file."""
     if path.suffix == ".json":
         return load_json(path)
     if path.suffix in (".pkl", ".pickle"):
@@ -23,7 +26,7 @@ def load_file(path: Path) -> Any:
 
 
 def load_json(path: Path) -> Any:
-    """Return what a JSON file holds; raises UserError that names the file and the place of the mistake."""
+    """Return the content of a JSON file; raises UserError that names the file and the line of the mistake."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -53,9 +56,9 @@ def items(record: Any, name: str, where: str) -> Sequence[Any]:
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """Return an array of finite numbers (float32 stays, all else becomes float64); None in `shape` is any size.
+    """Return an array of finite numbers: float32 stays, every other type becomes float64.
 
-    An empty list counts as an empty array of any shape that has a zero or an open size.
+    None in `shape` is any size. An empty list fits every shape in which some size is 0 or None.
     """
     try:
         array = np.asarray(value)

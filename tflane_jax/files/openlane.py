@@ -1,7 +1,7 @@
-"""OpenLane-V2's JSON: which frame a file describes and what an annotation holds, read with a check of every field.
+"""OpenLane-V2's JSON: the frame that a file describes and the content of its annotation, every field checked.
 
-Scoring reads truth and submissions with it, `datasets.openlane_v2` examples. Source: shared specs/data_formats.md
-section 2.2.
+`scoring` reads annotations and submissions with it, `datasets.openlane_v2` examples. Format:
+docs/reference/data_formats.md, section 2.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ DENSE_POINTS = 201
 
 
 class FieldNames(NamedTuple):
-    """What a task calls its fields; `suffix` ends the names of its annotation files."""
+    """Names of the fields of a task; `suffix` ends the names of its annotation files."""
 
     lanes: str
     line: str
@@ -35,7 +35,7 @@ SEGMENT = FieldNames("lane_segment", "centerline", "topology_lsls", "topology_ls
 
 
 class FrameKey(NamedTuple):
-    """Which frame: OpenLane-V2's identifier."""
+    """OpenLane-V2's identifier of a frame."""
 
     split: str
     segment: str
@@ -46,12 +46,12 @@ class FrameKey(NamedTuple):
 
     @property
     def scene(self) -> str:
-        """The drive that the frame comes from."""
+        """The drive to which the frame belongs."""
         return f"{self.split}/{self.segment}"
 
 
 def read_lines(record: Any, things: str, field: str, where: str) -> list[Float[np.ndarray, "_ 3"]]:
-    """Return one line of each of an annotation's lanes, segments or areas."""
+    """Return one line (n, 3), metres, of each lane, segment or area of an annotation."""
     lines = []
     for i, thing in enumerate(items(record, things, where)):
         at = f"{where}: {things}[{i}]"
@@ -60,7 +60,7 @@ def read_lines(record: Any, things: str, field: str, where: str) -> list[Float[n
 
 
 def read_labels(record: Any, things: str, field: str, low: int, high: int, where: str) -> Int[np.ndarray, " n"]:
-    """Return a whole number of each of an annotation's lanes, segments, areas or elements."""
+    """Return one whole number, `low` to `high`, of each lane, segment, area or element of an annotation."""
     labels = []
     for i, thing in enumerate(items(record, things, where)):
         at = f"{where}: {things}[{i}]"
@@ -69,7 +69,7 @@ def read_labels(record: Any, things: str, field: str, low: int, high: int, where
 
 
 def read_matrix(record: Any, field: str, shape: tuple[int, int], where: str) -> Float[np.ndarray, "n m"]:
-    """Return a topology matrix."""
+    """Return a topology matrix of the given shape."""
     return numbers(member(record, field, where), shape, f"{where}: {field}")
 
 
@@ -84,12 +84,12 @@ def read_elements(record: Any, where: str) -> tuple[Float[np.ndarray, "e 2 2"], 
 
 
 def read_areas(record: Any, where: str) -> tuple[list[Float[np.ndarray, "_ 3"]], Int[np.ndarray, " a"]]:
-    """Return lines and categories of crossings and boundaries."""
+    """Return lines and categories (1 crossing, 2 boundary) of the areas."""
     return read_lines(record, "area", "points", where), read_labels(record, "area", "category", 1, 2, where)
 
 
 def as_identifier(identifier: Any, where: str) -> FrameKey:
-    """Return the frame that a collected file's key names."""
+    """Return a key of a collected file as a frame; raises UserError if it is none."""
     if not isinstance(identifier, tuple) or len(identifier) != 3:
         raise UserError(f"{where}: {identifier!r:.80} is no frame, expected (split, segment, timestamp)")
     return FrameKey(*map(str, identifier))

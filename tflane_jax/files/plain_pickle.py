@@ -1,8 +1,8 @@
-"""Pickles of plain data, read without running anything that they name.
+"""Pickles of plain data, read without running code from the file.
 
-A pickle is a program: loading an untrusted one with `pickle.load` lets it do whatever it wants. Here only containers,
-numbers, strings and numpy arrays come out; a file that asks for anything else is refused before it gets it.
-`convert.torch_file` adds to these what PyTorch's checkpoints are made of.
+`pickle.load` runs whatever functions an untrusted file names. This reader allows containers, numbers, strings and numpy
+arrays, and refuses a file that names anything else before it is called. `convert.torch_file` also allows the parts of
+PyTorch's checkpoints.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from tflane_jax.errors import UserError
 
 
 def load_plain_pickle(path: Path) -> Any:
-    """Return what a pickle file of plain data holds.
+    """Return the content of a pickle file of plain data.
 
     Raises:
-        UserError: there is no such file, it is no pickle or cut short, or it names anything but containers, numbers,
+        UserError: the file does not exist, is no pickle, is truncated, or names anything but containers, numbers,
             strings and numpy arrays.
     """
     try:
@@ -44,13 +44,13 @@ def load_plain_pickle(path: Path) -> Any:
 
 
 class Refused(Exception):
-    """The name of something that the data does not need."""
+    """A pickle names something that is not allowed; the message is the name."""
 
 
 class Sealed(NamedTuple):
-    """A function that a pickle may call and cannot change.
+    """A function that a pickle may call but not change.
 
-    A pickle may set attributes of whatever it holds, and functions and classes written in Python would keep them.
+    A pickle can set attributes of the objects that it names. A plain Python function or class would keep them.
     """
 
     function: Callable[..., Any]
@@ -61,10 +61,10 @@ class Sealed(NamedTuple):
 
 
 class RestrictedUnpickler(pickle.Unpickler):
-    """An unpickler that knows a few names.
+    """An unpickler that resolves only the allowed names.
 
     Attributes:
-        allowed: what each (module, name) stands for: classes written in C, `Sealed` functions, plain values.
+        allowed: values by (module, name): classes written in C, `Sealed` functions, plain values.
     """
 
     def __init__(self, file: IO[bytes], allowed: Mapping[tuple[str, str], Any], *, encoding: str = "ASCII") -> None:
@@ -73,7 +73,7 @@ class RestrictedUnpickler(pickle.Unpickler):
         self.allowed = allowed
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return what stands for a name; raise `Refused` for one that is not allowed."""
+        """Return the value of a name; raise `Refused` for one that is not allowed."""
         try:
             return self.allowed[module, name]
         except KeyError:
@@ -85,14 +85,14 @@ class RestrictedUnpickler(pickle.Unpickler):
 
 
 def _array(kind: type, shape: Any, code: Any) -> np.ndarray:
-    """Make the empty array that the file then fills; `shape` and `code` are placeholders there, and not believed."""
+    """Return the empty array that the file then fills; `shape` and `code` of the file are placeholders, so ignored."""
     if kind != _NDARRAY:
         raise Refused(f"an array of type {reprlib.repr(kind)}")
     return np.ndarray.__new__(np.ndarray, (0,), "b")
 
 
 def _bytes(text: str | bytes = b"", encoding: str = "latin1") -> bytes:
-    """Return bytes as the older protocols write them; a number, which asks for so many zeros, is refused."""
+    """Return bytes as the older protocols write them; a number, which would allocate as many zeros, is refused."""
     if not isinstance(text, (str, bytes)) or encoding.replace("-", "") != "latin1":
         raise Refused(f"bytes made of {reprlib.repr(text)} by {reprlib.repr(encoding)}")
     return text.encode("latin1") if isinstance(text, str) else text
@@ -103,7 +103,7 @@ def _bytearray(text: str | bytes = b"", encoding: str = "latin1") -> bytearray:
 
 
 def _dtype(code: str, align: bool = False, copy: bool = True) -> np.dtype:
-    """Return a type of its own, which the file then completes."""
+    """Return a new type, which the file then completes."""
     return np.dtype(code, align=bool(align), copy=True)
 
 
@@ -112,11 +112,11 @@ def _scalar(dtype: np.dtype, data: bytes = b"") -> Any:
 
 
 def _from_buffer(buffer: Any, dtype: np.dtype, shape: tuple[int, ...], order: Literal["C", "F"]) -> np.ndarray:
-    """Return an array that protocol 5 keeps inside the file."""
+    """Return an array stored inside the file, as by protocol 5."""
     return np.frombuffer(buffer, dtype).reshape(shape, order=order)
 
 
-# Stands for the class, which called with a shape would take as much memory.
+# Not the class itself: a file could call it with a shape of any size.
 _NDARRAY = "numpy.ndarray"
 _NUMPY: dict[str, dict[str, Callable[..., Any]]] = {
     "multiarray": {"_reconstruct": _array, "scalar": _scalar},
@@ -134,7 +134,7 @@ PLAIN: Mapping[tuple[str, str], Any] = {
     ("numpy", "dtype"): Sealed(_dtype),
     ("collections", "OrderedDict"): collections.OrderedDict,
     ("_codecs", "encode"): Sealed(_bytes),
-    # Python 2 and 3, numpy 1 and 2 keep the same things in different places.
+    # Python 2 and 3, numpy 1 and 2 have them in different modules.
     **{(module, name): value for module in ("builtins", "__builtin__") for name, value in _BUILTINS.items()},
     **{
         (f"numpy.{core}.{module}", name): Sealed(value)
@@ -143,4 +143,4 @@ PLAIN: Mapping[tuple[str, str], Any] = {
         for name, value in names.items()
     },
 }
-"""What plain data may name."""
+"""Names allowed in plain data."""

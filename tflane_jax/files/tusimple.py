@@ -16,6 +16,9 @@ from jaxtyping import Float
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, member, numbers
 
+NO_POINT = -2.0
+"""x of a row in which a lane has no point."""
+
 
 @dataclass(frozen=True)
 class RowLanes:

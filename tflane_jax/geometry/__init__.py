@@ -1,6 +1,7 @@
-"""Ground floor: poses, polylines, ranges and cameras as pure array functions (no learning, no I/O).
+"""Poses, polylines, ranges and cameras as pure array functions, without parameters and without files.
 
-Functions take numpy or jax arrays and answer in kind, so that the same line runs in float64 on the host and under jit.
+Functions return arrays of the library of their arguments, numpy or jax. The same line runs in float64 on the host and
+under jit.
 """
 
 from tflane_jax.geometry.cameras import (

@@ -1,7 +1,7 @@
-"""Bezier curves through a polyline, as constant matrices: OpenLane-V2's baseline describes centerlines so.
+"""Bezier curves fitted to polylines by constant matrices.
 
-Reference: specs/modules.md section 13 ("5 Bezier control points, end points fixed"). The points of a polyline stand at
-equal steps of the curve's parameter.
+Reference: the centerline baseline of OpenLane-V2, which predicts 5 control points and fixes the end points. The points
+of a polyline have equally spaced parameters on the curve.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 
 def bezier_basis(points: int, controls: int) -> Float[np.ndarray, "p k"]:
-    """Return the matrix that makes `points` points of a curve from its `controls` control points (Bernstein)."""
+    """Return the Bernstein matrix from `controls` control points to `points` points of the curve."""
     t, degree = np.linspace(0.0, 1.0, points)[:, None], controls - 1
     order = np.arange(controls)[None]
     ways = np.array([math.comb(degree, k) for k in range(controls)])[None]
@@ -21,10 +21,10 @@ def bezier_basis(points: int, controls: int) -> Float[np.ndarray, "p k"]:
 
 
 def bezier_fit(points: int, controls: int) -> Float[np.ndarray, "k p"]:
-    """Return the matrix that fits control points to a polyline: its ends stay, the others by least squares.
+    """Return the least-squares matrix from a polyline to control points; the first and the last are its ends.
 
     Raises:
-        ValueError: fewer points than control points, or fewer than two of those.
+        ValueError: fewer points than control points, or fewer than two control points.
     """
     if not 2 <= controls <= points:
         raise ValueError(f"{points} points do not determine {controls} control points")

@@ -14,17 +14,20 @@ from jaxtyping import Bool, Float
 from tflane_jax.geometry.namespace import AnyArray, ArrayT, namespace
 from tflane_jax.geometry.poses import invert_pose, transform_points
 
+MIN_DEPTH = 1e-5
+"""Least depth of a point in front of a camera, metres (BEVFormer)."""
+
 
 def project(
     points: Float[AnyArray, "*b k 3"],
     intrinsics: Float[AnyArray, "*b 3 3"],
     camera_from_ego: Float[AnyArray, "*b 4 4"],
-    min_depth: float = 1e-5,
+    min_depth: float = MIN_DEPTH,
 ) -> tuple[Float[Any, "*b k 2"], Float[Any, "*b k"], Bool[Any, "*b k"]]:
     """Return pixel and depth (metres along the optical axis) of points in the ego frame, and whether they are valid.
 
-    Valid means a depth above `min_depth`, in front of the camera; whether the pixel lies in the image is for
-    `inside_image`. The pixel of a point that is not valid is finite and means nothing. The default is BEVFormer's.
+    A point is valid if its depth exceeds `min_depth` (default: BEVFormer's); `inside_image` checks the pixel. The pixel
+    of an invalid point is finite and arbitrary.
     """
     xp = namespace(points, intrinsics, camera_from_ego)
     local = transform_points(camera_from_ego, points)
@@ -41,9 +44,9 @@ def ground_points(
     camera_from_ego: Float[AnyArray, "*b 4 4"],
     height: float = 0.0,
 ) -> tuple[Float[Any, "*b k 3"], Bool[Any, "*b k"]]:
-    """Return where the rays of pixels meet the plane z = `height` of the ego frame (metres), and whether they do.
+    """Return where the rays of pixels meet the plane z = `height` of the ego frame, metres, and which of them do.
 
-    A ray along the plane, or away from it (above the horizon), is not valid; its point is finite and means nothing.
+    A ray parallel to the plane or away from it (above the horizon) is not valid; its point is finite and arbitrary.
     """
     xp = namespace(pixels, intrinsics, camera_from_ego)
     ego_from_camera = invert_pose(camera_from_ego)
@@ -53,13 +56,13 @@ def ground_points(
     origin = ego_from_camera[..., None, :3, 3]
     slope, drop = rays[..., 2], height - origin[..., 2]
     valid = slope * drop > 0.0
-    reach = xp.where(valid, drop, 0.0) / xp.where(valid, slope, 1.0)
-    ground = origin[..., :2] + reach[..., None] * rays[..., :2]
+    distance = xp.where(valid, drop, 0.0) / xp.where(valid, slope, 1.0)
+    ground = origin[..., :2] + distance[..., None] * rays[..., :2]
     return xp.concatenate([ground, xp.full_like(ground[..., :1], height)], -1), valid
 
 
 def inside_image(pixels: Float[ArrayT, "*b 2"], width: int, height: int) -> Bool[ArrayT, "*b"]:
-    """Return whether pixels lie in an image of this size; the left and top border do, the right and bottom do not."""
+    """Return whether pixels lie in an image of this size, left and top border included, right and bottom excluded."""
     u, v = pixels[..., 0], pixels[..., 1]
     return (u >= 0) & (u < width) & (v >= 0) & (v < height)
 

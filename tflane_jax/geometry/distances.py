@@ -1,7 +1,7 @@
 """Distances between polylines: discrete Frechet and Chamfer, over vertices as the lane metrics define them.
 
 Leading axes broadcast, so one call serves aligned pairs (`f(a, b)`) and all pairs (`f(a[:, None], b[None])`); numpy
-arrays in float64 on the host, jax arrays under jit. Source: shared specs/metrics.md section 1; Eiter & Mannila,
+arrays in float64 on the host, jax arrays under jit. Source: docs/reference/metrics.md, section 1; Eiter & Mannila,
 Computing Discrete Frechet Distance (1994), for the recursion.
 """
 
@@ -23,9 +23,8 @@ def pad_lines(
 ) -> Float[np.ndarray, "l n d"]:
     """Stack ragged polylines into one float64 array by repeating each line's last vertex (numpy).
 
-    The repetition changes neither the discrete Frechet distance (no coupling gets longer or shorter by standing
-    still) nor the nearest vertex to a point; it does change vertex means, so Chamfer needs the true counts.
-    Raises ValueError for a line without points.
+    The repetition changes neither the discrete Frechet distance nor the vertex nearest to a point. It does change means
+    over vertices, so the Chamfer distance needs the true counts. Raises ValueError for a line without points.
     """
     if len(lines) == 0:
         return np.zeros((0, 1, dims))

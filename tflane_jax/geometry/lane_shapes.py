@@ -1,6 +1,6 @@
 """The lane shape model of the LSTR family: a cubic on flat ground and its image in a pitched camera.
 
-GTN paper Eq. (5) to (8), with its misprints read as LSTR states them (Liu et al. 2020). On the ground, X to the right
+GTN paper Eq. (5) to (8); its misprints are corrected by LSTR (Liu et al. 2021). On the ground, X to the right
 and Z ahead of the camera, a lane line is
 
     X = k Z^3 + m Z^2 + n Z + b                                                                                 (5)
@@ -9,8 +9,8 @@ and its image is a curve u(v), u to the right and v down from the principal poin
 
     u = k'' / (v - f'')^2 + m'' / (v - f'') + n' + b'' v - b'''                                                 (7)
 
-The paper reaches (7) by turning image points with the camera, (u, v, f) -> (u', v', f'), and leaving out the division
-by f' / f (Eq. 6, `tilted_image_curve`), which is right for small pitch only. Projecting the ground curve through a
+The paper derives (7) by rotating image points with the camera, (u, v, f) -> (u', v', f'), without the division by
+f' / f (Eq. 6, `tilted_image_curve`). That holds for small pitch only. Projecting the ground curve through a
 pinhole at any pitch gives the same family of curves, with other coefficients: `pinhole_image_curve`.
 """
 
@@ -69,7 +69,7 @@ def flat_image_curve(curve: GroundCurve, focal: float, height: float) -> ImageCu
 
 
 def tilted_image_curve(flat: ImageCurve, focal: float, pitch: float) -> ImageCurve:
-    """Return the curve on the tilted image plane as the paper has it, Eq. (6) in the form of Eq. (7).
+    """Return the curve on the tilted image plane by the paper's Eq. (6), in the form of Eq. (7).
 
     Args:
         flat: of a level camera.
@@ -91,8 +91,8 @@ def tilted_image_curve(flat: ImageCurve, focal: float, pitch: float) -> ImageCur
 def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: float) -> ImageCurve:
     """Return the exact image of a ground curve in a pinhole camera at any pitch; arguments as above.
 
-    A pixel's ray meets the ground at Z = h z / y and X = h u / y, where y = v cos(phi) - f sin(phi) is how fast it
-    falls and z = f cos(phi) + v sin(phi) = f / cos(phi) + y tan(phi) how fast it moves ahead. With (5),
+    A pixel's ray meets the ground at Z = h z / y and X = h u / y. Its downward component is
+    y = v cos(phi) - f sin(phi), its forward component z = f cos(phi) + v sin(phi) = f / cos(phi) + y tan(phi). With (5),
 
         u = (k h^2 z^3 / y^2) + (m h z^2 / y) + n z + b y / h,
 
@@ -118,7 +118,7 @@ def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: 
 
 
 def normalised_image_curve(curve: ImageCurve, centre: tuple[float, float], size: tuple[float, float]) -> ImageCurve:
-    """Return the same curve with rows and columns as shares of the image, counted from its top-left corner.
+    """Return the same curve with rows and columns as fractions of the image, counted from its top-left corner.
 
     Args:
         curve: in pixels from the principal point.
@@ -144,7 +144,7 @@ def curve_columns(
     Args:
         curves: coefficients, last axis.
         rows: v, for each curve.
-        least: at rows nearer to the horizon f'' than this, the curve is continued as if they were this far below it.
+        least: rows nearer to the horizon f'' than this count as this far below it.
     """
     xp = namespace(curves)
     k, f, m, n, b, offset = (curves[..., i, None] for i in range(6))

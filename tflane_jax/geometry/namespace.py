@@ -1,4 +1,4 @@
-"""Which array library a function's arguments belong to."""
+"""The array library of a function's arguments, numpy or jax."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 AnyArray = np.ndarray | jax.Array
-# For functions that answer in kind.
+# For functions that return the type of their arguments.
 ArrayT = TypeVar("ArrayT", np.ndarray, jax.Array)
 
 

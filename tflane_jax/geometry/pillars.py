@@ -1,4 +1,7 @@
-"""Pillars over the cells of a bird's-eye-view grid, and where cameras see them (specs/modules.md section 4)."""
+"""Pillars of points over the cells of a BEV grid and their projection into cameras.
+
+Reference: Li et al. 2022 (BEVFormer), section 3.3.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.geometry.cameras import MIN_DEPTH
 from tflane_jax.geometry.namespace import AnyArray, namespace
 from tflane_jax.geometry.poses import transform_points
 from tflane_jax.geometry.ranges import BevGrid
-
-# Least depth of a point in front of a camera, metres (BEVFormer).
-MIN_DEPTH = 1e-5
 
 
 def cell_points(grid: BevGrid) -> Float[np.ndarray, "q 2"]:
@@ -23,7 +24,7 @@ def cell_points(grid: BevGrid) -> Float[np.ndarray, "q 2"]:
 
 
 def pillar_points(grid: BevGrid, anchors: int) -> Float[np.ndarray, "q d 3"]:
-    """Return the points of the pillars over the cells, in [0, 1]: D heights from half a metre inside the z range."""
+    """Return the points of the pillars in [0, 1]: D heights, the first and last 0.5 m inside the z range."""
     height = grid.range.size()[2]
     z = np.linspace(0.5, height - 0.5, anchors) / height
     cells = cell_points(grid)
@@ -37,20 +38,20 @@ def project_pillars(
     camera_from_ego: Float[AnyArray, "v 4 4"],
     size: Int[AnyArray, "v 2"],
 ) -> tuple[Float[Any, "v q d 2"], Bool[Any, "v q d"]]:
-    """Return where pillar points (metres, ego frame) lie in each image, as shares of its size, and whether inside.
+    """Return where pillar points (metres, ego frame) lie in each image, as fractions of its size, and whether inside.
 
     Args:
         points: pillars.
         intrinsics, camera_from_ego: of the cameras.
         size: width and height of each camera's own image, pixels.
 
-    A point behind a camera is projected with the least depth, as BEVFormer does: far outside, all but never inside.
+    A point behind a camera is projected with the least depth, as by BEVFormer, which puts it far outside the image.
     """
     xp = namespace(points, intrinsics, camera_from_ego)
     q, d = points.shape[:2]
     local = transform_points(camera_from_ego, xp.broadcast_to(points.reshape(1, q * d, 3), (len(size), q * d, 3)))
     depth = local[..., 2:]
     image = (local @ xp.swapaxes(intrinsics, -1, -2))[..., :2]
-    share = image / xp.maximum(depth, MIN_DEPTH) / size[:, None].astype(image.dtype)
-    inside = (depth > MIN_DEPTH) & (share > 0.0) & (share < 1.0)
-    return share.reshape(-1, q, d, 2), inside.all(-1).reshape(-1, q, d)
+    fraction = image / xp.maximum(depth, MIN_DEPTH) / size[:, None].astype(image.dtype)
+    inside = (depth > MIN_DEPTH) & (fraction > 0.0) & (fraction < 1.0)
+    return fraction.reshape(-1, q, d, 2), inside.all(-1).reshape(-1, q, d)

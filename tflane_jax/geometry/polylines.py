@@ -14,7 +14,7 @@ from tflane_jax.geometry.ranges import PerceptionRange
 def arc_length(points: Float[AnyArray, "n d"]) -> Float[np.ndarray, " n"]:
     """Return the **ground plane** (x, y) distance from the first point to each point along the line, metres.
 
-    Lengths are 2-D even for 3-D lines, as in the OpenLane-V2 tools (specs/metrics.md section 6).
+    Lengths are 2-D even for 3-D lines, as in the OpenLane-V2 tools.
     """
     steps = np.linalg.norm(np.diff(np.asarray(points)[:, :2], axis=0), axis=-1)
     return np.concatenate([[0.0], np.cumsum(steps)])
@@ -45,8 +45,7 @@ def sample_at(points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"]) 
     segment = np.minimum(segment, last)
     start, length = along[segment], along[segment + 1] - along[segment]
     weight = ((distances - start) / length)[:, None]
-    # The form a + w (b - a) keeps w = 0 exact; w = 1 is set by hand so that both ends are the line's own
-    # points.
+    # a + w (b - a) is exact for w = 0 but not for w = 1; both ends must be the line's own points.
     out = points[segment] + weight * (points[segment + 1] - points[segment])
     return np.where(weight == 1.0, points[segment + 1], out)
 
@@ -66,8 +65,8 @@ def resample_lines(lines: Sequence[Float[AnyArray, "_ d"]], count: int) -> Float
     along = np.concatenate([[0.0], np.cumsum(steps)])
     distances = along[first][:, None] + (along[last] - along[first])[:, None] * np.linspace(0.0, 1.0, count)
     distances[:, -1] = along[last]
-    # The joint of two lines has one distance for both; the clip returns each query to its own line, and to
-    # its last segment that has a length.
+    # The end of a line and the start of the next have the same distance: the clip keeps each query on its own line,
+    # and on its last segment that has a length.
     start = np.searchsorted(along, distances, side="right") - 1
     final = np.maximum(np.searchsorted(along, along[last], side="left") - 1, first)
     start = np.clip(start, first[:, None], final[:, None])
@@ -126,7 +125,7 @@ def _crossing(a: np.ndarray, b: np.ndarray, axis: int, border: float) -> np.ndar
 
 def _on_segment(a: np.ndarray, b: np.ndarray, t: np.ndarray, range_: PerceptionRange) -> np.ndarray:
     point = a + t[:, None] * (b - a)
-    # Rounding must leave a cut end neither a hair outside the box nor a hair inside, nor move a vertex of the line.
+    # Despite rounding, a cut end lies exactly on the border and a vertex of the line stays where it is.
     for axis, borders in enumerate((range_.x, range_.y)):
         point[:, axis] = np.clip(point[:, axis], *borders)
         for border in borders:

@@ -1,4 +1,4 @@
-"""The perceived box around the vehicle and the bird's-eye-view grid laid over it."""
+"""The perception range around the vehicle and its bird's-eye-view grid."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class PerceptionRange:
     z: tuple[float, float] = (-2.3, 1.7)
 
     def low(self, dims: int = 3) -> tuple[float, ...]:
-        """Lower corner of the first `dims` axes."""
+        """Return the lower corner of the first `dims` axes, metres."""
         return tuple(axis[0] for axis in (self.x, self.y, self.z)[:dims])
 
     def size(self, dims: int = 3) -> tuple[float, ...]:
-        """Extent of the first `dims` axes."""
+        """Return the extent of the first `dims` axes, metres."""
         return tuple(axis[1] - axis[0] for axis in (self.x, self.y, self.z)[:dims])
 
     def normalise(self, points: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b d"]:
@@ -40,7 +40,7 @@ class PerceptionRange:
         return _like(points, self.low(d)) + points * _like(points, self.size(d))
 
     def contains(self, points: Float[ArrayT, "*b d"]) -> Bool[ArrayT, "*b"]:
-        """True where x and y lie inside the box, border included (z is not looked at)."""
+        """Return whether x and y lie inside the box, border included; z is ignored."""
         inside_x = (points[..., 0] >= self.x[0]) & (points[..., 0] <= self.x[1])
         return inside_x & (points[..., 1] >= self.y[0]) & (points[..., 1] <= self.y[1])
 
@@ -65,7 +65,7 @@ class BevGrid:
         return size[0] / self.columns, size[1] / self.rows
 
     def centers(self) -> tuple[list[float], list[float]]:
-        """Coordinates of the cell centres: x for each column, y for each row, metres."""
+        """Return the coordinates of the cell centres, metres: x of each column, y of each row."""
         (dx, dy), (x0, y0) = self.cell, self.range.low(2)
         return (
             [x0 + (c + 0.5) * dx for c in range(self.columns)],
@@ -79,6 +79,6 @@ class BevGrid:
 
 
 def _like(points: Float[ArrayT, "*b d"], values: tuple[float, ...]) -> Float[ArrayT, "*b d"]:
-    # Of the same rank: the library runs with jax_numpy_rank_promotion="raise".
+    # Of the rank of `points`: the tests run with jax_numpy_rank_promotion="raise".
     xp = namespace(points)
     return xp.asarray(values, points.dtype).reshape((1,) * (points.ndim - 1) + (len(values),))

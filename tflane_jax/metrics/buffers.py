@@ -1,8 +1,8 @@
-"""Whether two polylines, made 2 r wide with flat ends and mitred bends, touch (numpy, no shapely).
+"""Whether the buffers of two polylines touch: radius r, flat ends, mitred bends (numpy, no shapely).
 
-MapTR's evaluator compares only such pairs (shared specs/metrics.md section 4). A buffer is taken as the union of convex
-pieces: one rectangle for each segment, and on the outer side of each bend a kite up to the mitre's tip, or a triangle
-where the tip would lie more than five radii away. Two unions touch if two of their pieces do.
+MapTR's evaluator compares only such pairs (docs/reference/metrics.md, section 4). A buffer is a union of convex pieces:
+one rectangle for each segment, and on the outer side of each bend a kite up to the tip of the mitre, or a triangle if
+the tip lies more than five radii away. Two buffers touch if two of their pieces do.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def buffers_touch(
     be padded by them.
     """
     touch = _middle_inside(a, b, i, j, radius) | _middle_inside(b, a, j, i, radius)
-    # What is left is rare: lines side by side contain each other's middle.
+    # Few pairs remain: of lines side by side, each contains the other's middle.
     left = np.flatnonzero(~touch & _has_length(a)[i] & _has_length(b)[j])
     for start in range(0, len(left), _BLOCK):
         block = left[start : start + _BLOCK]
@@ -47,7 +47,7 @@ def _middle_inside(
     j: Int[np.ndarray, " k"],
     radius: float,
 ) -> Bool[np.ndarray, " k"]:
-    """Return whether a vertex in the middle of line i, which lies in its own buffer, lies in a rectangle of line j."""
+    """Return whether the middle vertex of line i, a point of its buffer, lies in a rectangle of line j."""
     middle = a[i, a.shape[1] // 2]
     segment = np.diff(b, axis=1)
     length = np.hypot(segment[..., 0], segment[..., 1])
@@ -83,7 +83,7 @@ def _convex_pieces(lines: Float[np.ndarray, "l n 2"], radius: float) -> Float[np
 
 
 def _without_repetitions(lines: Float[np.ndarray, "l n 2"]) -> Float[np.ndarray, "l n 2"]:
-    """Move the vertices that repeat the one before them behind the others."""
+    """Move vertices that repeat their predecessor to the end."""
     kept = np.concatenate([np.ones((len(lines), 1), bool), (lines[:, 1:] != lines[:, :-1]).any(-1)], 1)
     order = np.argsort(~kept, axis=1, kind="stable")
     order = np.where(np.take_along_axis(kept, order, 1), order, order[np.arange(len(order)), kept.sum(1) - 1][:, None])
@@ -93,7 +93,7 @@ def _without_repetitions(lines: Float[np.ndarray, "l n 2"]) -> Float[np.ndarray,
 def _any_pieces_touch(a: Float[np.ndarray, "k s 4 2"], b: Float[np.ndarray, "k t 4 2"]) -> Bool[np.ndarray, " k"]:
     """Return for each k whether one of a's pieces touches one of b's."""
     low_a, high_a, low_b, high_b = a.min(2), a.max(2), b.min(2), b.max(2)
-    # Comparisons with NaN are false, so absent pieces drop out here.
+    # Comparisons with NaN are false, which excludes absent pieces.
     boxes = (low_a[:, :, None] <= high_b[:, None]) & (low_b[:, None] <= high_a[:, :, None])
     pair, s, t = np.nonzero(boxes.all(-1))
     touch = np.zeros(len(a), bool)
@@ -102,7 +102,7 @@ def _any_pieces_touch(a: Float[np.ndarray, "k s 4 2"], b: Float[np.ndarray, "k t
 
 
 def _quadrilaterals_touch(a: Float[np.ndarray, "k 4 2"], b: Float[np.ndarray, "k 4 2"]) -> Bool[np.ndarray, " k"]:
-    """Return whether convex quadrilaterals share a point: no edge's normal separates them."""
+    """Return whether convex quadrilaterals intersect: no normal of an edge separates them."""
     edges = np.concatenate([shape - np.roll(shape, 1, axis=1) for shape in (a, b)], 1)
     normals = np.stack([-edges[..., 1], edges[..., 0]], -1)
     on_a, on_b = (np.einsum("kec,kpc->kep", normals, shape) for shape in (a, b))

@@ -1,10 +1,11 @@
-"""Matching of one frame by the OpenLane-V2 centerline rules: all that the metrics keep of it.
+"""Matching of one frame by the OpenLane-V2 centerline rules.
 
-Source: shared specs/metrics.md sections 1 and 2.
+Source: openlanev2/centerline/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md describes the rules.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,14 +23,14 @@ from tflane_jax.metrics.frames import (
 )
 from tflane_jax.metrics.frechet import end_distance, pair_frechet
 from tflane_jax.metrics.matching import greedy_match, nearest_truth
-from tflane_jax.metrics.topology import FILL, Version, matchings, topology_precision
+from tflane_jax.metrics.topology import FILL, Version, check_versions, matchings, topology_precision
 
 LANE_THRESHOLDS = (1.0, 2.0, 3.0)  # metres, discrete Frechet
 ELEMENT_THRESHOLD = 0.75  # IoU distance
 
 
 def relaxation(truth: Float[np.ndarray, "g n 3"]) -> Float[np.ndarray, " g"]:
-    """Return the factor on distances to each true lane, max(0.5, 1 - 0.005 r), r the range of its nearest vertex."""
+    """Return the factor on distances to each true lane: max(0.5, 1 - 0.005 r), r metres from ego to nearest vertex."""
     return np.maximum(0.5, 1.0 - 0.005 * np.linalg.norm(truth, axis=-1).min(-1))
 
 
@@ -38,8 +39,8 @@ def nearest_lanes(
 ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """Return for each detection the relaxed Frechet distance to its nearest lane (metres), and which lane that is.
 
-    The distance is multiplied by `relaxation`, so far lanes are easier. Exact without measuring every pair: the
-    distance of the end points bounds a pair from below. Without lanes the distances are inf.
+    The distance is multiplied by `relaxation`, so far lanes are easier. Few pairs are measured: the distance of the end
+    points bounds that of a pair from below. Without lanes the distances are inf.
     """
     if len(truth) == 0 or len(detected) == 0:
         return nearest_truth(np.zeros((len(truth), len(detected))))
@@ -67,15 +68,15 @@ def iou_distance(a: Float[np.ndarray, "t 2 2"], b: Float[np.ndarray, "u 2 2"]) -
 
 @dataclass(frozen=True)
 class MatchedFrame:
-    """Everything that the metrics keep of one frame (K lane thresholds, P detections, G lanes).
+    """Matching results of one frame (K lane thresholds, P detections, G lanes).
 
     Attributes:
         scores: (P,).
         nearest: (P,) the lane that each detection is nearest to (relaxed Frechet distance).
         hits: (K, P) true positive.
         lanes: G.
-        topology: (K, G) for each lane, the mean over v1.0's levels (v2.1 has one) of its vertex average precision,
-            outgoing plus incoming.
+        topology: by version (K, G): average precision of each lane as a vertex, outgoing plus incoming. v1.0 averages
+            over ten confidence levels, v2.1 has one.
         elements: the part of the traffic elements, None without them.
     """
 
@@ -83,7 +84,7 @@ class MatchedFrame:
     nearest: Int[np.ndarray, " p"]
     hits: Bool[np.ndarray, "k p"]
     lanes: int
-    topology: Float[np.ndarray, "k g"]
+    topology: dict[Version, Float[np.ndarray, "k g"]]
     elements: MatchedElements | None
 
     def select(self, lanes: Bool[np.ndarray, " g"]) -> MatchedFrame:
@@ -98,19 +99,19 @@ class MatchedFrame:
             nearest=(np.cumsum(lanes) - 1)[self.nearest[owned]],
             hits=self.hits[:, owned],
             lanes=int(lanes.sum()),
-            topology=self.topology[:, lanes],
+            topology={version: precision[:, lanes] for version, precision in self.topology.items()},
             elements=None,
         )
 
 
 @dataclass(frozen=True)
 class MatchedElements:
-    """Everything that the metrics keep of the traffic elements of one frame.
+    """Matching results of the traffic elements of one frame.
 
     Attributes:
         scores, attributes, hits: (U,) detections, matched inside their attribute.
         truths: (13,) number of true elements per attribute.
-        topology: (K,) sum over lanes and elements of the vertex average precision.
+        topology: by version (K,): sum over lanes and elements of the vertex average precision.
         vertices: number of terms of that sum; 0 where lanes or elements are missing.
     """
 
@@ -118,14 +119,17 @@ class MatchedElements:
     attributes: Int[np.ndarray, " u"]
     hits: Bool[np.ndarray, " u"]
     truths: Int[np.ndarray, "13"]
-    topology: Float[np.ndarray, " k"]
+    topology: dict[Version, Float[np.ndarray, " k"]]
     vertices: int
 
 
-def match_frame(detections: LaneDetections, truth: LaneTruth, version: Version = "v2.1") -> MatchedFrame:
-    """Match one frame by the rules of the given version; raise UserError for arrays that do not fit together."""
+def match_frame(detections: LaneDetections, truth: LaneTruth, versions: Sequence[Version] = ("v2.1",)) -> MatchedFrame:
+    """Match one frame once, with the topology of the given versions.
+
+    Raises UserError for arrays that do not fit together.
+    """
     true_points, points = checked_lines(truth.points, "truth"), checked_lines(detections.points, "detections")
-    return match_lanes(detections, truth, *nearest_lanes(true_points, points), version)
+    return match_lanes(detections, truth, *nearest_lanes(true_points, points), versions)
 
 
 def match_lanes(
@@ -133,37 +137,41 @@ def match_lanes(
     truth: LaneTruth,
     distance: Float[np.ndarray, " p"],
     nearest: Int[np.ndarray, " p"],
-    version: Version = "v2.1",
+    versions: Sequence[Version] = ("v2.1",),
 ) -> MatchedFrame:
     """Match one frame whose detections are at `distance` from their `nearest` lanes; see `match_frame`."""
     g, p = len(truth.points), len(detections.points)
     edges, confidence = np.asarray(truth.successor, bool), np.asarray(detections.successor)
-    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
+    scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(edges, (g, g), "truth: successor")
     check_shape(scores, (p,), "detections: scores")
     check_shape(confidence, (p, p), "detections: successor")
 
     taken = np.stack([greedy_match(distance < threshold, nearest, scores) for threshold in LANE_THRESHOLDS])
-    levels = np.stack([matchings(scores, row, version) for row in taken])
-    rows = np.concatenate(levels)
-    topology = topology_precision(edges, confidence, rows, rows, FILL[version])
-    topology = topology.reshape(*levels.shape[:2], 2, g).mean(1).sum(1)
+    levels: dict[Version, Int[np.ndarray, "k levels p"]] = {
+        version: np.stack([matchings(scores, row, version) for row in taken]) for version in check_versions(versions)
+    }
+    topology: dict[Version, Float[np.ndarray, "k g"]] = {}
+    for version, level in levels.items():
+        rows = np.concatenate(level)
+        precision = topology_precision(edges, confidence, rows, rows, FILL[version])
+        topology[version] = precision.reshape(*level.shape[:2], 2, g).mean(1).sum(1)
     elements = None
     if truth.elements is not None and detections.elements is not None:
-        elements = _match_elements(detections.elements, truth.elements, levels, g, version)
+        elements = _match_elements(detections.elements, truth.elements, levels, g)
     return MatchedFrame(scores, nearest, taken >= 0, g, topology, elements)
 
 
 def _match_elements(
     detections: ElementDetections,
     truth: ElementTruth,
-    lane_levels: Int[np.ndarray, "k levels p"],
+    lane_levels: dict[Version, Int[np.ndarray, "k levels p"]],
     lanes: int,
-    version: Version,
 ) -> MatchedElements:
-    t, u, p = len(truth.boxes), len(detections.boxes), lane_levels.shape[-1]
+    """Match the traffic elements of a frame whose lanes are matched; `lane_levels` by version, -1 for no lane."""
+    t, u, p = len(truth.boxes), len(detections.boxes), next(iter(lane_levels.values())).shape[-1]
     edges, confidence = np.asarray(truth.lane, bool), np.asarray(detections.lane)
-    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
+    scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(np.asarray(truth.boxes), (t, 2, 2), "truth: element boxes")
     check_shape(edges, (lanes, t), "truth: lane to element")
     check_shape(np.asarray(detections.boxes), (u, 2, 2), "detections: element boxes")
@@ -174,22 +182,25 @@ def _match_elements(
 
     distance = iou_distance(truth.boxes, detections.boxes)
     inside = np.where(true_attributes[:, None] == attributes, distance, np.inf)
-    # The score of detection looks inside an attribute, the score of topology does not.
+    # DET_t matches within an attribute, TOP_lt across attributes.
     within, taken = (
         greedy_match(least < ELEMENT_THRESHOLD, nearest, scores)
         for least, nearest in (nearest_truth(inside), nearest_truth(distance))
     )
 
-    thresholds, levels = lane_levels.shape[:2]
-    columns = np.tile(matchings(scores, taken, version), (thresholds, 1))
-    topology = topology_precision(edges, confidence, np.concatenate(lane_levels), columns, FILL[version])
     vertices = lanes + t if lanes and t else 0
+    topology: dict[Version, Float[np.ndarray, " k"]] = {}
+    for version, of_lanes in lane_levels.items():
+        thresholds, levels = of_lanes.shape[:2]
+        columns = np.tile(matchings(scores, taken, version), (thresholds, 1))
+        precision = topology_precision(edges, confidence, np.concatenate(of_lanes), columns, FILL[version])
+        topology[version] = precision.sum(-1).reshape(thresholds, levels).mean(1) * bool(vertices)
     return MatchedElements(
         scores=scores,
         attributes=attributes,
         hits=within >= 0,
         truths=np.bincount(true_attributes, minlength=ATTRIBUTES),
-        topology=topology.sum(-1).reshape(thresholds, levels).mean(1) * bool(vertices),
+        topology=topology,
         vertices=vertices,
     )
 

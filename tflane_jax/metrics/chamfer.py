@@ -1,7 +1,7 @@
 """Chamfer distances of many pairs of polylines, measured only where they can be small (numpy).
 
-`tflane_jax.geometry.distances.chamfer` is the definition; here are ragged lines, and a lower bound that is a hundred
-times cheaper than the distance and settles nearly all pairs of a frame.
+`tflane_jax.geometry.distances.chamfer` is the definition. This file takes ragged lines, and first a lower bound that is
+a hundred times cheaper than the distance and excludes nearly all pairs of a frame.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.metrics.frames import Lines, checked_lines
 
-# Rounding of bound and distance, far below any difference that could matter.
+# Allows for the rounding of bound and distance, metres.
 _SLACK = 1e-9
-# A line is cut into at most so many pieces, of at least so many vertices, to bound its distance.
+# The bound cuts a line into at most _PIECES pieces of at least _PIECE vertices.
 _PIECES, _PIECE = 10, 4
-# Squared distances measured at a time: they stay in the processor's cache.
+# Squared distances computed at a time, so that they fit into the processor's cache.
 _BLOCK = 2**16
 
 
@@ -27,9 +27,9 @@ class PaddedLines:
     """Polylines of one frame in one array.
 
     Attributes:
-        points: (L, n, d) metres; a line with fewer than n vertices repeats its last one (which changes no nearest
-            vertex).
-        counts: (L,) how many vertices count in means over a line.
+        points: (L, n, d) metres; a line with fewer than n vertices repeats its last one, which changes no nearest
+            vertex.
+        counts: (L,) number of vertices of each line, for means.
     """
 
     points: Float[np.ndarray, "l n d"]
@@ -37,7 +37,7 @@ class PaddedLines:
 
     @classmethod
     def of(cls, lines: Lines, what: str, dims: int = 3) -> PaddedLines:
-        """Return the given lines; raise UserError, which names them by `what`, for those that cannot be measured."""
+        """Return the lines padded; raise UserError, which begins with `what`, for lines without points or not finite."""
         return cls(checked_lines(lines, what, dims), np.fromiter(map(len, lines), int, len(lines)))
 
     def __len__(self) -> int:
@@ -48,15 +48,15 @@ class PaddedLines:
         return PaddedLines(self.points[lines], self.counts[lines])
 
     def open_ends(self) -> PaddedLines:
-        """Return the lines without the last vertex where it equals the first: it counts once in means."""
+        """Return the lines without the last vertex of closed ones, so that it counts once in means."""
         closed = (self.points[:, 0] == self.points[:, -1]).all(-1) & (self.counts > 1)
         return PaddedLines(self.points, self.counts - closed)
 
     def resampled(self, count: int) -> PaddedLines:
         """Return `count` points on each line, equally spaced in ground-plane arc length, both ends included.
 
-        As `geometry.polylines.resample` does, and unlike `resample_lines` to the last bit: rounding does not depend on
-        the other lines, so that twins remain equally near.
+        Bit-identical to `geometry.polylines.resample`. The rounding of `resample_lines` depends on the other lines, so
+        that two equal lines could have different distances.
         """
         if len(self) == 0:
             return PaddedLines(np.zeros((0, count, self.points.shape[-1])), self.counts)
@@ -75,7 +75,7 @@ class PaddedLines:
         return PaddedLines(np.where(weight == 1.0, b, a + weight * (b - a)), np.full(len(self), count))
 
     def counted(self) -> Bool[np.ndarray, "l n"]:
-        """Return which vertices count."""
+        """Return which vertices are no padding."""
         return np.arange(self.points.shape[1]) < self.counts[:, None]
 
 
@@ -85,15 +85,15 @@ def near_pairs(
     within: float | Float[np.ndarray, " a"],
     among: Bool[np.ndarray, "a b"] | None = None,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Return all pairs (lines of a, lines of b) whose Chamfer distance can be at most `within` metres, and few others.
+    """Return all pairs (lines of a, lines of b) with a Chamfer distance of at most `within` metres, and few others.
 
     Args:
-        within: one for all, or one for each line of a.
-        among: leave out the pairs that are false here.
+        within: one number, or one for each line of a.
+        among: pairs to consider; None considers all.
     """
     within = np.broadcast_to(np.asarray(within) + _SLACK, len(a))
     boxes_a, boxes_b = _Boxes.of(a), _Boxes.of(b)
-    # The box of the whole line first, it costs next to nothing.
+    # First the cheap bound by the box of the whole line.
     low_a, high_a = boxes_a.low.min(1)[..., None], boxes_a.high.max(1)[..., None]
     low_b, high_b = boxes_b.low.min(1)[:, None], boxes_b.high.max(1)[:, None]
     possible = _gap(low_a, high_a, low_b, high_b) <= within[:, None]
@@ -112,8 +112,8 @@ def pair_chamfer(
 ) -> Float[np.ndarray, " k"]:
     """Return the Chamfer distance of line i of a and line j of b, metres.
 
-    Half the sum of the mean distances from each vertex to the nearest vertex of the other line; not squared, blind to
-    direction (shared specs/metrics.md section 1).
+    Half the sum of the mean distances from each vertex to the nearest vertex of the other line; not squared, the same
+    for a reversed line (docs/reference/metrics.md, section 1).
     """
     distance = np.empty(len(i))
     counted_a, counted_b = a.counted(), b.counted()
@@ -128,9 +128,9 @@ def pair_chamfer(
 
 @dataclass(frozen=True)
 class _Boxes:
-    """Bounding boxes of the pieces of lines, and the pieces' share of the vertices; the lines come last, for speed.
+    """Bounding boxes of the pieces of lines, and each piece's fraction of the vertices; lines are the last axis.
 
-    No vertex is nearer to the other line than their pieces' boxes are: the Chamfer distance between the boxes, weighted
+    No vertex is nearer to the other line than the boxes of their pieces. So the Chamfer distance of the boxes, weighted
     by vertices, bounds that of the lines from below.
     """
 
@@ -144,8 +144,8 @@ class _Boxes:
         pieces = np.clip(n // _PIECE, 1, _PIECES)
         starts = np.arange(pieces) * n // pieces
         points = np.ascontiguousarray(lines.points.transpose(2, 1, 0))
-        share = np.add.reduceat(lines.counted().T, starts, dtype=np.float64) / lines.counts
-        return cls(np.minimum.reduceat(points, starts, axis=1), np.maximum.reduceat(points, starts, axis=1), share)
+        fraction = np.add.reduceat(lines.counted().T, starts, dtype=np.float64) / lines.counts
+        return cls(np.minimum.reduceat(points, starts, axis=1), np.maximum.reduceat(points, starts, axis=1), fraction)
 
 
 def _gap(
@@ -161,7 +161,7 @@ def _gap(
 
 
 def _squared(a: Float[np.ndarray, "k n d"], b: Float[np.ndarray, "k m d"]) -> Float[np.ndarray, "k n m"]:
-    # In place and coordinate by coordinate: the passes over memory are what this costs.
+    # In place, one coordinate at a time: memory traffic dominates the time.
     total = a[:, :, None, 0] - b[:, None, :, 0]
     total *= total
     for axis in range(1, a.shape[-1]):

@@ -1,8 +1,8 @@
 """The F-score of 3-D lanes that the OpenLane-V2 devkit prints beside the centerline metrics.
 
-Lanes are compared where they pass 100 planes across the road, 1 m apart, and paired one to one at the least total cost.
-Kept apart from `CenterlineMetrics`, since it takes about as long as all of those together and few papers report it. It
-did not change between devkit v1.0 and v2.1. Rules: shared specs/metrics.md section 2.7.
+Lanes are compared on 100 planes across the road, 1 m apart, and paired one to one at the least total cost. The F-score
+is not part of `CenterlineMetrics`: it takes about as long as all of those together and few papers report it. It is the
+same in devkit v1.0 and v2.1. Rules: docs/reference/metrics.md, section 2.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from tflane_jax.metrics.chamfer import PaddedLines
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
 
 SAMPLES = np.arange(-50.0, 50.0)  # x of the planes, metres
-NEAR = 1.5  # metres; also what a plane costs that only one of two lanes passes
-_SHARE = 0.75  # of a lane's planes that must be near
-_WORST = NEAR * len(SAMPLES)  # pairs of this cost or more find nothing
+NEAR = 1.5  # metres; also the cost of a plane that only one of two lanes passes
+_FRACTION = 0.75  # of a lane's planes that must be near
+_WORST = NEAR * len(SAMPLES)  # pairs of at least this cost do not count
 _STARTS_BEFORE, _ENDS_BEHIND = 49.0, -50.0  # metres
 
 
 class CenterlineFScore:
-    """Accumulator of the F-score over frames; it keeps four counts. Scores of detections play no part."""
+    """Accumulator of the F-score over frames; it keeps four counts. Scores of detections are ignored."""
 
     protocol = "OpenLane-V2 centerline F-score v2.1"
 
@@ -48,7 +48,7 @@ class CenterlineFScore:
         return merged
 
     def compute(self) -> dict[str, float]:
-        """Return `frames`, `F_score` and its parts `F_recall` and `F_precision`, each 0 where nothing is to count."""
+        """Return `frames`, `F_score` and its parts `F_recall` and `F_precision`, each 0 without lanes or detections."""
         recalled, precise, lanes, detections = self._counts.tolist()
         recall, precision = recalled / max(lanes, 1), precise / max(detections, 1)
         score = 2 * recall * precision / (recall + precision) if recalled and precise else 0.0
@@ -57,12 +57,12 @@ class CenterlineFScore:
 
 @dataclass(frozen=True)
 class SampledLanes:
-    """Lanes where they pass the planes `SAMPLES` (S of them).
+    """Lanes on the S planes x = `SAMPLES`.
 
     Attributes:
-        points: (L, S, 2) y and z, metres; without meaning where the lane does not pass.
+        points: (L, S, 2) y and z, metres; arbitrary where the lane does not pass the plane.
         first: (L,) index of the first plane that the lane passes.
-        count: (L,) how many it passes, in a row and at least two.
+        count: (L,) number of consecutive planes that it passes, at least two.
     """
 
     points: Float[np.ndarray, "l s 2"]
@@ -71,10 +71,10 @@ class SampledLanes:
 
 
 def sample_lanes(lines: Lines, what: str) -> SampledLanes:
-    """Return the lanes that take part, by y and z on the planes; raise UserError for lines that cannot be measured.
+    """Return the lanes that count on the planes; raise UserError for lines without points or not finite.
 
-    A lane of one point takes no part, nor one that starts ahead of 49 m or ends behind -50 m, in drawing order, nor one
-    that passes fewer than two planes. A lane that goes back and forth is straightened out by sorting its vertices by x.
+    Left out are lanes of one point, lanes whose first point lies ahead of 49 m or whose last lies behind -50 m, and
+    lanes that pass fewer than two planes. The vertices of a lane are sorted by x.
     """
     padded = PaddedLines.of(lines, what)
     points = padded.points
@@ -92,11 +92,11 @@ def sample_lanes(lines: Lines, what: str) -> SampledLanes:
 def _interpolated(points: Float[np.ndarray, "l n 3"], slope_type: np.dtype | type) -> Float[np.ndarray, "l s 2"]:
     """Return y and z on the planes, of vertices in order of x.
 
-    Slopes are as precise as the line was, which is what the official program does.
+    As in the official program, slopes have the precision of the line (float32 or float64).
     """
     lanes, n = points.shape[:2]
     lane = np.arange(lanes)[:, None]
-    # How many vertices lie before each plane: those with a first plane beyond them up to here.
+    # Number of vertices before each plane.
     bins = len(SAMPLES) + 1
     beyond = np.searchsorted(SAMPLES, points[..., 0], side="right") + lane * bins
     below = np.bincount(beyond.ravel(), minlength=lanes * bins).reshape(lanes, bins).cumsum(1)[:, :-1]
@@ -104,27 +104,27 @@ def _interpolated(points: Float[np.ndarray, "l n 3"], slope_type: np.dtype | typ
 
     step = np.diff(points, axis=1)
     run = step[..., :1]
-    # Between vertices of one x (padding among them) lies no plane, or one through the first: any slope will do.
+    # Vertices of equal x (padding among them) have no plane between them: any slope will do.
     slope = step[..., 1:].astype(slope_type) / np.where(run > 0.0, run, 1.0).astype(slope_type)
     ahead = SAMPLES - points[lane, start, 0]
     return slope[lane, start] * ahead[..., None] + points[lane, start, 1:]
 
 
 def found_lanes(true: SampledLanes, found: SampledLanes) -> tuple[int, int]:
-    """Return how many true lanes are found, and how many detections find one, in the pairing of least cost."""
+    """Return the numbers of true lanes found and of detections that find one, in the pairing of least cost."""
     cost, near = _costs(true, found)
     g, p = linear_sum_assignment(cost)
     possible = cost[g, p] < _WORST
-    recalled = possible & (near[g, p] >= _SHARE * true.count[g])
-    precise = possible & (near[g, p] >= _SHARE * found.count[p])
+    recalled = possible & (near[g, p] >= _FRACTION * true.count[g])
+    precise = possible & (near[g, p] >= _FRACTION * found.count[p])
     return int(recalled.sum()), int(precise.sum())
 
 
 def _costs(true: SampledLanes, found: SampledLanes) -> tuple[Int[np.ndarray, "g p"], Int[np.ndarray, "g p"]]:
-    """Return the cost of each pair, and on how many planes its lanes are near.
+    """Return the cost of each pair, and the number of planes on which its lanes are near.
 
-    The cost sums, in metres and cut to an integer, the distances on planes that both pass, and `NEAR` for each plane
-    that only one of them passes. Only the planes that both pass are computed: few of 100, for most pairs none.
+    The cost is the sum of the distances on planes that both pass, plus `NEAR` for each plane that only one of them
+    passes, in metres, truncated to an integer. Most pairs have no common plane and need no distances.
     """
     first = np.maximum(true.first[:, None], found.first)
     last = np.minimum((true.first + true.count)[:, None], found.first + found.count)
@@ -135,12 +135,12 @@ def _costs(true: SampledLanes, found: SampledLanes) -> tuple[Int[np.ndarray, "g 
     g, p = np.nonzero(shared)
     planes = shared[g, p]
     begin = np.cumsum(planes) - planes
-    # All planes of all pairs in one row.
+    # The common planes of all pairs, concatenated.
     plane = np.arange(planes.sum()) + np.repeat(first[g, p] - begin, planes)
     step = true.points[np.repeat(g, planes), plane] - found.points[np.repeat(p, planes), plane]
     distance = np.hypot(step[:, 0], step[:, 1])
     if len(g):
         total[g, p] += np.add.reduceat(distance, begin)
         near[g, p] = np.add.reduceat(distance < NEAR, begin, dtype=np.int64)
-    # Officially only a pair that fits perfectly costs nothing.
+    # As in the official program, only a perfect pair costs 0.
     return np.where((total > 0.0) & (total < 1.0), 1, total.astype(np.int64)), near

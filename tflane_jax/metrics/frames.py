@@ -1,4 +1,4 @@
-"""What the lane metrics compare in one frame: truth and detections of lanes, their topology and traffic elements.
+"""Truth and detections of one frame: lanes, their topology and traffic elements.
 
 Plain numpy arrays and ragged lists, so that predictions of any framework fit in. `tflane_jax.evaluation` makes them
 from the containers of `tflane_jax.scene`.
@@ -85,7 +85,7 @@ class LaneDetections:
 
 
 def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "l n d"]:
-    """Return the polylines of one frame as one array (`pad_lines`); raise UserError for what cannot be measured."""
+    """Return the polylines of one frame as one array (`pad_lines`); raise UserError if they have no points or are not finite."""
     try:
         points = pad_lines(lines, dims)
     except ValueError as error:

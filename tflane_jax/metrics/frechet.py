@@ -1,7 +1,7 @@
 """Discrete Fréchet distances of many pairs of polylines at once (numpy).
 
-`tflane_jax.geometry.distances.discrete_frechet` is the definition; here the recursion advances along anti-diagonals, a
-tenth as many steps, and a lower bound settles most pairs of a frame.
+`tflane_jax.geometry.distances.discrete_frechet` is the definition. Here the recursion advances along anti-diagonals,
+which takes a tenth of the steps, and a lower bound excludes most pairs of a frame.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def pair_frechet(
         low, high = max(0, diagonal - m + 1), min(diagonal, n - 1)
         start = low * m + diagonal - low
         here = cells[start : high * m + diagonal - high + 1 : m - 1]
-        # Row r stands at index r + 1: a cell is reached from its left (same row), from above and across (row before).
+        # Index r + 1 holds row r. A cell is reached from the left (same row), from above and diagonally (previous row).
         best = np.minimum(last[low + 1 : high + 2], last[low : high + 1])
         np.minimum(best, before[low : high + 1], out=best)
         before[low + 1 : high + 2] = np.maximum(best, here, out=best)

@@ -2,7 +2,7 @@
 
 A lane segment has a centerline and two side lines; areas are pedestrian crossings and road boundaries. Both flavours
 give the same numbers for what they share: AP_ls is DET_l, TOP_lsls is TOP_ll (v2.1), AP_ped is the crossings' part of
-DET_a. LaneSegNet and TF-Lane print the second. Rules: shared specs/metrics.md section 3.
+DET_a. LaneSegNet and TF-Lane print the second. Rules: docs/reference/metrics.md, section 3.
 """
 
 from __future__ import annotations
@@ -84,13 +84,13 @@ class LaneSegmentMetrics:
 
     def __init__(self, flavour: Flavour = "OpenLane-V2") -> None:
         self.flavour: Flavour = flavour
-        self._lanes = CenterlineMetrics("v2.1")
+        self._lanes = CenterlineMetrics(("v2.1",))
         self._true_areas = np.zeros(BOUNDARY + 1, np.int64)  # by category
         self._area_detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, categories, hits
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table of these numbers."""
+        """Name and version, the title of every table of these numbers."""
         if self.flavour == "LaneSegNet":
             return "LaneSegNet lane segments (TOP_lsls v2.1)"
         return "OpenLane-V2 lane segments v2.1"
@@ -157,12 +157,12 @@ def match_areas(
 ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Bool[np.ndarray, "k p"]]:
     """Return scores and categories of the detected areas, and which are true positives at each threshold.
 
-    An area of another category is never nearest. Only true areas lose the vertex that closes them.
+    Only areas of the same category are compared. Only true areas lose their closing vertex.
     """
     true, found = PaddedLines.of(truth.points, "truth: areas"), PaddedLines.of(detections.points, "detections: areas")
     true_categories = _checked_categories(truth.categories, len(true), "truth")
     categories = _checked_categories(detections.categories, len(found), "detections")
-    scores = np.array(detections.scores)  # kept by the accumulator, so not the caller's own
+    scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
     check_shape(scores, (len(found),), "detections: area scores")
     true = true.open_ends()
     i, j = near_pairs(true, found, AREA_THRESHOLDS[-1], true_categories[:, None] == categories)
@@ -176,11 +176,11 @@ def match_areas(
 def nearest_segments(
     truth: list[Lines], detected: list[Lines]
 ) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Return for each detection the distance to its nearest true segment (metres), and which one that is.
+    """Return for each detection the distance to its nearest true segment (metres) and the index of that segment.
 
-    The distance is half of Frechet(centerlines) + Chamfer(left) + Chamfer(right), relaxed like that of centerlines;
-    pairs whose relaxed centerline Chamfer distance is 3 m or more are never matched (inf), however near their sides.
-    A distance of 3 m or more, which is never matched either, may be too large or inf: not all of those are measured.
+    The distance is half of Frechet(centerlines) + Chamfer(left) + Chamfer(right), with the relaxation of centerlines.
+    It is inf for pairs whose relaxed centerline Chamfer distance is 3 m or more. Other distances of 3 m or more, which
+    are never matched either, may be too large or inf, because not all of them are computed.
 
     Args:
         truth: G centerlines, left lines, right lines.
@@ -197,7 +197,7 @@ def nearest_segments(
                 ", expected as many of each"
             )
     relax = relaxation(true[0].points)
-    # Nothing beyond the largest threshold is matched, and half the centerlines' distance is a part of the whole.
+    # Half the centerline distance is part of the total, and nothing beyond the largest threshold is matched.
     true_centers, centers = true[0].points, found[0].points
     lane, detection = np.nonzero(0.5 * relax[:, None] * end_distance(true_centers, centers) < LANE_THRESHOLDS[-1])
     true = [lines.open_ends() for lines in true]

@@ -1,7 +1,7 @@
-"""Greedy nearest matching and the official average precisions (shared specs/metrics.md sections 1 and 4).
+"""Greedy nearest matching and the official average precisions (docs/reference/metrics.md, sections 1 and 4).
 
-Everywhere "in descending confidence" is a stable order: of equal confidences the earlier element goes first. The
-official program sorts unstably, so its value is undefined where confidences tie; ours is one of the possible ones.
+Sorting by confidence is stable: of equal confidences the earlier element goes first. The official program sorts
+unstably, so its value is undefined where confidences tie; ours is one of its possible values.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ def descending(values: Float[np.ndarray, "*b n"]) -> Int[np.ndarray, "*b n"]:
 
 
 def nearest_truth(distance: Float[np.ndarray, "g p"]) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Return for each prediction the distance to its nearest truth, the first of several, and which one that is.
+    """Return for each prediction the distance to its nearest truth and the index of that truth, the first of equals.
 
     Without truth the distances are inf.
     """
@@ -30,12 +30,12 @@ def greedy_match(
 ) -> Int[np.ndarray, " p"]:
     """Return for each prediction the truth that it takes, -1 for a false positive.
 
-    Every prediction looks only at its nearest truth, decided before matching (`nearest`). In descending confidence it
-    takes that truth if it is `near` enough and free; there is no second choice.
+    Every prediction considers only its `nearest` truth. In order of descending confidence it takes that truth if it is
+    `near` and free; there is no second choice.
     """
     order = descending(scores)
     order = order[near[order]]
-    # Of several predictions the last assigned takes a truth, so the best comes last.
+    # Of several predictions the last one assigned keeps the truth, so the best comes last.
     winner = np.full(nearest.max(initial=-1) + 1, -1)
     winner[nearest[order[::-1]]] = order[::-1]
     winner = winner[winner >= 0]
@@ -54,8 +54,8 @@ def pooled(detections: list[tuple[np.ndarray, ...]], *empty: tuple[int, ...]) ->
 def average_precision_11(scores: Float[np.ndarray, " p"], hits: Bool[np.ndarray, " p"], truths: int) -> float:
     """Return the mean over the recalls 0, 0.1, ..., 1 of the best precision at that recall or above.
 
-    `hits` tells true from false positives, pooled over all frames; `truths` counts the ground truth. Nothing to find
-    and nothing predicted is 1; only one of the two empty is 0.
+    `hits` marks the true positives, pooled over all frames; `truths` is the number of true elements. Without truth and
+    predictions the result is 1, with only one of the two 0.
     """
     if truths == 0 or len(scores) == 0:
         return float(truths == 0 and len(scores) == 0)
@@ -90,7 +90,7 @@ def vertex_average_precision(
     """
     edges = np.broadcast_to(edges, confidence.shape)
     predicted = confidence > threshold
-    # Hits are few: each counts what ranks before it, which takes no sorting.
+    # Hits are few: counting the entries before each one is faster than sorting.
     *vertex, neighbour = np.nonzero(edges & predicted)
     row, hit = confidence[*vertex], confidence[*vertex, neighbour][:, None]
     before = (row > hit) | ((row == hit) & (np.arange(row.shape[-1]) <= neighbour[:, None]))

@@ -1,8 +1,9 @@
 """OpenLane-V2 centerline metrics: DET_l, DET_t, TOP_ll, TOP_lt and OLS, in both published versions.
 
 The topology score changed between devkit v1.0 and v1.1 (= v2.1) and differs by a factor of about four, so the version
-is part of every result: TF-Lane reports v2.1, the marker-fusion paper v1.0. DET is the same in both. Rules: shared
-specs/metrics.md sections 1 and 2; the groups by occlusion are this project's own (docs/metrics.md).
+is part of every result: TF-Lane reports v2.1, the marker-fusion paper v1.0. DET is the same in both. Source:
+openlanev2/centerline/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md describes the rules. The groups by
+occlusion are this project's own (docs/metrics.md).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.matching import average_precision_11, pooled
-from tflane_jax.metrics.topology import Version
+from tflane_jax.metrics.topology import Version, check_versions
 
 
 class CenterlineMetrics:
@@ -30,14 +31,16 @@ class CenterlineMetrics:
     `merge` give the metrics of any set of scenes.
 
     Args:
-        version: of the topology score; "v2.1" is also that of devkit v1.1.
+        versions: of the topology score; "v2.1" is also that of devkit v1.1. Every frame is matched once for all of
+            them. The first gives `TOP_ll`, `TOP_lt` and `OLS`, the others the same with a suffix, as `TOP_ll_v1.0`.
     """
 
-    def __init__(self, version: Version = "v2.1") -> None:
-        self.version: Version = version
+    def __init__(self, versions: Sequence[Version] = ("v2.1",)) -> None:
+        self.versions = check_versions(versions)
         self._frames = self._frames_with_elements = 0
         self._lanes = self._lane_vertices = self._element_vertices = 0
-        self._lane_topology, self._element_topology = (np.zeros(len(LANE_THRESHOLDS)) for _ in range(2))
+        sums = len(self.versions), len(LANE_THRESHOLDS)
+        self._lane_topology, self._element_topology = np.zeros(sums), np.zeros(sums)
         self._true_elements = np.zeros(ATTRIBUTES, np.int64)
         # Detections of every frame: (scores, hits) of lanes, (scores, hits, attributes) of traffic elements.
         self._lane_detections: list[tuple[np.ndarray, ...]] = []
@@ -45,34 +48,34 @@ class CenterlineMetrics:
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table of these numbers."""
-        return f"OpenLane-V2 centerline {self.version}"
+        """Name and version, the title of every table of these numbers."""
+        return _protocol(self.versions)
 
     def update(self, detections: LaneDetections, truth: LaneTruth) -> None:
         """Add one frame; raise UserError for arrays that do not fit together."""
-        self.add(match_frame(detections, truth, self.version))
+        self.add(match_frame(detections, truth, self.versions))
 
     def add(self, frame: MatchedFrame) -> None:
-        """Add one frame that has been matched by this version's rules."""
+        """Add one frame that has been matched with at least these versions."""
         self._frames += 1
         self._lanes += frame.lanes
         self._lane_vertices += 2 * frame.lanes
-        self._lane_topology += frame.topology.sum(-1)
+        self._lane_topology += np.stack([frame.topology[version].sum(-1) for version in self.versions])
         self._lane_detections.append((frame.scores, frame.hits))
         if frame.elements is not None:
             elements = frame.elements
             self._frames_with_elements += 1
             self._true_elements += elements.truths
             self._element_vertices += elements.vertices
-            self._element_topology += elements.topology
+            self._element_topology += np.stack([elements.topology[version] for version in self.versions])
             self._element_detections.append((elements.scores, elements.hits, elements.attributes))
 
     def merge(self, other: Self) -> Self:
         """Return an accumulator of the frames of both, in this order (neither changes)."""
-        if self.version != other.version:
+        if self.versions != other.versions:
             raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one version")
-        merged = type(self)(self.version)
-        for name in vars(self).keys() - {"version"}:
+        merged = type(self)(self.versions)
+        for name in vars(self).keys() - {"versions"}:
             setattr(merged, name, getattr(self, name) + getattr(other, name))
         return merged
 
@@ -82,11 +85,12 @@ class CenterlineMetrics:
         - `frames`, `lanes`: number of frames and of true lanes;
         - `DET_l` and, per threshold in metres, `DET_l@1.0`, `DET_l@2.0`, `DET_l@3.0` (1 if there is neither a true
           lane nor a detection, as officially);
-        - `recall` and `recall@1.0`, `recall@2.0`, `recall@3.0`: share of the true lanes that some detection takes,
-          whatever its score. Not official; it moves smoothly where DET_l, which rests on eleven recalls, jumps;
+        - `recall` and `recall@1.0`, `recall@2.0`, `recall@3.0`: fraction of the true lanes that some detection takes,
+          whatever its score. Not official; it changes smoothly, whereas DET_l is a mean over eleven recall levels;
         - `TOP_ll`: 0 without true lanes in v2.1; missing in v1.0, whose official program stops with an error;
         - only if every frame had traffic elements on both sides: `DET_t` and, per attribute, `DET_t@0` ...
-          `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is.
+          `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is;
+        - `TOP_ll`, `TOP_lt` and `OLS` of the further versions, named with the version: `TOP_ll_v1.0`.
         """
         result: dict[str, float] = {"frames": self._frames, "lanes": self._lanes}
         scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
@@ -111,15 +115,29 @@ class CenterlineMetrics:
         result["DET_t"] = float(np.mean(precisions))
         result |= {f"DET_t@{i}": value for i, value in enumerate(precisions)}
         result |= self._topology("TOP_lt", self._element_topology, self._element_vertices)
-        if "TOP_ll" in result and "TOP_lt" in result:
-            parts = result["DET_l"], result["DET_t"], result["TOP_ll"] ** 0.5, result["TOP_lt"] ** 0.5
-            result["OLS"] = float(np.mean(parts))
+        for suffix in self._suffixes():
+            lanes, elements = (result.get(name + suffix) for name in ("TOP_ll", "TOP_lt"))
+            if lanes is not None and elements is not None:
+                result["OLS" + suffix] = float(np.mean([result["DET_l"], result["DET_t"], lanes**0.5, elements**0.5]))
         return result
 
-    def _topology(self, name: str, total: Float[np.ndarray, " k"], vertices: int) -> dict[str, float]:
-        if vertices:
-            return {name: float(total.sum() / (len(LANE_THRESHOLDS) * vertices))}
-        return {name: 0.0} if self.version == "v2.1" else {}
+    def _suffixes(self) -> list[str]:
+        """Return what each version appends to the names of its scores: nothing for the first."""
+        return ["", *(f"_{version}" for version in self.versions[1:])]
+
+    def _topology(self, name: str, totals: Float[np.ndarray, "v k"], vertices: int) -> dict[str, float]:
+        scores = {}
+        for suffix, version, total in zip(self._suffixes(), self.versions, totals, strict=True):
+            if vertices:
+                scores[name + suffix] = float(total.sum() / (len(LANE_THRESHOLDS) * vertices))
+            elif version == "v2.1":
+                scores[name + suffix] = 0.0
+        return scores
+
+
+def _protocol(versions: Sequence[Version]) -> str:
+    further = "".join(f", {version} where the name says so" for version in versions[1:])
+    return f"OpenLane-V2 centerline {versions[0]}{further}"
 
 
 class GroupedCenterlineMetrics:
@@ -129,20 +147,20 @@ class GroupedCenterlineMetrics:
     with all lanes and all detections, by the official rules. Then, for the group S of lanes:
 
     - DET_l counts the true lanes in S and the detections whose nearest true lane lies in S, false positives included.
-      Nearest is the least relaxed Frechet distance, however large (below 3 m it is the lane that the official matching
-      looks at). Detections in frames without true lanes count only in `all`;
+      Nearest is the least relaxed Frechet distance, however large. Below 3 m it is the official candidate. Detections
+      in frames without true lanes count only in `all`;
     - TOP_ll pools the vertex precisions of the lanes in S; their neighbours may lie outside S.
 
-    So `all` is the official number, occluded and clear share out its lanes and its vertices exactly, and its detections
-    but for those in frames without lanes. Traffic elements count only in `all`.
+    `all` is the official number. `occluded` and `clear` partition its lanes and its vertices, and its detections in
+    frames with lanes. Traffic elements count only in `all`.
 
-    Frames can be shared out, too: a group of frames is measured like `all`, on these frames alone.
+    A frame may also belong to a group of frames, which is measured like `all` on these frames alone.
 
     Args:
         groups: the groups to report.
         frame_groups: names of groups of frames.
-        occluded_below: visibility (share of the lane in direct line of sight) below which a lane is occluded.
-        version: of the topology score.
+        occluded_below: visibility (fraction of the lane in direct line of sight) below which a lane is occluded.
+        versions: of the topology score, see `CenterlineMetrics`.
     """
 
     def __init__(
@@ -151,24 +169,24 @@ class GroupedCenterlineMetrics:
         *,
         frame_groups: Sequence[str] = (),
         occluded_below: float = 0.5,
-        version: Version = "v2.1",
+        versions: Sequence[Version] = ("v2.1",),
     ) -> None:
-        self.version: Version = version
+        self.versions = check_versions(versions)
         self.occluded_below = occluded_below
         self._frame_groups = frozenset(frame_groups)
-        self._metrics = {group: CenterlineMetrics(version) for group in (*groups, *frame_groups)}
+        self._metrics = {group: CenterlineMetrics(versions) for group in (*groups, *frame_groups)}
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table of these numbers."""
-        return f"OpenLane-V2 centerline {self.version}, occluded: visibility < {self.occluded_below:g}"
+        """Name and version, the title of every table of these numbers."""
+        return f"{_protocol(self.versions)}, occluded: visibility < {self.occluded_below:g}"
 
     def update(self, detections: LaneDetections, truth: LaneTruth, frame_group: str | None = None) -> None:
         """Add one frame, which may belong to a group of frames.
 
         Raises UserError for arrays that do not fit together or a visibility that is not known.
         """
-        frame = match_frame(detections, truth, self.version)
+        frame = match_frame(detections, truth, self.versions)
         for group, metrics in self._metrics.items():
             if group in ("all", frame_group):
                 metrics.add(frame)
@@ -201,25 +219,25 @@ class GroupedCenterlineMetrics:
 class DistanceCenterlineMetrics(GroupedCenterlineMetrics):
     """The centerline metrics of all lanes and of those whose nearest vertex lies within a range of distances.
 
-    Lanes and detections are shared out as `GroupedCenterlineMetrics` says.
+    Lanes and detections are assigned to groups by the rules of `GroupedCenterlineMetrics`.
 
     Args:
         edges: distances in the ground plane at which one group ends and the next begins, metres, ascending.
-        version: of the topology score.
+        versions: of the topology score, see `CenterlineMetrics`.
     """
 
-    def __init__(self, edges: Sequence[float] = (10.0, 20.0, 30.0), *, version: Version = "v2.1") -> None:
+    def __init__(self, edges: Sequence[float] = (10.0, 20.0, 30.0), *, versions: Sequence[Version] = ("v2.1",)) -> None:
         limits = [0.0, *edges, np.inf]
         self._ranges = {
             f"from {low:g} m" if high == np.inf else f"{low:g} to {high:g} m": (low, high)
             for low, high in itertools.pairwise(limits)
         }
-        super().__init__(("all", *self._ranges), version=version)
+        super().__init__(("all", *self._ranges), versions=versions)
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table of these numbers."""
-        return f"OpenLane-V2 centerline {self.version}, by distance of a lane's nearest vertex"
+        """Name and version, the title of every table of these numbers."""
+        return f"{_protocol(self.versions)}, by distance of a lane's nearest vertex"
 
     def _members(self, group: str, truth: LaneTruth, lanes: int) -> Bool[np.ndarray, " g"]:
         low, high = self._ranges[group]

@@ -1,29 +1,43 @@
 """Topology scores of OpenLane-V2: the average precision of each true vertex, in the two published versions.
 
-Source: shared specs/metrics.md sections 2.4 (v2.1 = v1.1) and 2.6 (v1.0).
+Source: `topology` in openlanev2/centerline/evaluation of the OpenLane-V2 devkit, tags v1.0.0 and v2.1.0.
+docs/reference/metrics.md describes both.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.errors import UserError
 from tflane_jax.metrics.matching import descending, vertex_average_precision
 
 Version = Literal["v2.1", "v1.0"]
 
-# The confidence of a false edge that the official program puts where no matched pair says anything: just above the
-# edge threshold 0.5 (by float32's epsilon) in v2.1, the highest in v1.0.
+# The confidence of the false edge that the official program assumes at a vertex without a match: just above the edge
+# threshold 0.5 (by float32's epsilon) in v2.1, the highest possible in v1.0.
 FILL: dict[Version, float] = {"v2.1": 0.5 + 2.0**-23, "v1.0": 1.0}
 LEVELS = 10
+
+
+def check_versions(versions: Sequence[Version]) -> tuple[Version, ...]:
+    """Return the versions as a tuple; raise UserError if there is none, an unknown one, or one of them twice."""
+    known = get_args(Version)
+    if not versions or len(set(versions)) != len(versions) or not set(versions) <= set(known):
+        raise UserError(f"versions of the topology score are {versions!r}, expected some of {known}, each once")
+    return tuple(versions)
 
 
 def matchings(
     scores: Float[np.ndarray, " p"], taken: Int[np.ndarray, " p"], version: Version
 ) -> Int[np.ndarray, "levels p"]:
-    """Return the matchings over which the version averages: the one given in v2.1, ten cut-off ones in v1.0."""
+    """Return the matchings over which the version averages: v2.1 the given one, v1.0 ten that are cut by confidence.
+
+    `taken` is the true lane or element of each detection, -1 for none.
+    """
     if version == "v2.1":
         return taken[None]
     return np.where(confidence_levels(scores, taken), taken, -1)
@@ -53,9 +67,14 @@ def topology_precision(
 ) -> Float[np.ndarray, "k g+t"]:
     """Return the average precision of every true vertex (g rows, then t columns) for k matchings.
 
-    `rows` and `columns` give the truth that each detection takes, -1 for none. The confidence of a detected edge
-    counts where both its ends are matched. Everywhere else stand no edge where there is one, and a false edge of
-    confidence `fill` where there is none.
+    A pair of true vertices that are both matched gets the confidence of the detected edge. Every other pair counts as
+    wrong: a true edge is missed (confidence 0), and where there is no edge a false one has the confidence `fill`.
+
+    Args:
+        edges: true edges.
+        confidence: of the detected edges, 0 to 1.
+        rows, columns: the true vertex that each detection takes, -1 for none; one row for each matching.
+        fill: confidence of false edges.
     """
     matched = np.broadcast_to(np.where(edges, 0.0, fill), (len(rows), *edges.shape))
     if confidence.size:

@@ -1,8 +1,8 @@
-"""TuSimple lane metrics: accuracy, false positives and false negatives (shared specs/metrics.md section 5).
+"""TuSimple lane metrics: accuracy, false positives and false negatives (docs/reference/metrics.md, section 5).
 
-The official rules have corners that surprise: rows without a point on either side count as hits, a prediction may serve
-several lanes (so that false positives can be negative), one lane of more than four may be missed for nothing, and with
-six or more lanes the accuracy can exceed 1. All of them are kept.
+Four official rules surprise, and are kept: rows without a point on both sides count as hits; a prediction may match
+several lanes, so that false positives can be negative; with more than four lanes, one may be missed without a penalty;
+with six or more lanes the accuracy can exceed 1.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 
 PIXEL_THRESHOLD = 20.0  # across the lane
-MATCHED = 0.85  # least share of rows
+MATCHED = 0.85  # least fraction of rows
 OFFICIAL_TIME_LIMIT, LSTR_TIME_LIMIT = 200.0, 20_000.0  # milliseconds
 _ABSENT = -100.0
-_LANES = 4  # the benchmark is about the ego lane's and its neighbours' lines
+_LANES = 4  # the lines of the ego lane and of its neighbours
 
 
 class TuSimpleMetrics:
@@ -36,7 +36,7 @@ class TuSimpleMetrics:
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table of these numbers."""
+        """Name and version, the title of every table of these numbers."""
         return f"TuSimple, {self.time_limit:g} ms an image"
 
     def update(self, detections: RowLanes, truth: RowLanes) -> None:
@@ -62,7 +62,7 @@ class TuSimpleMetrics:
 def score_image(
     detections: RowLanes, truth: RowLanes, time_limit: float = OFFICIAL_TIME_LIMIT
 ) -> tuple[float, float, float]:
-    """Return accuracy, share of false positives and share of missed lanes of one image."""
+    """Return accuracy, fraction of false positives and fraction of missed lanes of one image."""
     if truth.rows is None:
         raise UserError("truth: the rows (h_samples) of the lanes are missing")
     rows = np.asarray(truth.rows, np.float64)
@@ -82,9 +82,9 @@ def score_image(
 
 
 def pixel_thresholds(true: Float[np.ndarray, "g h"], rows: Float[np.ndarray, " h"]) -> Float[np.ndarray, " g"]:
-    """Return how far a point may lie from each lane along its row, so that it is 20 pixels across the lane.
+    """Return the distance along a row, pixels, that is 20 pixels across each lane.
 
-    The slope is that of the least-squares line through the lane's points; a lane of one point counts as upright.
+    The slope is that of the least-squares line through the lane's points; a lane of one point counts as vertical.
     """
     valid = true >= 0
     count = np.maximum(valid.sum(-1, keepdims=True), 1)
@@ -98,7 +98,7 @@ def pixel_thresholds(true: Float[np.ndarray, "g h"], rows: Float[np.ndarray, " h
 def line_accuracy(
     true: Float[np.ndarray, "g h"], found: Float[np.ndarray, "p h"], thresholds: Float[np.ndarray, " g"]
 ) -> Float[np.ndarray, "g p"]:
-    """Return the share of rows in which a prediction is nearer than the threshold; rows absent in both are hits."""
+    """Return the fraction of rows in which a prediction is nearer than the threshold; rows absent in both are hits."""
     true, found = (np.where(x < 0, _ABSENT, x) for x in (true, found))
     near = np.abs(true[:, None] - found[None]) < thresholds[:, None, None]
     return near.mean(-1) if near.shape[-1] else np.zeros(near.shape[:2])

@@ -1,7 +1,7 @@
 """MapTR's metric of vectorised maps: average precision by Chamfer distance, per class, and its mean (mAP).
 
-Rules: shared specs/metrics.md section 4. The optional metric by the overlap of buffers (`iou`), which no paper here
-reports, is left out.
+Rules: docs/reference/metrics.md, section 4. The optional metric by overlap of buffers (`iou`) is not implemented: none
+of the papers reports it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class MapDetections:
     """Detected map elements of one frame: P lines.
 
     Attributes:
-        points: P polylines (n, 2), metres; each may have its own n. One of a single point is left out, as officially.
+        points: P polylines (n, 2), metres; each may have its own n. Lines of one point are ignored, as officially.
         classes: (P,) 0 divider, 1 pedestrian crossing, 2 boundary.
         scores: (P,) confidence; only the order counts.
     """
@@ -64,7 +64,7 @@ class VectorMapMetrics:
 
     Args:
         sampling: of the detections. "maptr": to 100 points, as in all official configurations
-            (`eval_use_same_gt_sample_num_flag`); "maptrv2": the same, but those of exactly 100 points stay as they are;
+            (`eval_use_same_gt_sample_num_flag`); "maptrv2": the same, but lines of exactly 100 points stay unchanged;
             "as_given": none. Ground truth is always resampled.
     """
 
@@ -76,7 +76,7 @@ class VectorMapMetrics:
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table of these numbers."""
+        """Name and version, the title of every table of these numbers."""
         return _PROTOCOLS[self.sampling]
 
     def update(self, detections: MapDetections, truth: MapTruth) -> None:
@@ -127,11 +127,11 @@ class VectorMapMetrics:
 
 @dataclass(frozen=True)
 class MatchedMap:
-    """What the metric keeps of one frame; detections of a single point are gone.
+    """Matching results of one frame, without detections of a single point.
 
     Attributes:
         scores, classes: (P,).
-        nearest: (P,) the true line that each detection is nearest to; without meaning beyond the largest threshold.
+        nearest: (P,) the true line nearest to each detection; arbitrary beyond the largest threshold.
         distance: (P,) Chamfer distance to it, metres; inf beyond the largest threshold.
         hits: (K, P) true positive.
         truths: (3,) number of true lines of each class.
@@ -146,7 +146,7 @@ class MatchedMap:
 
 
 def match_map(detections: MapDetections, truth: MapTruth, sampling: Sampling = "maptr") -> MatchedMap:
-    """Match one frame, all classes at once: a line of another class is never nearest."""
+    """Match one frame, all classes at once: only lines of the same class are compared."""
     true = PaddedLines.of(truth.points, "truth", dims=2)
     true_classes = _checked_classes(truth.classes, len(true), "truth")
     if (true.counts < 2).any():
@@ -167,8 +167,8 @@ def match_map(detections: MapDetections, truth: MapTruth, sampling: Sampling = "
 def map_distance(true: PaddedLines, found: PaddedLines, same: Bool[np.ndarray, "g p"]) -> Float[np.ndarray, "g p"]:
     """Return the Chamfer distances up to the largest threshold, metres; inf beyond it and where `same` is false.
 
-    Also inf where the lines, made 4 m wide, do not touch: officially such a pair is not compared. Short pieces that lie
-    end to end fall under it.
+    Also inf if the buffers of the lines (2 m to each side) do not touch: the official program does not compare such
+    pairs, for example short pieces that lie end to end.
     """
     i, j = near_pairs(true, found, MAP_THRESHOLDS[-1], same)
     chamfer = pair_chamfer(true, found, i, j)

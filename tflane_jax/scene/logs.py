@@ -1,8 +1,7 @@
-"""What a drive recorded: a vector map, ego poses and tracks, on the host, in numpy.
+"""The log of a drive: vector map, ego poses and tracks, in numpy on the host.
 
-A `Log` is what the built-in world simulates and what the Argoverse 2 reader reads; `tflane_jax.datasets.examples` turns
-one moment of it into an `Example`. Global coordinates (city frame) stay float64 here; nothing on this floor is padded
-except tracks, which carry `valid`.
+The built-in world simulates a `Log` and the Argoverse 2 reader reads one; `tflane_jax.datasets.examples` makes an
+`Example` of one moment. Global coordinates (city frame) stay float64. Only tracks are padded, with `valid`.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class VectorMap:
         road_boundaries: polylines (n, 3); a closed ring repeats its first point.
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks beside the road, unlimited in height.
-        roads: one line (n, 3) in the middle of each road, of sources that know roads; a closed one repeats its first
+        roads: the middle line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first
             point.
     """
 
@@ -88,9 +87,9 @@ class Tracks:
         yaw: (F, K) radians.
         size: (K, 3) length, width, height, metres.
         category: (K,) `scene.RoadUser`.
-        occluded: (F, K) reported without being seen.
+        occluded: (F, K) the tracker reports the box without seeing it.
         valid: (F, K).
-        uuid: (K,) str, the source's name of the track.
+        uuid: (K,) str, name of the track in the source.
     """
 
     position: np.ndarray
@@ -114,8 +113,7 @@ class KeyFrame:
     Attributes:
         timestamp_ns: the moment.
         global_from_ego: (4, 4) float64 pose at that moment.
-        track_frame: index into the log's track frames of the frame that belongs to this moment; the history is what
-            lies strictly before it.
+        track_frame: index of this moment's frame among the log's track frames; its history lies strictly before it.
     """
 
     timestamp_ns: int
@@ -125,7 +123,7 @@ class KeyFrame:
 
 @dataclass(frozen=True)
 class PlacedMarkers:
-    """Fiducial markers that stand beside the road; `tflane_jax.markers` says what the frame of a marker is.
+    """Fiducial markers beside the road; `tflane_jax.markers` defines the frame of a marker.
 
     Attributes:
         marker_id: (M,) int32, unique within a log.
@@ -150,16 +148,16 @@ class Log:
         map: static map.
         timestamps_ns: (F,) int64, one for each track frame.
         global_from_ego: (F, 4, 4) float64, the ego pose of each track frame.
-        tracks: what the tracker reported: the only traffic a prior may see.
-        actors: every box that was really there, for line of sight and the obstacle channel (the same object as `tracks`
-            where a source has no tracker in between).
+        tracks: reported by the tracker; the only traffic that a prior may use.
+        actors: all true boxes, for line of sight and the obstacle channel; the same object as `tracks` if the source
+            simulates no tracker.
         keyframes: moments at which examples are made, in time order.
-        element_attribute: (F, E) attribute of each of the map's elements at each track frame (the state of a light);
-            None where every element keeps its own.
+        element_attribute: (F, E) attribute of each map element at each track frame (the state of a light); None if
+            all are constant.
         weather: 0 (clear) to 1 (worst), dims the evidence.
         paint_wear: 0 (fresh) to 1 (gone), dims lane paint.
-        seed: root of everything random that is drawn when this log is rendered.
-        markers: fiducial markers beside the road; None where nobody has put any up.
+        seed: of all random numbers drawn when this log is rendered.
+        markers: fiducial markers beside the road; None if there are none.
     """
 
     name: str

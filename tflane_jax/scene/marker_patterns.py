@@ -32,7 +32,7 @@ class MarkerFamily(enum.Enum):
     APRILTAG_36H11 = "DICT_APRILTAG_36h11"
 
 
-# Cells of white around the black square of a printed marker: detectors need one.
+# White cells around the black square of a printed marker, which detectors need.
 MARGIN = 1
 
 
@@ -51,7 +51,7 @@ def marker_count(family: MarkerFamily) -> int:
 
 
 def correctable_bits(family: MarkerFamily) -> int:
-    """Return how many wrong bits of a marker of this family can be put right without doubt about its id."""
+    """Return how many wrong bits of a marker of this family can be corrected with a unique id."""
     return int(dictionary_of(family).maxCorrectionBits)
 
 
@@ -63,7 +63,7 @@ def cells_across(family: MarkerFamily) -> int:
 def marker_cells(family: MarkerFamily, marker_id: int) -> Bool[np.ndarray, "n n"]:
     """Return which cells of a marker are white, top row first, with its black border and without a margin.
 
-    The array is remembered: do not write into it. Raises UserError for an id that the family does not have.
+    The array is cached and read-only. Raises UserError for an id that the family does not have.
     """
     return _cells(family, int(marker_id))
 

@@ -2,8 +2,8 @@
 
 Submission (a pickle): {"results": {(split, segment, timestamp): {"predictions": {...}}}}. Annotations: the devkit's
 collected pickle {(split, segment, timestamp): {"annotation": {...}}}, or the dataset's folder with
-`<split>/<segment>/info/<timestamp>.json`, `<timestamp>-ls.json` for lane segments. Source: shared
-specs/data_formats.md section 2.2, specs/metrics.md section 6.
+`<split>/<segment>/info/<timestamp>.json`, `<timestamp>-ls.json` for lane segments. Sources:
+docs/reference/data_formats.md, section 2, and docs/reference/metrics.md, section 6.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from tflane_jax.metrics.lane_segment import (
     SegmentTruth,
 )
 
-# The published numbers are measured on every 20th of a centerline's points.
+# Published numbers use every 20th point of a centerline.
 _STRIDE = 20
-# Lines of segments and areas are measured on so many points, equally spaced.
+# Points of the lines of segments and of areas, equally spaced.
 _LINE_POINTS, _AREA_POINTS = 10, 20
 
 
@@ -67,8 +67,8 @@ def read_segment_truth(
 ) -> dict[FrameKey, SegmentTruth]:
     """Return lane-segment annotations, a collected file's or a folder's; raises UserError as `read_predictions`.
 
-    Lines get 10 points and areas 20, unless they have as many already. In the flavour "LaneSegNet" a crossing of five
-    corners becomes its two long sides, 10 points each, as LaneSegNet measures it.
+    Lines are resampled to 10 points and areas to 20. In the flavour "LaneSegNet" a crossing of five corners becomes its
+    two long sides of 10 points each.
     """
     return _annotations(path, SEGMENT, lambda record, where: _segment_truth(record, where, flavour), progress)
 
@@ -173,7 +173,7 @@ def _with_points(line: np.ndarray, count: int) -> np.ndarray:
 
 
 def _long_sides(corners: np.ndarray) -> np.ndarray:
-    """Return a crossing as LaneSegNet measures it: corners 0 to 1, then corners 2 to 3."""
+    """Return the two long sides of a crossing, as LaneSegNet's evaluation: corners 0 to 1, then corners 2 to 3."""
     return np.concatenate([resample(corners[:2], _AREA_POINTS // 2), resample(corners[2:4], _AREA_POINTS // 2)])
 
 

@@ -27,7 +27,7 @@ SUFFIXES = (".npz", ".json")
 
 
 class PlainKey(NamedTuple):
-    """Which frame."""
+    """Identifier of a frame."""
 
     scene: str
     timestamp_ns: str
@@ -73,7 +73,7 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
     try:
         with path.open("rb") as stream:
             if not zipfile.is_zipfile(stream):
-                raise ValueError("no archive")  # numpy would take other kinds of files for one
+                raise ValueError("no archive")  # numpy reads other kinds of files too
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}

@@ -1,4 +1,4 @@
-"""The protocols that `tflane score` knows: which files they read and which metric they feed."""
+"""The protocols of `tflane score`: the files that they read and the metric that they compute."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class ScoringProtocol:
     """One protocol.
 
     Attributes:
-        read_predictions, read_truth: from a path to what the metric compares, by frame.
-        scene_of: from a frame to the name of its scene.
-        metrics: returns a fresh accumulator.
-        columns: of its table, in this order; others stay in the JSON file.
-        groups: from the name of a way to part lanes, "occlusion" or "distance", to a fresh accumulator that does; its
-            numbers come by group.
+        read_predictions, read_truth: read a path and return the input of the metric by frame.
+        scene_of: returns the name of a frame's scene.
+        metrics: returns a new accumulator.
+        columns: of the table, in this order; the JSON file has them all.
+        groups: by a criterion that partitions lanes, "occlusion" or "distance": returns a new accumulator whose numbers
+            are by group.
     """
 
     read_predictions: Callable[[Path], Mapping[Any, Any]]
@@ -51,11 +51,11 @@ def _centerline(version: Version) -> ScoringProtocol:
         read_predictions=_plain_or(plain.read_predictions, openlane_v2.read_predictions),
         read_truth=_plain_or(plain.read_truth, openlane_v2.read_truth),
         scene_of=lambda key: key.scene,
-        metrics=partial(CenterlineMetrics, version),
+        metrics=partial(CenterlineMetrics, (version,)),
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
         groups={
-            "occlusion": partial(GroupedCenterlineMetrics, version=version),
-            "distance": partial(DistanceCenterlineMetrics, version=version),
+            "occlusion": partial(GroupedCenterlineMetrics, versions=(version,)),
+            "distance": partial(DistanceCenterlineMetrics, versions=(version,)),
         },
     )
 

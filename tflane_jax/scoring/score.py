@@ -1,7 +1,7 @@
 """Score predictions against ground truth by a protocol: whole, by scene, with confidence intervals.
 
-Frames are kept by scene, so that scenes can be reported alone and drawn again for the bootstrap: frames of one drive
-look alike, and intervals over frames would be far too narrow.
+Frames are grouped by scene, for numbers by scene and for the bootstrap over scenes: frames of one drive are alike, so
+intervals over frames would be far too narrow.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tflane_jax.errors import UserError
 
 
 class Accumulator(Protocol):
-    """What every metric of `tflane_jax.metrics` is."""
+    """The interface of every metric of `tflane_jax.metrics`."""
 
     @property
     def protocol(self) -> str:
@@ -46,7 +46,7 @@ class Scored:
 
     @property
     def protocol(self) -> str:
-        """Name and version, to stand above every table."""
+        """Name and version, the title of every table."""
         return next(iter(self.scenes.values())).protocol
 
     def total(self) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class Scored:
     ) -> dict[str, tuple[float, float]]:
         """Return percentile bootstrap intervals of the numbers: scenes are drawn with replacement, `samples` times.
 
-        Raises UserError where there are fewer than two scenes, of which nothing can be drawn.
+        Raises UserError for fewer than two scenes.
         """
         scenes = list(self.scenes.values())
         if len(scenes) < 2:

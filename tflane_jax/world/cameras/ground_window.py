@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from tflane_jax.world.front_view.surface import noise_tile
+from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import SHIFT
 
 # What one standard deviation of noise is in bytes.

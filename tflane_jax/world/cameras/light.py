@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.geometry import invert_pose
 from tflane_jax.world.cameras.solids import footprints
-from tflane_jax.world.front_view.surface import noise_tile
 from tflane_jax.world.render.camera import NEAR, FrontCamera, lift
+from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, clipped, fixed_point
 from tflane_jax.world.render.weather import FrontWeatherConfig, Weather, draw_weather
 

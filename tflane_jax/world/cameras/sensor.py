@@ -25,8 +25,8 @@ from tflane_jax.world.cameras.moment import NEAR_REACH, Moment, attributes_at, i
 from tflane_jax.world.cameras.ring import CameraRigConfig, camera_stream, draw_rig, enlarged
 from tflane_jax.world.cameras.solids import draw_bodies
 from tflane_jax.world.cameras.stage import SHADE_TEXEL, Stage, Stream, stage_of
-from tflane_jax.world.front_view.picture import develop
 from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.exposure import develop
 from tflane_jax.world.render.weather import Weather
 
 # What a front-view picture of width 640 is to the rain and the lens.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from jaxtyping import Float
 
@@ -12,24 +10,11 @@ from tflane_jax.world.front_view.ground import Ground
 from tflane_jax.world.front_view.road import Beside, Highway
 from tflane_jax.world.front_view.stripes import draw_stripe
 from tflane_jax.world.render.camera import FrontCamera
+from tflane_jax.world.render.noise import TILE, noise_tile
 
 # The profile across the road is tabled at this spacing, metres, to this offset on either side.
 _STEP, _WIDEST = 0.04, 80.0
-_TILE = 256
 _GRASS = ((0.30, 0.35, 0.18), (0.36, 0.38, 0.22), (0.42, 0.38, 0.26), (0.25, 0.3, 0.16), (0.5, 0.44, 0.32))
-
-
-@functools.cache
-def noise_tile() -> Float[np.ndarray, "n n"]:
-    """Return smooth periodic noise of unit variance, the same in every process."""
-    rng = np.random.default_rng(20_250_712)
-    frequency = np.fft.fftfreq(_TILE)
-    radius = np.hypot(frequency[:, None], frequency[None, : _TILE // 2 + 1]) * _TILE
-    strength = np.zeros_like(radius)
-    seen = (radius > 2.0) & (radius < 90.0)
-    strength[seen] = radius[seen] ** -0.8
-    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((_TILE, _TILE))) * strength)
-    return (noise / noise.std()).astype(np.float32)
 
 
 def paint_ground(
@@ -91,7 +76,7 @@ def _texture(rng: np.random.Generator, ground: Ground, dirt: float) -> Float[np.
     tile, factor = noise_tile(), np.ones_like(ground.s)
     # Cell along and across the road (metres) and strength; each fades where a pixel covers more than a few cells.
     for along, across, strength in ((0.9, 0.22, 0.025 + 0.05 * dirt), (0.03, 0.015, 0.06 + 0.05 * dirt)):
-        shift = rng.uniform(0.0, _TILE, 2).astype(np.float32)
+        shift = rng.uniform(0.0, TILE, 2).astype(np.float32)
         seen = strength * np.clip(8.0 * along / ground.length - 1.0, 0.0, 1.0).astype(np.float32)
         near = slice(int(np.argmax(seen > 0.0)), None)
         values = cv2.remap(

@@ -16,13 +16,14 @@ from tflane_jax.errors import UserError
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.world.front_view.ground import look_at_ground
 from tflane_jax.world.front_view.lines import label_lines
-from tflane_jax.world.front_view.picture import develop, draw_backdrop, light_ground, show_ground
+from tflane_jax.world.front_view.picture import draw_backdrop, light_ground, show_ground
 from tflane_jax.world.front_view.road import Highway, HighwayConfig, draw_highway
 from tflane_jax.world.front_view.roadside import Roadside, draw_roadside
 from tflane_jax.world.front_view.surface import paint_ground
 from tflane_jax.world.front_view.traffic import FrontTraffic, FrontTrafficConfig, draw_traffic
 from tflane_jax.world.front_view.vehicles import vehicle_solids
 from tflane_jax.world.render.camera import FrontCamera, FrontCameraConfig, draw_camera
+from tflane_jax.world.render.exposure import develop
 from tflane_jax.world.render.polygons import draw_solids
 from tflane_jax.world.render.weather import FrontWeatherConfig, Weather, draw_weather
 

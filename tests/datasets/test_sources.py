@@ -1,0 +1,181 @@
+"""The list of data sources: a new dataset costs one file and one entry, and no source ignores --split."""
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.shared import ROOT
+from tflane_jax.cli import build_parser, main
+from tflane_jax.commands.sources import chosen_source
+from tflane_jax.config import FrontViewData, LogData, OpenLaneV2Data, RunConfig, TuSimpleData, WorldData
+from tflane_jax.datasets import sources
+from tflane_jax.datasets.argoverse2 import Argoverse2Config
+from tflane_jax.datasets.base import SPLITS
+from tflane_jax.datasets.front_views import FrontViewConfig
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
+from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.tusimple import TuSimpleConfig
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Example, RoadImage
+from tflane_jax.tasks.lane_shape import LaneShapeTask
+
+IMAGES = RunConfig(LaneShapeTask(), FrontViewData())
+
+
+def chosen(*arguments, config=None):
+    options = build_parser().parse_args(["eval", "run", *map(str, arguments)])
+    return chosen_source(config or RunConfig(), options)
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """A folder of two splits with a log each; the annotations are not read here."""
+    for split in ("train", "val"):
+        (tmp_path / "sensor" / split / f"{split}-log").mkdir(parents=True)
+        (tmp_path / "sensor" / split / f"{split}-log" / "annotations.feather").touch()
+    return tmp_path
+
+
+def test_a_new_dataset_is_one_file_and_one_entry(tmp_path):
+    text = Path(sources.__file__).read_text(encoding="utf-8")
+    entry = "    tusimple.SOURCE,\n"
+    assert text.count(entry) == 1
+    listed = tmp_path / "sources.py"
+    listed.write_text("from tests.datasets import toy_source\n" + text.split("from __future__ import annotations\n")[1])
+    listed.write_text(listed.read_text().replace(entry, entry + "    toy_source.SOURCE,\n"))
+    work = tmp_path / "work"
+    work.mkdir()
+    command = [sys.executable, "-m", "tests.datasets.toy_session", str(listed), str(work)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_source_has_its_own_name_and_one_config():
+    assert len({source.name for source in sources.SOURCES}) == len(sources.SOURCES)
+    for source in sources.SOURCES:
+        assert sources.named_source(source.name) is source
+        same = {one.config: one.data for one in sources.SOURCES if one.data is source.data}
+        assert same == {source.config: source.data}
+    with pytest.raises(UserError, match="no data source toys, only procedural, "):
+        sources.named_source("toys")
+    with pytest.raises(TypeError, match="config of no data source"):
+        sources.open_dataset(RunConfig())
+
+
+@pytest.mark.parametrize(
+    ("data", "kind", "names"),
+    [
+        (WorldData(), Example, ["procedural-train", "procedural-val", "procedural-test"]),
+        (LogData(Path("a/train"), Path("b"), Path("c")), Example, ["argoverse2-train", "argoverse2", "argoverse2"]),
+        (OpenLaneV2Data(Path("o")), Example, ["openlane-v2-A-train", "openlane-v2-A-val", "openlane-v2-A-val"]),
+        (FrontViewData(), RoadImage, ["front-views-train", "front-views-val", "front-views-test"]),
+        (TuSimpleData(Path("t")), RoadImage, ["tusimple-train", "tusimple-val", "tusimple-test"]),
+    ],
+)
+def test_data_of_a_run_lead_to_their_source(data, kind, names):
+    splits = [data.source(split) for split in SPLITS]
+    assert [sources.source_name(config) for config in splits] == names
+    for config in splits:
+        source = sources.source_of(config)
+        assert (source.data, source.config, source.example) == (type(data), type(config), kind)
+
+
+def test_the_split_counts_where_root_is_given(tmp_path, logs):
+    """TuSimple's --root took all training files whatever the split, Argoverse 2's all logs of all splits."""
+    for split in SPLITS:
+        expected = TuSimpleConfig(str(tmp_path), split)
+        assert chosen("--data", "tusimple", "--root", tmp_path, "--split", split, config=IMAGES) == expected
+    # A configuration that reads the training files as its test split does so in its own folder only.
+    everything = RunConfig(LaneShapeTask(), TuSimpleData(Path("own"), train="all", val="all", test="all"))
+    assert chosen("--split", "test", config=everything) == TuSimpleConfig("own", "all")
+    assert chosen("--root", tmp_path, "--split", "test", config=everything) == TuSimpleConfig(str(tmp_path), "test")
+    assert chosen("--root", tmp_path, config=everything) == TuSimpleConfig(str(tmp_path), "test")
+
+    for split in ("train", "val"):
+        source = chosen("--data", "argoverse2", "--root", logs, "--split", split)
+        assert source == Argoverse2Config(logs / "sensor" / split)
+        assert chosen("--data", "argoverse2", "--root", logs / "sensor", "--split", split) == source
+
+    source = chosen("--data", "openlane-v2", "--root", tmp_path, "--split", "train")
+    assert source == OpenLaneV2Config(tmp_path, "train", example=WorldData().example)
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_the_split_counts_in_made_data(split):
+    scenes = {"train": 2000, "val": 100, "test": 200}[split]
+    assert chosen("--split", split) == ProceduralConfig(split, scenes=scenes)
+    assert chosen("--data", "world-cameras", "--split", split).split == split
+    logs = RunConfig(data=LogData(Path("a"), Path("b"), Path("c")))
+    assert chosen("--data", "procedural", "--split", split, config=logs) == ProceduralConfig(split, scenes=100)
+    photos = RunConfig(LaneShapeTask(), TuSimpleData(Path("t")))
+    assert chosen("--data", "front-views", "--split", split, config=photos) == FrontViewConfig(split, images=100)
+
+
+def test_a_split_that_logs_do_not_have_is_refused(logs):
+    for arguments in (["--split", "test"], []):  # the default of eval is test
+        with pytest.raises(UserError, match="has no split test, only train, val: choose one with --split"):
+            chosen("--data", "argoverse2", "--root", logs, *arguments)
+    # A folder of logs has no splits: the default takes them all, a split that was asked for is an error.
+    folder = logs / "sensor" / "val"
+    for where in (folder, folder / "val-log"):
+        assert chosen("--data", "argoverse2", "--root", where) == Argoverse2Config(where)
+        with pytest.raises(UserError, match="is not divided into splits, so --split train cannot"):
+            chosen("--data", "argoverse2", "--root", where, "--split", "train")
+    assert chosen("--data", "argoverse2", "--root", folder, "--split", "val") == Argoverse2Config(folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "config", "message"),
+    [
+        (["--data", "procedural", "--root", "x"], None, "--data procedural takes no --root"),
+        (["--data", "argoverse2"], None, "needs --root PATH, a log or a folder of logs"),
+        (["--root", "x"], None, "add --data argoverse2 or --data openlane-v2"),
+        (["--root", "x"], IMAGES, "--root is the folder of real data: add --data tusimple$"),
+        (["--data", "tusimple", "--root", "x"], None, "no lane graphs: this model takes procedural, .* or openlane-v2"),
+        (["--data", "procedural"], IMAGES, "are no images: this model takes front-views or tusimple"),
+        ([], replace(IMAGES, data=WorldData()), "data are lane graphs, but its task takes images"),
+        ([], replace(RunConfig(), data=FrontViewData()), "data are images, but its task takes lane graphs"),
+    ],
+)
+def test_what_does_not_fit_is_refused(arguments, config, message):
+    with pytest.raises(UserError, match=message):
+        chosen(*arguments, config=config)
+
+
+def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
+    for arguments, names in (
+        (["eval", "--help"], "{procedural,world-cameras,argoverse2,openlane-v2,front-views,tusimple}"),
+        (["data", "check", "--help"], "{argoverse2,openlane-v2,tusimple}"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0
+        assert names in capsys.readouterr().out
+    with pytest.raises(SystemExit) as ended:
+        main(["eval", "run", "--data", "toy"])
+    assert ended.value.code == 2
+    assert "'toy' is none of procedural, world-cameras, argoverse2" in capsys.readouterr().err
+
+
+def test_tusimples_folder_is_checked(tmp_path, capsys):
+    pytest.importorskip("cv2")
+    record = {"raw_file": "clips/a.jpg", "lanes": [[100, -2]], "h_samples": [700, 710]}
+    (tmp_path / "clips").mkdir()
+    (tmp_path / "clips" / "a.jpg").touch()
+    for name in ("label_data_0313.json", "label_data_0531.json"):
+        (tmp_path / name).write_text(json.dumps(record) + "\n")
+    assert main(["data", "check", "--format", "tusimple", str(tmp_path)]) == 2
+    text = capsys.readouterr().out
+    assert "lacks label_data_0601.json of split train" in text
+    assert "lacks the label file test_label.json of split test" in text
+    shutil.copy(tmp_path / "label_data_0313.json", tmp_path / "label_data_0601.json")
+    (tmp_path / "label_data_0601.json").write_text(json.dumps(record | {"raw_file": "clips/b.jpg"}) + "\n")
+    shutil.copy(tmp_path / "clips" / "a.jpg", tmp_path / "clips" / "b.jpg")
+    shutil.copy(tmp_path / "label_data_0531.json", tmp_path / "test_label.json")
+    assert main(["data", "check", "--format", "tusimple", str(tmp_path)]) == 0
+    assert "| train |      2 |           2 |" in capsys.readouterr().out

@@ -1,9 +1,9 @@
-"""How long the camera images of the built-in world take.
+"""Time to render the camera images of the built-in world.
 
     python -m benchmarks.camera_world --out runs/bench
 
-One process on one core; CPU time, since that is what a busy machine leaves comparable. A scene's ground, scenery and
-sky are drawn once and serve all its key frames, so a frame of a data set costs its share of that, and its own images.
+One process on one core. CPU time, because wall time depends on the load of the machine. Ground, scenery and sky of a
+scene are drawn once for all its key frames, so a frame costs its images and a fraction of that.
 """
 
 from __future__ import annotations

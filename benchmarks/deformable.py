@@ -2,8 +2,9 @@
 
     python -m benchmarks.deformable --out runs/bench
 
-Forward, and forward with the gradients of value, locations and weights, in float32. Queries stand in raster order over
-the maps and look around themselves. PyTorch, where it is installed, runs on the same cores in the same rounds.
+Forward, and forward with the gradients of value, locations and weights, in float32. Queries are in raster order over
+the maps and sample around their own position. If PyTorch is installed, it runs on the same cores in the same
+rounds.
 """
 
 from __future__ import annotations

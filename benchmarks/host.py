@@ -1,4 +1,4 @@
-"""What the host and its traffic-flow module cost: inference, training step, several seeds at once, time to first step.
+"""Time of a host and its traffic-flow module: inference, training step, several seeds at once, first step.
 
     python -m benchmarks.host --out runs/bench
 
@@ -47,7 +47,7 @@ def tasks() -> dict[str, LaneGraphTask]:
 def paper_size_tasks() -> dict[str, LaneGraphTask]:
     """Return both with TopoNet's own decoder: 256 channels, 6 layers, 200 queries, 100 x 200 BEV cells.
 
-    The encoder stays small. With cameras and BEVFormer in its place the TFM's share would be smaller still.
+    The encoder stays small. With cameras and BEVFormer, the TFM's fraction of the time would be smaller.
     """
     decoder = LaneDecoderConfig(dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed")
     model = TopoNetConfig(encoder=EvidenceEncoderConfig(dim=64, cell=1), decoder=decoder)

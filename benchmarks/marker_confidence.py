@@ -1,9 +1,9 @@
-"""What the confidence of Eq. (2) says of simulated detections: how far they lie off, and how far they are trusted.
+"""The confidence of Eq. (2) against the error of simulated marker detections.
 
     python -m benchmarks.marker_confidence --scenes 40
 
-The test split of `configs/markers/` with the paper's simulation, against the same frames without noise. How far off a
-detection is, is how far it moves the ground from 10 m behind to 30 m ahead of the vehicle, on average.
+The test split of `configs/markers/` with the paper's simulation, against the same frames without noise. The error of
+a detection is the mean displacement of the ground from 10 m behind to 30 m ahead of the vehicle.
 """
 
 from __future__ import annotations

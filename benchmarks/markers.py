@@ -1,9 +1,9 @@
-"""What markers and their memory cost a host that streams: one frame, with the memory of the frames before it.
+"""Time of markers and their memory in a host that streams: one frame, with the memory of the frames before it.
 
     python -m benchmarks.markers --out runs/bench
 
-The models are those of `configs/markers/`. Without memory a frame's own markers guide it; with memory the bank is
-moved, aged and looked up in every frame, whether a marker is in sight or not.
+The models are those of `configs/markers/`. Without memory the prior tokens come from the frame's own markers. With
+memory the bank is moved, decayed and read in every frame, with or without markers in sight.
 """
 
 from __future__ import annotations

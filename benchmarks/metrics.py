@@ -1,11 +1,11 @@
-"""How many frames per second the metrics score, and how many times as fast as the official evaluators that is.
+"""Frames per second of the metrics, and the speed-up over the official evaluators.
 
     python -m benchmarks.metrics --out runs/bench
 
-One process; CPU time, since that is what a busy machine leaves comparable. Frames are random but realistic: curved
+One process. CPU time, because wall time depends on the load of the machine. Frames are random but realistic: curved
 lanes around the ego, each detected half a metre off with a high score; of the remaining detections, with low scores,
 half lie some metres from a true lane, as the queries of a transformer do, and half anywhere. The official times are
-quoted from shared specs/metrics.md section 8 (CPU time, a comparable machine of two cores).
+quoted from docs/reference/metrics.md, section 7 (CPU time, a comparable machine of two cores).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Timing that a busy machine cannot falsify: compiled programs in turn, compared round by round.
+"""Comparisons of compiled programs that stay valid on a busy machine.
 
-Arrays are arguments, since XLA folds the constants of a closure into the program; compilation is timed apart; the
-programs of a comparison run one after the other in every round, and what is reported is the median over rounds of the
-ratio of two times of one round, so that a neighbour's load hits both.
+Arrays are arguments, because XLA folds the constants of a closure into the program. Compilation is timed apart. In
+every round the programs of a comparison run one after the other; the result is the median over rounds of the ratio of
+two times of one round, so that the load of the machine affects both.
 """
 
 from __future__ import annotations

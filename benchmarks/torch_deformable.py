@@ -1,7 +1,7 @@
 """Multi-scale deformable attention in PyTorch as the reference runs it without CUDA: a `grid_sample` for each level.
 
-Written from shared specs/modules.md section 3. PyTorch is imported when a program is made, and is no dependency of the
-project.
+Source: Zhu et al. 2021 (Deformable DETR), Eq. (3). PyTorch is imported when a program is made, and is no
+dependency of the project.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def attend(value: Any, shapes: Sequence[tuple[int, int]], locations: Any, weight
         sampled.append(
             torch.nn.functional.grid_sample(image, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
         )
-    share = weights.transpose(1, 2).reshape(views * heads, 1, queries, -1)
-    total = (torch.cat(sampled, -1) * share).sum(-1)
+    weight = weights.transpose(1, 2).reshape(views * heads, 1, queries, -1)
+    total = (torch.cat(sampled, -1) * weight).sum(-1)
     return total.reshape(views, -1, queries).transpose(1, 2).contiguous()
 
 

@@ -1,4 +1,4 @@
-"""LSTR's Hungarian fitting loss in PyTorch, for `benchmarks.torch_lstr` (shared specs/modules.md section 2.7)."""
+"""LSTR's Hungarian fitting loss in PyTorch, for `benchmarks.torch_lstr`; source: docs/reference/lstr.md."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from tflane_jax.errors import UserError
 
-# Of the loss terms and the matching costs alike.
+# Weights of the loss terms and of the matching costs.
 CLASS, CURVE, EXTENT = 3.0, 5.0, 2.0
 
 

@@ -1,7 +1,7 @@
-"""LSTR in PyTorch, layer by layer as the original runs it: what our LSTR is timed against.
+"""LSTR in PyTorch with the layers of the original, as the baseline of our LSTR's times.
 
-Written from shared specs/modules.md sections 2.1 to 2.8; the published weights load by their own names. PyTorch is
-imported when something is built, and is no dependency of the project.
+Source: Liu et al. 2021, docs/reference/lstr.md; the published weights load by their own names. PyTorch is imported when
+a network is built, and is no dependency of the project.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def build(model: LstrConfig = PUBLISHED) -> Any:
             return self.relu(out + (x if self.downsample is None else self.downsample(x)))
 
     class Layer(nn.Module):
-        """What encoder and decoder layers share: one attention, the feed-forward part and two norms."""
+        """Parts common to encoder and decoder layers: one attention, the feed-forward part and two norms."""
 
         def __init__(self, config: TransformerConfig):
             super().__init__()

@@ -18,7 +18,7 @@ def test_lstr_has_the_published_size():
     example = config.task.shapes(config.data)
     learned, _ = split_statistics(shapes_of_params(config.task, example))
     assert sum(parameter_counts(learned).values()) == 765_754
-    # 0.582 GMAC (shared specs/modules.md 2.8); what is counted beyond is norms, activations and softmax.
+    # 0.582 GMAC of convolutions and products (docs/reference/lstr.md); the rest is norms, activations and softmax.
     assert 2 * 0.582 < prediction_program(config.task, example, compiled=False).gflop < 2 * 0.582 * 1.05
 
 

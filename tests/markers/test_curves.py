@@ -7,8 +7,9 @@ import pytest
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
-from tflane_jax.markers.curves import CurveConfig, Sighting, measure, save_error_curves, street, summarise
+from tflane_jax.markers.curves import CurveConfig, Sighting, measure, street, summarise
 from tflane_jax.markers.detection import DetectorConfig
+from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.scene.marker_patterns import MarkerFamily
 
 pytest.importorskip("cv2")

@@ -1,4 +1,4 @@
-"""Reading the golden cases of OpenLane-V2 (both tasks) and MapTR: schema in shared specs/metrics.md section 7."""
+"""Reading the golden cases of OpenLane-V2 (both tasks) and MapTR: schema in docs/reference/golden.md."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def test_golden(case):
 
 
 def by_loop(detections, truth):
-    """The rules of shared specs/metrics.md section 2.7, word by word."""
+    """The rules of docs/reference/metrics.md section 2.7, word by word."""
     samples = np.arange(-50, 50)
 
     def sampled(lines):

@@ -92,7 +92,8 @@ def pinhole_image_curve(curve: GroundCurve, focal: float, height: float, pitch: 
     """Return the exact image of a ground curve in a pinhole camera at any pitch; arguments as above.
 
     A pixel's ray meets the ground at Z = h z / y and X = h u / y. Its downward component is
-    y = v cos(phi) - f sin(phi), its forward component z = f cos(phi) + v sin(phi) = f / cos(phi) + y tan(phi). With (5),
+    y = v cos(phi) - f sin(phi) and its forward component z = f cos(phi) + v sin(phi) = f / cos(phi) + y tan(phi). With
+    (5),
 
         u = (k h^2 z^3 / y^2) + (m h z^2 / y) + n z + b y / h,
 

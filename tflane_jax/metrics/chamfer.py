@@ -37,7 +37,7 @@ class PaddedLines:
 
     @classmethod
     def of(cls, lines: Lines, what: str, dims: int = 3) -> PaddedLines:
-        """Return the lines padded; raise UserError, which begins with `what`, for lines without points or not finite."""
+        """Return the lines, padded; raise UserError, beginning with `what`, for lines without points or not finite."""
         return cls(checked_lines(lines, what, dims), np.fromiter(map(len, lines), int, len(lines)))
 
     def __len__(self) -> int:

@@ -85,7 +85,7 @@ class LaneDetections:
 
 
 def checked_lines(lines: Lines, what: str, dims: int = 3) -> Float[np.ndarray, "l n d"]:
-    """Return the polylines of one frame as one array (`pad_lines`); raise UserError if they have no points or are not finite."""
+    """Return the polylines of one frame as one array; raise UserError for lines without points or not finite."""
     try:
         points = pad_lines(lines, dims)
     except ValueError as error:

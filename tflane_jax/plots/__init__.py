@@ -1,5 +1,4 @@
-"""Pictures and tables. matplotlib (extra `plot`) is imported when the first figure is made, not with this
-package."""
+"""Pictures and tables. matplotlib (extra `plot`) is imported with the first figure, not with this package."""
 
 from tflane_jax.plots.attention import (
     draw_attention_matrix,

@@ -1,4 +1,4 @@
-"""Looking into the traffic-flow module: its masks and where the lane queries look (TF-Lane, section 3.3)."""
+"""Masks and attention weights of the traffic-flow module (TF-Lane, section 3.3)."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def draw_lane_attention(
     lane_valid: Bool[Array, " q"] | None = None,
     least: float = 0.1,
 ) -> None:
-    """Draw how much each lane looks at each road user, over a scene drawn before (`draw_scene`).
+    """Draw the attention of lanes to road users as links over a scene that was drawn before (`draw_scene`).
 
     Args:
         ax: where to draw.
-        lanes: the lanes that the queries stand for, metres.
-        flow: the traffic flow that the tokens were made from.
+        lanes: the lanes of the queries, metres, ego frame.
+        flow: the traffic flow of the tokens.
         weights: attention of lane q to token t, 0 to 1.
-        instance: which instance of `flow` each token is.
+        instance: index in `flow` of each token.
         valid: tokens that are not padding.
-        lane_valid: queries to draw, default all.
-        least: weaker weights are left out.
+        lane_valid: queries to draw; None draws all.
+        least: smallest weight to draw.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba
@@ -74,14 +74,14 @@ def draw_attention_matrix(
 
 
 def draw_temporal_mask(ax: Axes, frame_valid: Bool[Array, "t n"], *, title: str = "temporal mask") -> None:
-    """Draw which frames of which road users are attended to (light), oldest frame on the left."""
+    """Draw which frames of each road user are attended to (light), oldest frame on the left."""
     _grid(ax, np.asarray(frame_valid), title)
     ax.set_xlabel("frame, oldest first", fontsize=8)
     ax.set_ylabel("road user", fontsize=8)
 
 
 def draw_spatial_mask(ax: Axes, mask: Bool[Array, "s s"], lanes: int, *, title: str = "spatial mask $M_s$") -> None:
-    """Draw M_s, (L+T, L+T), as the four quadrants L->L, L->T, T->L, T->T; row attends to column where light.
+    """Draw M_s, (L+T, L+T), as the four quadrants L->L, L->T, T->L, T->T. Light: row attends to column.
 
     Args:
         ax: where to draw.

@@ -1,7 +1,6 @@
 """Scenes and predictions from above: x (forward) to the right, y (left) upward, metres.
 
-Each `draw_*` adds one layer to a matplotlib `Axes`, and `draw_scene` puts the usual ones together. Only valid
-entries are drawn: padding may hold anything.
+Each `draw_*` adds one layer to a matplotlib `Axes`; `draw_scene` draws the usual ones. Padding is not drawn.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Layer = Literal["evidence", "hidden", "areas", "lanes", "traffic", "elements"]
-# The ground that rasters cover, and the part of it that is shown.
+# The ground that rasters cover, and the part of it that is shown by default.
 GROUND = BevGrid().range
 VIEW = PerceptionRange()
 
@@ -50,10 +49,10 @@ def draw_scene(
 
     Args:
         ax: where to draw.
-        example: a layer that it does not have is skipped.
-        layers: what to draw; the order is fixed.
-        ground: what `example.bev` and `example.hidden` cover.
-        view: the ground to show.
+        example: layers that it does not have are skipped.
+        layers: to draw, in a fixed order.
+        ground: range of `example.bev` and `example.hidden`.
+        view: range to show.
         title: above the picture.
     """
     prepare(ax, view, title)
@@ -90,15 +89,14 @@ def draw_evidence(
 
     colour = np.asarray([style.EVIDENCE[channel] for channel in style.EVIDENCE], np.float32)
     light = np.asarray(bev, np.float32)[..., list(style.EVIDENCE)] / 255.0 * strength
-    # Each channel covers the ground by its own evidence, like thin layers of paint: one does not erase
-    # another.
+    # Channels blend like layers of translucent paint: none hides another.
     road = np.asarray(to_rgb(style.ROAD), np.float32)
     shown = 1.0 - (1.0 - road) * np.prod(1.0 - light[..., None] * colour, axis=-2)
     ax.imshow(shown, extent=_extent(ground), origin="lower", interpolation="bilinear", zorder=0.5)
 
 
 def draw_hidden(ax: Axes, hidden: Bool[Array, "h w"], ground: PerceptionRange = GROUND) -> None:
-    """Darken and hatch the ground that no ray reaches."""
+    """Darken and hatch the ground out of sight."""
     from matplotlib.colors import ListedColormap
 
     dark = np.asarray(hidden, bool)
@@ -109,7 +107,7 @@ def draw_hidden(ax: Axes, hidden: Bool[Array, "h w"], ground: PerceptionRange = 
     filled = ax.contourf(
         dark.astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"], extent=_extent(ground), origin="lower"
     )
-    # Without an edge colour of its own the hatch takes the global default, black on black.
+    # The default edge colour would draw the hatch black on black.
     filled.set(edgecolor=style.HATCH, linewidth=0.0, zorder=0.9)
 
 
@@ -130,8 +128,7 @@ def draw_areas(ax: Axes, areas: Areas) -> None:
 def draw_lanes(
     ax: Axes, lanes: LaneGraph, *, colour: str | None = None, width: float = 1.5, alpha: float = 1.0
 ) -> None:
-    """Draw truth lanes with arrows in driving direction, by default coloured by visibility (hidden to
-    clear)."""
+    """Draw true lanes with arrows in driving direction; without a `colour`, they are coloured by visibility."""
     from matplotlib.colors import LinearSegmentedColormap
 
     points, visibility = _rows(lanes.valid, lanes.points, lanes.visibility)
@@ -142,8 +139,7 @@ def draw_lanes(
 
 
 def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
-    """Draw tracks: a trail that fades with age and the box of the latest frame, empty where it was not
-    seen."""
+    """Draw tracks: a trail that fades with age, and the box of the latest frame, not filled if it was not seen."""
     from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.colors import to_rgba_array
 
@@ -169,7 +165,7 @@ def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
 
 
 def draw_elements(ax: Axes, elements: TrafficElements) -> None:
-    """Draw traffic lights (round, in the colour that they show) and signs (square)."""
+    """Draw traffic lights (round, in the colour of their state) and signs (square)."""
     position, category, attribute = _rows(elements.valid, elements.position, elements.category, elements.attribute)
     for kind, marker in ((1, "o"), (2, "s")):
         mine = category == kind
@@ -199,10 +195,9 @@ def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
 
 
 def draw_prediction(ax: Axes, prediction: CenterlinePrediction, *, threshold: float = 0.3) -> None:
-    """Draw the lanes that score at least `threshold`, stronger the higher they score, and their topology.
+    """Draw lanes with a score of at least `threshold`, opacity by score, and their topology.
 
-    A link runs from the end of a lane to the start of its successor, where the model holds that more likely
-    than not.
+    A link runs from the end of a lane to the start of its successor if the score of the edge is above 0.5.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba
@@ -214,7 +209,7 @@ def draw_prediction(ax: Axes, prediction: CenterlinePrediction, *, threshold: fl
     colours[:, 3] = 0.25 + 0.75 * scores[chosen]
     _lines(ax, points, colours, width=1.7, zorder=3.5)
     _arrows(ax, points, colours, zorder=3.6)
-    # A logit of zero is a probability of one half.
+    # A logit of 0 is a score of 0.5.
     before, after = np.nonzero(np.asarray(prediction.successor_logits)[np.ix_(chosen, chosen)] > 0.0)
     links = np.stack([points[before, -1, :2], points[after, 0, :2]], 1)
     ax.add_collection(LineCollection(list(links), colors=style.LINK, linewidths=1.1, zorder=3.7))

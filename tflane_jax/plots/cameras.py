@@ -1,4 +1,4 @@
-"""Camera images with lanes and traffic elements drawn into them, and the scene from above beside them."""
+"""Camera images overlaid with lanes and traffic elements, beside the scene from above."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tflane_jax.scene import CameraViews, CenterlinePrediction, ElementPredictio
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-ATTRIBUTES = (
+ATTRIBUTE_NAMES = (
     "?",
     "red",
     "green",
@@ -41,9 +41,9 @@ ATTRIBUTES = (
 """Short names of OpenLane-V2's attributes of traffic elements, by number."""
 
 _PANEL = 3.4  # inches
-# Points on a lane in an image: closer together than half a metre even on the longest.
+# Points on a lane in an image: less than half a metre apart on the longest lanes.
 _POINTS = 201
-# Lanes nearer to the image plane than this are cut off, metres.
+# Lanes are cut off at this depth, metres.
 _NEAR = 0.5
 # Images smaller than this are shown with sharp pixels.
 _PIXELATED = 400
@@ -62,10 +62,10 @@ def save_camera_views(
     ground: PerceptionRange = GROUND,
     view: PerceptionRange = VIEW,
 ) -> Path:
-    """Write two rows per example: the cameras that look ahead with the scene from above, then those that look back.
+    """Write two rows per example: the front cameras with the scene from above, then the rear cameras.
 
-    Without predictions the truth is drawn, with predictions these; from above, the truth stands thin beside them. Lanes
-    are coloured by the direction in which they are driven, seen from the vehicle.
+    Camera images show the predictions, or the truth if there are none; the view from above shows both, the truth thin.
+    The colour of a lane is its driving direction relative to the vehicle.
 
     Args:
         path: .png, .pdf or .svg.
@@ -121,13 +121,13 @@ def draw_camera(
     *,
     threshold: float = 0.3,
 ) -> None:
-    """Draw one camera's image with lanes, and in camera 0 with traffic elements: the truth, or what is predicted.
+    """Draw one camera's image with lanes, and camera 0 with traffic elements: the predictions, or else the truth.
 
     Args:
         ax: where to draw.
         example: one example with camera images.
         number: of the camera.
-        lanes, elements: predictions for the example; with either, the truth is left out.
+        lanes, elements: predictions for the example; with either, the truth is not drawn.
         threshold: lowest score of what is drawn.
     """
     views = example.cameras
@@ -151,8 +151,7 @@ def draw_camera(
 
 
 def draw_projected(ax: Axes, views: CameraViews, number: int, lines: Float[np.ndarray, "n p 3"]) -> None:
-    """Draw lines of the ego frame into a camera's image, coloured by direction: forward green, to the left blue, back
-    red."""
+    """Draw lines of the ego frame into a camera's image; colour by direction: forward green, left blue, back red."""
     from matplotlib.collections import LineCollection
 
     if not len(lines):
@@ -177,13 +176,13 @@ def draw_projected(ax: Axes, views: CameraViews, number: int, lines: Float[np.nd
 def draw_boxes(
     ax: Axes, box: Float[np.ndarray, "e 2 2"], attribute: Int[np.ndarray, " e"], chosen: Bool[np.ndarray, " e"]
 ) -> None:
-    """Draw boxes of traffic elements (pixels) with what they show."""
+    """Draw boxes of traffic elements (pixels) with the names of their attributes."""
     from matplotlib.patches import Rectangle
 
     for (low, high), shows in zip(box[chosen], attribute[chosen].tolist(), strict=True):
         colour = style.LIGHT.get(shows, style.PREDICTION)
         ax.add_patch(Rectangle(low, *(high - low), fill=False, edgecolor=colour, linewidth=1.0, zorder=3.0))
-        label = ATTRIBUTES[shows]
+        label = ATTRIBUTE_NAMES[shows]
         ax.text(low[0], low[1], label, color=colour, fontsize=5, va="bottom", ha="left", clip_on=True, zorder=3.1)
 
 
@@ -214,11 +213,11 @@ def _azimuth(views: CameraViews) -> Float[np.ndarray, " v"]:
 
 
 def _rows_of_cameras(views: CameraViews) -> tuple[list[int], list[int]]:
-    """Return the cameras that look ahead and those that do not, each from left to right as one turns around."""
+    """Return the front cameras and the rear cameras, each in the order of turning clockwise."""
     azimuth = _azimuth(views)
     order = np.argsort(-azimuth, kind="stable")
     ahead = np.cos(azimuth) > 0.25
-    # Behind, one turns from the left shoulder over the back to the right one.
+    # Rear cameras go from the left shoulder over the back to the right shoulder.
     back = order[~ahead[order]]
     return order[ahead[order]].tolist(), sorted(back.tolist(), key=lambda number: azimuth[number] % (2.0 * np.pi))
 

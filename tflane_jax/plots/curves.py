@@ -15,7 +15,7 @@ from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# What a record says beside its values.
+# Fields of a record that are not curves.
 _NOT_DRAWN = ("step", "split", "seconds")
 
 Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
@@ -24,13 +24,13 @@ Series = tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n seeds"]]
 def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
     """Write one panel per split and group of values ("loss", "loss/points": group "loss"), and return the path.
 
-    Several seeds are drawn as their mean in the band from the least to the greatest.
+    Several seeds are drawn as their mean and a band from minimum to maximum.
 
     Args:
         path: .png, .pdf or .svg.
         records: `step`, optionally `split`, and values by name: a number, or a list of one per seed.
 
-    Raises UserError where there is nothing to draw.
+    Raises UserError without records.
     """
     series = curves(records)
     if not series:
@@ -64,7 +64,7 @@ def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series
 def _draw_panel(ax: Axes, group: str, series: Mapping[str, Series]) -> None:
     for number, (name, (steps, values)) in enumerate(series.items()):
         colour = f"C{number % 10}"
-        # One point makes no line.
+        # A single point needs a marker to be visible.
         ax.plot(steps, values.mean(1), color=colour, lw=1.4, label=name, marker="o" if len(steps) == 1 else "")
         if values.shape[1] > 1:
             ax.fill_between(steps, values.min(1), values.max(1), color=colour, alpha=0.2, lw=0)

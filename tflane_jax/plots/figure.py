@@ -1,7 +1,6 @@
-"""Making and saving figures without matplotlib's global state, so that it works in threads and without a
-display.
+"""Figures without matplotlib's global state, so that they work in threads and without a display.
 
-matplotlib is imported when the first figure is made: it takes a second and is an optional extra.
+matplotlib is imported with the first figure, because the import takes a second and the extra is optional.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ def new_figure(
     """Return a figure and its (rows, columns) array of axes.
 
     Args:
-        rows, columns: of panels.
+        rows, columns: numbers of panels.
         panel: width and height of one panel, inches.
-        footer: further height for a legend, inches.
+        footer: additional height for a legend, inches.
 
-    Raises UserError where matplotlib is not installed.
+    Raises UserError if matplotlib is not installed.
     """
     try:
         from matplotlib.figure import Figure
@@ -38,7 +37,7 @@ def new_figure(
         raise UserError("pictures need matplotlib: install the extra with `pip install 'tflane_jax[plot]'`") from error
 
     class NotebookFigure(Figure):
-        """A figure that shows itself at the end of a notebook cell, as pyplot's do."""
+        """A figure that a notebook shows when it is the last value of a cell."""
 
         def _repr_png_(self) -> bytes:
             picture = io.BytesIO()

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tflane_jax.datasets.base import Dataset
 
 _PANEL_WIDTH = 4.8  # inches
-# Panels beside each other that a reader still sees whole; more go on in further lines.
+# More panels than this are wrapped to the next line.
 _MOST_COLUMNS = 7
 
 Tree = TypeVar("Tree")
@@ -105,8 +105,7 @@ def show_dataset(
 ) -> Path:
     """Write a contact sheet of `count` examples spread evenly over the dataset (all of them if it has fewer).
 
-    Each gets two panels, truth and what is seen. Raises UserError for an empty dataset or no pictures asked
-    for.
+    Each has two panels: the truth, and evidence with traffic. Raises UserError for an empty dataset or a count of 0.
     """
     if len(dataset) == 0 or count < 1:
         raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} examples, {count} asked for")
@@ -133,7 +132,7 @@ def show_dataset(
 
 
 def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes") -> None:
-    """Put the meaning of all colours below the panels, once for the whole figure."""
+    """Add the legend of all colours below the panels, once for the figure."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -163,13 +162,13 @@ def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "sc
 
 
 def _panel(view: PerceptionRange) -> tuple[float, float]:
-    """Width and height of a panel in inches; the title and the axis take 0.35."""
+    """Return width and height of a panel, inches; 0.35 of the height is for title and axis."""
     width, height = view.size(2)
     return _PANEL_WIDTH, _PANEL_WIDTH * height / width + 0.35
 
 
 def _label(axes: np.ndarray) -> None:
-    """Name the axes along the left and lower edge of the grid and leave the other panels bare."""
+    """Label only the axes along the left and lower edge of the grid."""
     for ax in axes[-1]:
         ax.set_xlabel("x, forward [m]", fontsize=8)
     for ax in axes[:-1].flat:

@@ -19,7 +19,7 @@ from tflane_jax.scene import CurvePrediction, LaneLines, RoadImage
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Neighbouring lanes differ; all stand out on asphalt.
+# Distinct colours for neighbouring lanes, all visible on asphalt.
 LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#7ae582", "#c792ea", "#ff9d3c", "#f5f5f5")
 TRUTH = "#8be28b"
 _POINTS = 100
@@ -73,7 +73,7 @@ def save_photo(
 
 
 def predicted_lines(prediction: CurvePrediction, count: int = _POINTS) -> Float[np.ndarray, "l p 2"]:
-    """Return (u, v) of the detected lanes, left to right at their lower ends, as shares of the image.
+    """Return (u, v) of the detected lanes, left to right at their lower ends, as fractions of the image.
 
     Args:
         prediction: one example, one layer.
@@ -85,7 +85,7 @@ def predicted_lines(prediction: CurvePrediction, count: int = _POINTS) -> Float[
 
 
 def draw_image(ax: Axes, image: UInt8[np.ndarray, "h w 3"], title: str = "") -> None:
-    """Show an image, its pixels from 0 to width and height, without axes."""
+    """Show an image without axes; pixel coordinates run from 0 to width and height."""
     height, width = image.shape[:2]
     ax.imshow(image, extent=(0, width, height, 0))
     ax.set(xlim=(0, width), ylim=(height, 0))

@@ -1,5 +1,4 @@
-"""Colours of the pictures: a dark road seen from above, and one meaning for each colour throughout the
-project."""
+"""Colours of the pictures; each has one meaning throughout the project. Backgrounds are dark."""
 
 from __future__ import annotations
 
@@ -12,14 +11,14 @@ EGO = "#ffffff"
 PREDICTION = "#4dd2ff"
 LINK = "#ff5fd2"
 
-# A truth lane is drawn between these two by the share of it in direct line of sight.
+# Colours of a true lane that is fully in line of sight and fully hidden; others lie between.
 LANE_CLEAR = "#8be28b"
 LANE_HIDDEN = "#ff9d3c"
 
 ROAD_BOUNDARY = "#7f8da3"
 CROSSING = "#b9a5e2"
 
-# What each channel of the evidence adds to the picture at full strength (red, green, blue, 0 to 1).
+# Colour of each evidence channel at full strength (red, green, blue, 0 to 1).
 EVIDENCE = {
     BevChannel.LANE_PAINT: (1.00, 0.93, 0.68),
     BevChannel.ROAD_EDGE: (0.28, 0.50, 0.78),

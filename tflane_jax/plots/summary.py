@@ -1,5 +1,4 @@
-"""What is in a dataset, as a table: how much there is per frame, how much of it is hidden, what did not
-fit."""
+"""A table of a dataset: amounts per frame, how much is hidden, how often capacities are full."""
 
 from __future__ import annotations
 
@@ -13,15 +12,14 @@ from tflane_jax.scene import AreaType, Example
 
 
 def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[str, Any]]:
-    """Return rows for `format_table`: each quantity's mean, least and most over the examples, and its
-    capacity.
+    """Return rows for `format_table`: mean, minimum and maximum of each quantity over the examples, and its capacity.
 
-    "full" is the share of examples that use every slot and may have lost something. What the dataset does not
-    offer has no row.
+    "full" is the fraction of examples that use every slot, so that something may have been left out. Quantities that
+    the dataset does not have are omitted.
 
     Args:
         arrays: examples stacked along a leading axis.
-        hidden_below: a lane with a smaller share of it in line of sight counts as hidden.
+        hidden_below: a lane with a smaller visibility counts as hidden.
     """
     lanes, areas, flow = arrays.lanes, arrays.areas, arrays.traffic_flow
     links = lanes.successor & lanes.valid[:, :, None] & lanes.valid[:, None]
@@ -61,7 +59,7 @@ def _subset(quantity: str, chosen: Bool[Array, "b n"]) -> dict[str, Any]:
 
 
 def _row(quantity: str, values: ArrayLike) -> dict[str, Any]:
-    """Return the statistics over the examples that have the quantity; None where none has."""
+    """Return the statistics over the examples with a finite value; None if there are none."""
     numbers = np.asarray(values, np.float64)
     numbers = numbers[np.isfinite(numbers)]
     mean, least, most = (numbers.mean(), numbers.min(), numbers.max()) if len(numbers) else (None, None, None)
@@ -69,7 +67,7 @@ def _row(quantity: str, values: ArrayLike) -> dict[str, Any]:
 
 
 def _mean_of(values: Shaped[Array, "b *n"], valid: Bool[Array, "b *n"]) -> Float[np.ndarray, " b"]:
-    """Return each example's mean over its valid entries, NaN where it has none."""
+    """Return each example's mean over its valid entries, NaN if it has none."""
     axes = tuple(range(1, valid.ndim))
     number = valid.sum(axes)
     total = np.where(valid, values, 0.0).sum(axes)

@@ -1,4 +1,4 @@
-"""Scores of several models against a setting of the data."""
+"""Curves of several models' scores over the values of a data setting."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Scores = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 
 
 def save_sweep(path: Path, scores: Scores, setting: str, values: Sequence[str], metrics: Sequence[str]) -> Path:
-    """Write one panel for each metric, a line for each model (mean of its seeds) in a band of one standard deviation.
+    """Write one panel per metric: for each model the mean of its seeds and a band of one standard deviation.
 
     Args:
         path: .png, .pdf or .svg.
-        scores: see there.
-        setting, values: of the horizontal axis; values that are no numbers are evenly spaced.
-        metrics: names in `scores`.
+        scores: fractions, shown as percent; see `Scores`.
+        setting, values: name and values of the horizontal axis; values that are no numbers are evenly spaced.
+        metrics: names of the metrics to draw.
     """
     try:
         places, ticks = np.array([float(value) for value in values]), None

@@ -1,4 +1,4 @@
-"""Tables that read well on a terminal and as Markdown, and their JSON twins."""
+"""Aligned Markdown tables, for terminal and file, and the same rows as JSON."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Row = Mapping[str, Any]
 
 
 def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, title: str = "", digits: int = 3) -> str:
-    """Return the rows as an aligned Markdown table, numbers to the right.
+    """Return the rows as an aligned Markdown table; columns of numbers are right-aligned.
 
     Args:
         rows: cells by column; a missing one or None is shown as "-", NaN as "n/a".
-        columns: which and in which order; default all, in order of appearance.
-        title: a line above the table; the place for the metric's protocol and version.
+        columns: to show, in this order; None shows all in order of appearance.
+        title: line above the table, for example the metric's protocol and version.
         digits: decimals of floating-point numbers.
     """
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
@@ -46,10 +46,11 @@ def save_table(
     title: str = "",
     digits: int = 3,
 ) -> tuple[Path, Path]:
-    """Write `<stem>.md` and `<stem>.json` ({"meta": ..., "rows": [...]}), each all or nothing, and return
-    both. `columns` are those of the Markdown table; the JSON file has them all.
+    """Write `<stem>.md` and `<stem>.json` ({"meta": ..., "rows": [...]}), each whole or not at all; return both paths.
 
-    NaN and infinity become null in the JSON file, where they are not allowed.
+    `columns` selects those of the Markdown table; the JSON file has all. NaN and infinity become null in JSON.
+
+    Raises UserError where a file cannot be written.
     """
     stem = Path(stem)
     text = json.dumps({"meta": _plain(meta), "rows": _plain(rows)}, indent=1, allow_nan=False)
@@ -83,7 +84,7 @@ def _cell(value: Any, digits: int) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return the value as what JSON knows."""
+    """Return the value in JSON's types; what has none becomes its `str`."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,1 +1,1 @@
-"""Priors: raw observations turned into fixed-size tokens and masks. No parameters; numpy at load time or under jit."""
+"""Priors: raw observations -> tokens and masks of fixed size. No parameters; runs in numpy or under jit."""

@@ -1,17 +1,17 @@
 """Temporal marker memory (Wu and Hu, section III-C): an explicit carry of fixed size, without parameters.
 
-The bank holds one slot for each of the last T frames: the lanes that markers gave in it and how far they were trusted.
-The paper keeps encoded tokens; the bank keeps the polylines that they are encoded from, which is the same at inference
-and lets them be moved with the vehicle.
+The bank has one slot for each of the last T frames, with the lanes of that frame's markers and their confidence. The
+paper stores encoded tokens. The bank stores the polylines before the encoder, which is equivalent at inference and
+allows to compensate the ego motion.
 
-What the paper leaves open, and the choice here (each an option):
+Choices that the paper leaves open (the first two are options):
 
-- A marker moves in the ego frame while it is remembered, and the paper does not say that it is moved back:
-  `compensation="ego_motion"` does; "none" leaves it where it was seen.
-- Eq. (3) has one confidence c, and remembered tokens have one each: `gate="strongest"` takes the largest decayed one,
-  "one" leaves the scaling to Eq. (4).
+- The vehicle moves while a marker is remembered, and the paper mentions no compensation. `compensation="ego_motion"`
+  moves remembered lanes into the present ego frame; "none" keeps their coordinates.
+- Eq. (3) has one confidence c, but every remembered token has its own. `gate="strongest"` takes the largest decayed
+  one; "one" leaves the scaling to Eq. (4).
 - T, gamma, alpha and epsilon are not given; the defaults are ours.
-- With several markers in a frame, c_t is that of the most trusted; lanes of the others are scaled down relative to it.
+- With several markers in a frame, c_t is the highest confidence; lanes of the others are scaled relative to it.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from tflane_jax.priors.markers import MarkerLanes
 
 @dataclass(frozen=True)
 class MarkerMemoryConfig:
-    """Size and fading of the memory.
+    """Size and decay of the memory.
 
     Attributes:
-        frames: T, slots of the bank, the present frame's among them.
+        frames: T, slots of the bank, the present frame included.
         decay: gamma, in (0, 1]; 1 is the ablation without decay.
         exponent: alpha of Eq. (4), in (0, 1].
-        threshold: epsilon; a frame trusted less is answered from the bank.
-        lanes: most lanes of the union that guide a frame, those with the largest weights; None is the whole union of
-            Eq. (4). The bank holds T L lanes, the encoder's time goes with those that guide.
-        compensation: whether remembered lanes are moved by the ego motion.
-        gate: c of Eq. (3) for what comes from the bank.
+        threshold: epsilon; a frame with a lower confidence uses the bank.
+        lanes: maximal number of prior tokens, those with the largest weights; None is the whole union of Eq. (4), T L
+            lanes. The time of the encoder grows with this number.
+        compensation: of the ego motion, for remembered lanes.
+        gate: c of Eq. (3) for tokens from the bank.
     """
 
     frames: int = 6
@@ -53,11 +53,11 @@ class MarkerMemoryConfig:
 
 @struct.dataclass
 class MarkerMemory:
-    """The bank: slot i holds what was observed i frames ago; it is not valid where nothing was.
+    """The bank: slot i holds the observations of i frames ago.
 
     Attributes:
-        points: (T, L, K, 2) metres, ego frame of the frame that was seen last.
-        confidence: (T, L) when observed; 0 where not valid.
+        points: (T, L, K, 2) metres, ego frame of the latest frame.
+        confidence: (T, L) at observation, before decay; 0 where not valid.
         successor: (T, L, L).
         valid: (T, L).
     """
@@ -69,8 +69,8 @@ class MarkerMemory:
 
     @classmethod
     def empty(cls, frames: int, lanes: int, points: int) -> MarkerMemory:
-        """Return a bank that remembers nothing, for L lanes of K points a frame."""
-        zeros: Any = np.zeros  # numpy's arrays stand for JAX's everywhere
+        """Return an empty bank for L lanes of K points a frame."""
+        zeros: Any = np.zeros  # the type says JAX array, numpy serves as well
         return cls(
             points=zeros((frames, lanes, points, 2), np.float32),
             confidence=zeros((frames, lanes), np.float32),
@@ -81,13 +81,13 @@ class MarkerMemory:
 
 @struct.dataclass
 class MarkerGuidance:
-    """What guides the BEV features of one frame: the union of Eq. (4), or the frame's own lanes.
+    """Prior tokens of one frame: the union of Eq. (4), or the lanes of the frame alone.
 
     Attributes:
         points: (N, K, 2) metres, ego frame.
-        weight: (N,) what each token is multiplied by; 0 where not valid.
-        gate: () c of Eq. (3); 0 without guidance.
-        successor: (N, N) directed connectivity, among lanes that were seen together.
+        weight: (N,) factor of each token; 0 where not valid.
+        gate: () c of Eq. (3); 0 without tokens.
+        successor: (N, N) directed connectivity, between lanes of the same frame.
         valid: (N,).
     """
 
@@ -99,12 +99,12 @@ class MarkerGuidance:
 
 
 def guidance(observed: MarkerLanes, exponent: float = 1.0) -> MarkerGuidance:
-    """Return the guidance of a frame on its own, without memory."""
+    """Return the prior tokens of a frame without memory."""
     strongest = observed.frame_confidence
-    share = observed.confidence / jnp.where(strongest > 0, strongest, 1.0)
+    relative = observed.confidence / jnp.where(strongest > 0, strongest, 1.0)
     return MarkerGuidance(
         points=jnp.asarray(observed.points),
-        weight=_power(share, exponent),
+        weight=_power(relative, exponent),
         gate=jnp.asarray(strongest),
         successor=jnp.asarray(observed.successor),
         valid=jnp.asarray(observed.valid),
@@ -118,14 +118,14 @@ def remember(
     has_previous: Bool[Array, ""],
     config: MarkerMemoryConfig,
 ) -> tuple[MarkerMemory, MarkerGuidance]:
-    """Return the memory for the next frame, and the guidance of this one.
+    """Return the memory for the next frame and the prior tokens of this one.
 
     Args:
         memory: of the frame before.
         observed: lanes of this frame's markers, as many as a slot holds.
-        previous_from_ego: pose of this ego frame in the previous one's; looked at where there is a previous frame.
-        has_previous: False begins a scene: nothing is remembered.
-        config: see there.
+        previous_from_ego: pose of this ego frame in the previous one; ignored without a previous frame.
+        has_previous: False at the start of a scene: the memory is ignored.
+        config: see `MarkerMemoryConfig`.
     """
     kept = memory.valid & has_previous
     points = memory.points
@@ -153,7 +153,7 @@ def remember(
 def _union(
     bank: MarkerMemory, weight: Float[Array, "t l"], used: Bool[Array, "t l"], gate: Array, most: int | None
 ) -> MarkerGuidance:
-    """Return the lanes of all slots in one row; the heaviest `most` of them, the youngest first among equals."""
+    """Return the lanes of all slots, or the `most` with the largest weights, of equal ones the latest."""
     slots, lanes, k = bank.points.shape[:3]
     points, weight, used = bank.points.reshape(slots * lanes, k, 2), weight.reshape(-1), used.reshape(-1)
     chosen = jnp.arange(slots * lanes)
@@ -171,14 +171,14 @@ def _union(
 
 
 def _push(newest: Array, slots: Array) -> Array:
-    """Return the slots one frame older, without the oldest, the newest in front."""
+    """Return the slots shifted by one frame: the newest in front, without the oldest."""
     return jnp.concatenate([jnp.asarray(newest, slots.dtype)[None], slots[:-1]])
 
 
 def _to_present(points: Float[Array, "t l k 2"], previous_from_ego: Float[Array, "4 4"]) -> Float[Array, "t l k 2"]:
     """Return points of the previous ego frame in this one's, in the plane: the inverse of a planar pose."""
     rotation, shift = previous_from_ego[:2, :2], previous_from_ego[:2, 3]
-    # Pitch and roll leave the upper left block not quite orthogonal, so its inverse is not its transpose.
+    # With pitch and roll the upper left block is not orthogonal, so the transpose is not its inverse.
     return jnp.einsum("ij,tlkj->tlki", jnp.linalg.inv(rotation), points - shift[None, None, None])
 
 

@@ -1,7 +1,7 @@
 """The fiducial-marker prior (Wu and Hu, sections III-A and III-B), up to the learned part.
 
-What was observed in a frame becomes lane polylines of a fixed number of points with the confidence of the marker that
-each belongs to. The same lines run in numpy when data is loaded and under jit, whichever arrays come in.
+The observations of a frame become lane polylines with a fixed number of points and the confidence of their marker. Runs
+in numpy or under jit, depending on the arrays.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class MarkerPriorConfig:
 
     Attributes:
         points: K, points of a polyline (paper: 11).
-        lanes: L, lanes of all markers of a frame; those of the most trusted markers, where there are more.
+        lanes: L, lanes of all markers of a frame; of more, those of the markers with the highest confidence.
         distance_scale: tau_d of Eq. (2), metres.
         residual_scale: tau_r of Eq. (2), metres.
         use_score: multiply the confidence by the detector's raw score, which the paper mentions as a supplement.
@@ -53,7 +53,7 @@ class MarkerLanes:
 
     @property
     def frame_confidence(self) -> Float[Array, ""]:
-        """c_t, the scalar of a frame: that of its most trusted marker, 0 without any."""
+        """c_t, the confidence of a frame: the highest of its markers, 0 without any."""
         return self.confidence.max(initial=0.0)
 
 
@@ -66,9 +66,9 @@ def confidence(
 
 
 def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) -> MarkerLanes:
-    """Return the lanes of one frame's markers, the most trusted first; padding may hold anything.
+    """Return the lanes of one frame's markers by descending confidence; padding may hold anything.
 
-    Raises ValueError where the lanes have fewer points than the config asks for.
+    Raises ValueError if the lanes have fewer points than the configuration.
     """
     xp = namespace(markers.lanes, markers.valid)
     count, lanes, points = markers.lanes.shape[:3]
@@ -76,7 +76,7 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
         raise ValueError(f"the markers' lanes have {points} points, the prior asks for {config.points}")
     pose = xp.where(markers.valid[:, None, None], markers.pose, xp.eye(4, dtype=markers.pose.dtype)[None])
     residual = xp.where(markers.valid, markers.residual, 0.0)
-    # The vertical coordinate is dropped here as everywhere in the prior (III-A).
+    # The prior ignores the vertical coordinate (section III-A).
     trust = confidence(xp.sqrt((pose[:, :2, 3] ** 2).sum(-1)), residual, config)
     if config.use_score:
         trust = trust * xp.where(markers.valid, markers.score, 0.0)
@@ -86,7 +86,7 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
     edges = edges.reshape(count * lanes, count * lanes) & same & valid[:, None] & valid[None, :]
     trust = xp.where(valid, xp.repeat(trust, lanes), 0.0)
-    # Stable, so that lanes of one marker keep their order; padding goes last.
+    # Stable: lanes of one marker keep their order; padding comes last.
     order = xp.argsort(xp.where(valid, -trust, xp.inf), stable=True)[: config.lanes]
     missing = config.lanes - len(order)
     return MarkerLanes(
@@ -98,5 +98,5 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
 
 
 def stride(points: int, kept: int) -> np.ndarray:
-    """Return which of `points` points a fixed stride keeps, the first and the last among them."""
+    """Return the indices of `kept` of `points` points at an even stride, first and last included."""
     return np.linspace(0, points - 1, kept).round().astype(int)

@@ -1,6 +1,6 @@
 """The SD-map prior of SMERF (Luo et al. 2024), up to the learned part: road-level polylines as coordinates and labels.
 
-The same lines run in numpy when data is loaded and under jit, whichever arrays come in.
+Runs in numpy or under jit, depending on the arrays.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class SdMapPriorConfig:
 
 @struct.dataclass
 class SdMapTokens:
-    """An SD map of R lines of P points as numbers for a network.
+    """Tokens of an SD map: R lines of P points.
 
     Attributes:
-        points: (R, P, 2) in [0, 1] across the range, beyond it outside; 0 in padding.
+        points: (R, P, 2) in [0, 1] inside the range; 0 in padding.
         labels: (R, K) one-hot category; 0 in padding.
         valid: (R,).
     """

@@ -1,8 +1,8 @@
 """The traffic-flow prior of TF-Lane (sections 3.2 and 3.3, "Temporal Domain Encoder"), up to the learned part.
 
-Truncates the tracks to the region R_t, drops instances with fewer than tol_pts valid frames, weighs the rest by where
-they are relative to the ego vehicle, keeps the T_top heaviest and pads to T_max. The same lines run in numpy when
-data is loaded and under jit, whichever arrays come in.
+Steps: truncate the tracks to the region R_t, drop instances with fewer than tol_pts valid frames, weight the others by
+their position relative to the ego vehicle, keep the T_top with the largest weights, pad to T_max. Runs in numpy or
+under jit, depending on the arrays.
 """
 
 from __future__ import annotations
@@ -24,14 +24,13 @@ class TrafficFlowPriorConfig:
     """How traffic flow becomes tokens.
 
     Attributes:
-        frames: f_t, how many past frames are used, the latest ones (paper: 20).
+        frames: f_t, number of past frames, the latest ones (paper: 20).
         min_valid_frames: tol_pts, an instance needs this many valid frames (paper: 5).
         max_instances: T_max, the number of slots (paper: N_t = 30).
         top_instances: T_top, how many slots may be filled; None fills all. 0 is inference without traffic flow.
-        occluded_frames: "mask" treats a frame in which the tracker did not see the box as lost (Fig. 4); "keep" uses
-            it.
-        front_sector_deg: full opening of the sector ahead that has the highest weight (paper: 60).
-        distance_scale: distance at which an instance outside that sector has lost half its weight, metres.
+        occluded_frames: "mask" ignores frames in which the tracker did not see the box (Fig. 4); "keep" uses them.
+        front_sector_deg: opening angle of the front sector, which has the highest weight (paper: 60).
+        distance_scale: distance that halves the weight of an instance outside that sector, metres.
         coordinates: "normalised" aligns positions with the BEV in [0, 1] (Table 5, "Norm." = T); "metres" does not.
     """
 
@@ -47,7 +46,7 @@ class TrafficFlowPriorConfig:
 
 @struct.dataclass
 class TrafficFlowTokens:
-    """reTF_i and its temporal mask: T_max instances of N frames, heaviest first.
+    """reTF_i and its temporal mask: T_max instances of N frames, by descending weight.
 
     Attributes:
         position: (T, N, 3) box centres, normalised or metres per the config; 0 where not valid.
@@ -57,7 +56,7 @@ class TrafficFlowTokens:
         frame_valid: (T, N) the temporal mask.
         valid: (T,) instance validity, from which the spatial mask is made.
         weight: (T,) ego-centric weight in (0, 1]; 0 in padding.
-        index: (T,) which instance of the traffic flow stands here; 0 in padding.
+        index: (T,) index of the instance in the traffic flow; 0 in padding.
     """
 
     position: Float[Array, "t n 3"]
@@ -81,14 +80,14 @@ def select_traffic_flow(
         region: R_t; positions outside it are not used. A host's perception range.
         bev_range: the box that normalised coordinates span. That of the host's BEV features.
 
-    Raises ValueError where the traffic flow holds fewer frames than the config asks for.
+    Raises ValueError if the traffic flow has fewer frames than the configuration.
     """
     xp = namespace(flow.position, flow.valid)
     recorded = flow.valid.shape[1]
     if recorded < config.frames:
         raise ValueError(f"the traffic flow holds {recorded} frames, the prior asks for {config.frames}")
     if flow.valid.shape[0] == 0:
-        flow = TrafficFlow.empty(1, recorded)  # so that the padding below has a row to point at
+        flow = TrafficFlow.empty(1, recorded)  # the padding below needs a row to index
     flow = TrafficFlow(
         position=flow.position[:, recorded - config.frames :],
         yaw=flow.yaw[:, recorded - config.frames :],
@@ -106,7 +105,7 @@ def select_traffic_flow(
     here = xp.take_along_axis(position[..., :2], latest[:, None, None], axis=1)[:, 0]
     weight = xp.where(instance_valid, ego_centric_weight(here, config), 0.0)
 
-    # Heaviest first, nearest first among equals (all of the front sector weighs the same); both sorts are stable.
+    # By descending weight, then by distance (the whole front sector has one weight); both sorts are stable.
     nearest = xp.argsort(xp.where(instance_valid, (here**2).sum(-1), xp.inf), stable=True)
     order = nearest[xp.argsort(-weight[nearest], stable=True)]
     slots = config.max_instances
@@ -134,8 +133,8 @@ def select_traffic_flow(
 def ego_centric_weight(position: Float[Array, "k 2"], config: TrafficFlowPriorConfig) -> Float[Array, " k"]:
     """Return the weight of instances at these positions (ego frame, metres), in (0, 1].
 
-    1 within the sector ahead; elsewhere it falls with the bearing beyond the sector and with the distance. The paper
-    (section 3.3) fixes the sector and that weights decrease "based on relative positions"; the two factors are ours.
+    1 within the front sector; elsewhere it decreases with bearing and distance. The paper (section 3.3) gives the
+    sector and says that weights decrease "based on relative positions"; the two factors are ours.
     """
     xp = namespace(position)
     half = math.radians(config.front_sector_deg) / 2
@@ -147,6 +146,6 @@ def ego_centric_weight(position: Float[Array, "k 2"], config: TrafficFlowPriorCo
 
 
 def _latest_valid(frame_valid: Bool[Array, "k n"]) -> Int[Array, " k"]:
-    """Return the index of the last valid frame of each instance (the last frame where there is none)."""
+    """Return the index of the last valid frame of each instance (the last frame if there is none)."""
     xp = namespace(frame_valid)
     return frame_valid.shape[1] - 1 - xp.argmax(xp.flip(frame_valid, axis=1), axis=1)

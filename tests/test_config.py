@@ -153,7 +153,7 @@ def test_parts_are_switched_on_and_off():
         "default",
         "--task.model.priors.markers.memory",
         "None",
-        "--task.model.traffic-flow=None",
+        "--task.model.priors.traffic-flow=None",
         "--task.model.priors.markers",
         "MarkerFusionConfig",
     ]
@@ -191,7 +191,7 @@ def test_settings_of_other_data_can_be_changed():
         (["stray"], "stray"),
         (
             ["--task.model.priors.markers", "on"],
-            r"--task\.model\.markers takes None, default, MarkerFusionConfig, not 'on'",
+            r"--task\.model\.priors\.markers takes None, default, MarkerFusionConfig, not 'on'",
         ),
         (["--task.model.priors.markers"], "takes None, default"),
         (["--data", "OpenLaneV2Data"], "OpenLaneV2Data has no defaults for all of its settings"),
@@ -259,8 +259,8 @@ def test_a_file_comes_before_a_shipped_name(tmp_path, monkeypatch):
         ("host", "did you mean markers/host"),
         ("configs/tf_lane/toponet_tfm.py:abla1", "the shipped configuration is called tf_lane/toponet_tfm"),
         ("xyz", "the package ships .*gtn_lane/lstr, .*tf_lane/toponet_tfm"),
-        ("tf_lane/toponet_tfm:abla", "no ablation abla: did you mean abla"),
-        ("tf_lane/toponet_tfm:xyz", "no ablation xyz: it has abla1, .*abla8"),
+        ("tf_lane/toponet_tfm:abla", "no ablation abla, only abla1, .*; did you mean abla"),
+        ("tf_lane/toponet_tfm:xyz", "no ablation xyz, only abla1, .*abla8$"),
         ("gtn_lane/lstr:xyz", r"has no function ablations\(\)"),
     ],
 )

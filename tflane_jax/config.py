@@ -86,8 +86,8 @@ def load_config(reference: str) -> RunConfig:
     ablations = load_ablations(name)
     if ablation not in ablations:
         close = difflib.get_close_matches(ablation, ablations, 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"it has {', '.join(ablations)}"
-        raise UserError(f"config file {name} has no ablation {ablation}: {hint}")
+        hint = f"; did you mean {' or '.join(close)}?" if close else ""
+        raise UserError(f"config file {name} has no ablation {ablation}, only {', '.join(ablations)}{hint}")
     return ablations[ablation]
 
 

@@ -48,7 +48,7 @@ def focal(logit, target):
 
 
 def loop_loss(prediction, lanes):
-    """TopoNet's loss as specs/modules.md section 5 words it, one number at a time."""
+    """TopoNet's loss as docs/reference/toponet.md states it, one number at a time."""
     points, logits, edges = (np.asarray(x, np.float64) for x in jax.tree.leaves(prediction))
     total = 0.0
     for layer in range(LAYERS):

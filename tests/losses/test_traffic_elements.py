@@ -68,7 +68,7 @@ def assign(cost):
 
 
 def loop_terms(prediction, lanes, elements, layer):
-    """Return the four terms of one layer as specs/modules.md section 5 words them, one number at a time."""
+    """Return the four terms of one layer as docs/reference/toponet.md states them, one number at a time."""
     found, positives = prediction.elements, 0
     classes = boxes = apart = edges = 0.0
     for b in range(BATCH):

@@ -1,4 +1,4 @@
-"""Parameters and answers at the papers' sizes, from shapes alone (shared specs/modules.md section 13)."""
+"""Parameters and outputs at the papers' sizes, from shapes alone (counts: docs/reference/training.md)."""
 
 import dataclasses
 

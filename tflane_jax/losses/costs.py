@@ -1,4 +1,4 @@
-"""Matching costs of the DETR family: what giving a target to a query would cost (specs/modules.md section 12)."""
+"""Matching costs of the DETR family, for every pair of query and target (docs/reference/training.md)."""
 
 from __future__ import annotations
 

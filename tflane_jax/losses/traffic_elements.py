@@ -1,4 +1,4 @@
-"""Losses of traffic elements in the front view: Deformable DETR's, as TopoNet uses them (specs/modules.md section 5).
+"""Losses of traffic elements in the front view: Deformable DETR's, as TopoNet uses them (docs/reference/toponet.md).
 
 Per decoder layer: focal loss on the class, L1 on centre and size as shares of the image, and generalised IoU.
 """

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks import torch_fitting, torch_lstr
-from tests.golden import assert_gradients_close, assert_outputs_close, case_id, golden_modules, load_module_case
+from tests.golden import case_id, golden_modules, load_module_case
+from tests.golden_compare import assert_gradients_close, assert_outputs_close
 from tests.shared import shared_path
 from tflane_jax.errors import UserError
 from tflane_jax.layers.resnet import ResNetConfig

@@ -45,6 +45,7 @@ FLOORS = (
     "cli",
 )
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms.split()}
+
 LONGEST_FILE = 350
 # Files that are about to be split.
 KNOWN_LONG = {
@@ -158,15 +159,16 @@ def test_slow_modules_are_imported_in_functions():
 
 def imports_at_module_level(tree: ast.Module) -> set[str]:
     """Return the imports that run when the module is imported: not those in functions or for type checkers only."""
-    statements = list(tree.body)
+    statements: list[ast.AST] = list(tree.body)
     found = set()
     while statements:
         node = statements.pop()
         if isinstance(node, ast.Import | ast.ImportFrom):
             found |= imported_modules(node)
         elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            checking = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-            inner = node.orelse if checking else ast.iter_child_nodes(node)
+            inner = ast.iter_child_nodes(node)
+            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+                inner = node.orelse
             statements += [child for child in inner if isinstance(child, ast.stmt | ast.ExceptHandler)]
     return found
 

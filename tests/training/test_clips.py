@@ -15,6 +15,7 @@ from tflane_jax.datasets.clips import as_clips
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
 from tflane_jax.evaluation.predict import predict_examples, predictions
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.scene import shapes_of, stack_examples
 from tflane_jax.summary import parameter_counts, shapes_of_params, training_program
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -133,9 +134,9 @@ def test_frames_are_shared_out_by_what_is_known_of_markers(params):
     frames = [(False, False), (True, True), (False, True), (True, True), (False, True), (False, False), (True, False)]
     told = [sightings.next(seen, has_previous) for seen, has_previous in frames]
     assert told == ["before", "seen", "gap", "seen", "gap", "before", "seen"]
-    metrics = evaluate_lanes(CLIPS, params, scenes(), 4).compute()
+    metrics = evaluate_lanes(CLIPS, params, scenes(), EvaluationConfig(batch_size=4)).compute()
     assert [metrics[group]["frames"] for group in ("all", "seen", "gap", "before")] == [6, 2, 4, 0]
     lanes = [metrics[group]["lanes"] for group in ("seen", "gap", "before")]
     assert sum(lanes) == metrics["all"]["lanes"]
     without = scenes().replace(markers=None)
-    assert "seen" not in evaluate_lanes(CLIPS, params, without, 4).compute()
+    assert "seen" not in evaluate_lanes(CLIPS, params, without, EvaluationConfig(batch_size=4)).compute()

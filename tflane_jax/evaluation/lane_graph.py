@@ -124,7 +124,9 @@ def _true_lines(example: Example):
     lines = example.map_lines
     if lines is None:
         return map_truth(example.segments, example.areas)
-    return map_lines(lines.points, lines.category, np.asarray(lines.valid) & (np.asarray(lines.category) < len(CLASSES)))
+    return map_lines(
+        lines.points, lines.category, np.asarray(lines.valid) & (np.asarray(lines.category) < len(CLASSES))
+    )
 
 
 def evaluate_lanes(

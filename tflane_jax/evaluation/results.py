@@ -16,7 +16,7 @@ class EvaluationConfig:
         batch_size: examples predicted at a time; changes no number.
         pictures: examples of the validation split that are drawn, spread evenly over it.
         versions: of OpenLane-V2's metrics. The first one gives the columns without a version in their names; the
-            others add columns where their numbers differ, say "OLS v1.0".
+            others add columns where their numbers differ, say "OLS_v1.0".
     """
 
     batch_size: int = 16

@@ -22,14 +22,13 @@ from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.lane_graph import Sightings, evaluate_lanes
+from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, Sightings, evaluate_lanes
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
-from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -216,13 +215,14 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         return Evaluation(metrics.protocol, metrics.compute())
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
-        """Return OpenLane-V2's centerline metrics by group, with those of traffic elements if the model has them."""
+        """Return the metrics of what the host predicts, by group, with those of traffic elements if it has them."""
         marked = data.source("val").example.markers is not None
         groups = Sightings.groups if marked else ()
-        metrics = GroupedCenterlineMetrics(frame_groups=groups, versions=config.versions)
+        metrics = LaneGraphMetrics(config.versions, groups)
         names = set(Evaluation("", metrics.compute()).scores())
         if self.model.elements is not None:
-            of_elements = ("OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES)))
+            of_elements = ["OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
+            of_elements += [f"{name}_{version}" for version in config.versions[1:] for name in ("OLS", "TOP_lt")]
             names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}
         return names
 

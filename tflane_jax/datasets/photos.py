@@ -14,8 +14,8 @@ from tflane_jax.files.images import opencv, resize
 HEIGHT, WIDTH = 360, 640
 """Size of the network's input, pixels (LSTR: Liu et al. 2021; docs/reference/lstr.md)."""
 
-# TuSimple's camera, as fractions of its 1280 x 720 image. Horizon: median row in which the straight lines of a frame meet,
-# over the 574 of 2,858 label records with three or more of them (row 238.7; 90 % within 227 to 249).
+# TuSimple's camera, as fractions of its 1280 x 720 image. Horizon: median row in which the straight lines of a frame
+# meet, over the 574 of 2,858 label records with three or more of them (row 238.7; 90 % within 227 to 249).
 HORIZON = 0.331
 # Assumed, not measured: TuSimple gives no calibration of its lane images, flat straight lanes look the same through any
 # focal length, and the period of the dashed lines in the ten frames at hand was too faint to tell it. This is the

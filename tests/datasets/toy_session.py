@@ -93,7 +93,7 @@ def model(folder: Path) -> Path:
     from tflane_jax.tasks.lane_graph import LaneGraphTask
 
     def predict(task, params, example):
-        return Prediction(jax.tree.map(jnp.asarray, fake_prediction(0)), None)
+        return Prediction(centerlines=jax.tree.map(jnp.asarray, fake_prediction(0)))
 
     LaneGraphTask.predict = predict  # pyright: ignore[reportAttributeAccessIssue]
     save_weights(RunConfig(), {"shift": jnp.zeros(3)}, folder / "run")

@@ -52,6 +52,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
     lanes, elements = answer.centerlines, answer.elements
+    assert lanes is not None, "a lane-graph task predicts centerlines"
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
     successor = expit(lanes.successor_logits)

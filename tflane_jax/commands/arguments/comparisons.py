@@ -48,7 +48,7 @@ def compare(commands) -> None:
         metavar="NAME='SETTINGS'",
         action="append",
         default=[],
-        help="evaluate on a further test set, say --test rain='--data.world.severity 1'; may be given several times",
+        help="evaluate on a further test set, for example --test rain='--data.world.severity 1'; may be repeated",
     )
     parser.add_argument(
         "--retrain", action="store_true", help="delete runs of other configurations in --out, and train them anew"
@@ -75,8 +75,8 @@ def sweep(commands) -> None:
     parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
     parser.add_argument("--values", nargs="+", required=True, help="of the setting")
     parser.add_argument("--metrics", nargs="+", help="to show, say all/DET_l gap/recall (default: as compare does)")
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.add_argument("--checkpoint", choices=("last", "best"), default="last", help="default last")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.set_defaults(takes_overrides=True)
 
 

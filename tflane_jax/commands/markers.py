@@ -22,9 +22,10 @@ from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import list_photos, opencv, read_image
 from tflane_jax.geometry.cameras import project
-from tflane_jax.markers.curves import CurveConfig, measure, save_error_curves, summarise
+from tflane_jax.markers.curves import CurveConfig, measure, summarise
 from tflane_jax.markers.detection import DetectedMarkers, DetectorConfig, detect, marker_outline
 from tflane_jax.plots import format_table, save_table
+from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import MarkerFamily
 from tflane_jax.training.run_folder import write_json

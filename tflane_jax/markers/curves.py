@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,6 @@ from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount, CameraRi
 from tflane_jax.world.cameras.sensor import render_window
 from tflane_jax.world.render.camera import FrontCamera
 
-# Standard deviation of the paper's forward error and of its yaw and pitch errors at 60 m, metres and degrees.
-PAPER_DISTANCE, PAPER_FORWARD, PAPER_ANGLE = 60.0, 3.0, 2.0
 # Around a board this many pixels are drawn, and of its own size half as many again.
 _AROUND = 24
 _LANE, _HEIGHT = 3.5, 3.0
@@ -237,43 +234,6 @@ def summarise(sightings: Sequence[Sighting]) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma_d: float) -> Path:
-    """Draw rate, forward error and rotation error over distance, beside what the paper assumes, and return the path.
-
-    Args:
-        path: .png, .pdf or .svg.
-        curves: rows of `summarise` by name.
-        sigma_d: of the paper's probability of detection exp(-d^2 / 2 sigma_d^2), metres.
-    """
-    from tflane_jax.plots.figure import new_figure, save_figure
-
-    figure, axes = new_figure(1, 4, panel=(3.6, 3.0))
-    panels = (
-        ("found", "detection rate"),
-        ("forward m", "forward error, rms [m]"),
-        ("rotation median", "rotation error, median [deg]"),
-        ("wrong pose", "other pose nearer to the truth"),
-    )
-    far = np.linspace(0.0, PAPER_DISTANCE, 61)
-    paper = {
-        "found": np.exp(-0.5 * (far / sigma_d) ** 2),
-        "forward m": PAPER_FORWARD * far / PAPER_DISTANCE,
-        "rotation median": PAPER_ANGLE * far / PAPER_DISTANCE,
-    }
-    for ax, (key, label) in zip(axes.flat, panels, strict=True):
-        for name, rows in curves.items():
-            ax.plot([row["distance m"] for row in rows], [row[key] for row in rows], ".-", label=name)
-        if key in paper:
-            ax.plot(far, paper[key], "k--", label="the paper's assumption")
-        ax.set_xlabel("distance [m]")
-        ax.set_ylabel(label)
-        ax.set_xlim(0.0, None)
-        ax.set_ylim(0.0, None)
-        ax.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=7)
-    return save_figure(figure, path)
 
 
 def street(seed: int, config: CurveConfig) -> Log:

@@ -1,0 +1,131 @@
+"""Write files and folders whole or not at all.
+
+The content is written under a hidden temporary name beside its destination and then renamed. A reader sees the old
+content or the new one, never a part. A killed process leaves the destination as it was, and at most a file or folder
+named `.<name>.<process>-<number>.tmp`. A power failure is not covered: nothing is flushed to the device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.errors import UserError
+
+_counter = itertools.count()
+_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp")
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+
+
+@contextlib.contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; rename it to `path` when the block ends without an error.
+
+    The block creates a file or a folder at the temporary path. A file replaces a file, a folder replaces a folder; the
+    parents of `path` are created. After an error the temporary content is deleted and `path` is as it was.
+
+    The temporary name ends in `.tmp`, because `Path.glob("*.json")` finds hidden files too. Writers that choose a
+    format by the suffix need to be told the format.
+
+    Two renames replace a folder. A process killed between them leaves the old folder under its temporary name.
+
+    Raises:
+        UserError: an OSError occurred in the block or in renaming. The message names `path`, the cause and the remedy.
+        ValueError: the block wrote nothing.
+    """
+    path = Path(path)
+    temporary = _temporary(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        if not os.path.lexists(temporary):
+            raise ValueError(f"nothing was written to {temporary}, so {path} cannot be replaced")
+        if temporary.is_dir() and path.is_dir():
+            _replace_folder(temporary, path)
+        else:
+            os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(_message(path, temporary, error)) from error
+    finally:
+        _delete(temporary)
+
+
+def write_bytes(path: Path | str, content: bytes | bytearray) -> Path:
+    """Write a file whole or not at all and return its path; raises UserError as `replacing` does."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+    return Path(path)
+
+
+def write_text(path: Path | str, text: str) -> Path:
+    """Write a UTF-8 text file whole or not at all and return its path; raises UserError as `replacing` does."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+def write_json(path: Path | str, content: Any, *, indent: int | None = 1, allow_nan: bool = True) -> Path:
+    """Write a JSON file, ended by a newline, whole or not at all, and return its path.
+
+    Args:
+        path: of the file.
+        content: what `json.dumps` takes.
+        indent: spaces for each level; None writes one line.
+        allow_nan: write NaN and infinity as the words that Python reads, though JSON has no such numbers.
+
+    Raises:
+        UserError: as `replacing` does.
+        TypeError, ValueError: `content` is not JSON. The file is then as it was.
+    """
+    return write_text(path, json.dumps(content, indent=indent, allow_nan=allow_nan) + "\n")
+
+
+def is_temporary(path: Path | str) -> bool:
+    """Return whether the name is one that `replacing` gives, so that a killed process may have left it."""
+    return _TEMPORARY.fullmatch(Path(path).name) is not None
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}-{next(_counter)}.tmp")
+
+
+def _replace_folder(new: Path, path: Path) -> None:
+    old = _temporary(path)
+    os.replace(path, old)
+    try:
+        os.replace(new, path)
+    except BaseException:
+        os.replace(old, path)
+        raise
+    _delete(old)
+
+
+def _delete(path: Path) -> None:
+    """Delete a file or folder if it exists; an error here must not hide the one that brought us here."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def _message(path: Path, temporary: Path, error: OSError) -> str:
+    cause = error.strerror or str(error) or type(error).__name__
+    if error.filename and Path(os.fsdecode(error.filename)) not in (path, temporary):
+        cause += f" ({os.fsdecode(error.filename)})"
+    if error.errno in _FULL:
+        remedy = "free space there or choose another path"
+    elif error.errno in _FORBIDDEN:
+        remedy = "give yourself the right to write there or choose another path"
+    else:
+        remedy = "check the path or choose another one"
+    return f"cannot write {path}: {cause}; {remedy}"

@@ -25,6 +25,7 @@ from tflane_jax.datasets.loading import TRAINING_PARTS, load_arrays
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.scene import Example
@@ -52,9 +53,7 @@ def paper_size_tasks() -> dict[str, LaneGraphTask]:
     decoder = LaneDecoderConfig(dim=256, layers=6, queries=200, hidden=512, relation=128, refine="fixed")
     model = TopoNetConfig(encoder=EvidenceEncoderConfig(dim=64, cell=1), decoder=decoder)
     module = TrafficFlowModuleConfig(width=128, heads=8)
-    with_traffic = dataclasses.replace(
-        model, priors=replace(model.priors, traffic_flow=TrafficFlowConfig(module=module))
-    )
+    with_traffic = dataclasses.replace(model, priors=PriorsConfig(traffic_flow=TrafficFlowConfig(module=module)))
     return {"baseline": LaneGraphTask(model), "+TFM": LaneGraphTask(with_traffic)}
 
 
@@ -151,7 +150,7 @@ def _gradient(task: LaneGraphTask):
 def run(out: Path, seconds: float = 10.0) -> dict[str, Any]:
     """Run everything, print the tables, write `host.json` and `host.md` into `out`, and return the record."""
     batch = examples()
-    traffic = tasks()["+TFM"].traffic_flow or TrafficFlowConfig()
+    traffic = tasks()["+TFM"].model.priors.traffic_flow or TrafficFlowConfig()
     results = inference(batch, seconds) | training(batch, seconds) | seeds(batch, seconds)
     record = {
         "machine": machine(),

@@ -37,7 +37,9 @@ def image_program(task: LaneShapeTask, params: Params) -> Callable[[UInt8[Array,
         no_lines = LaneLines(jnp.zeros((0, 1, 2)), jnp.zeros((0, 1), bool), jnp.zeros(0, bool))
 
         def one(image):
-            return task.predict(params, RoadImage(image, jnp.ones(image.shape[:2], bool), no_lines)).curves
+            prediction = task.predict(params, RoadImage(image, jnp.ones(image.shape[:2], bool), no_lines))
+            assert prediction.curves is not None, "tasks of lane shapes predict curves"
+            return prediction.curves
 
         answer = jax.vmap(one)(images)
         return {"logits": answer.logits, "curves": answer.curves}

@@ -9,7 +9,6 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.markers.curves import CurveConfig, Sighting, measure, street, summarise
 from tflane_jax.markers.detection import DetectorConfig
-from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.scene.marker_patterns import MarkerFamily
 
 pytest.importorskip("cv2")
@@ -60,13 +59,6 @@ def test_rows_say_what_the_sightings_say():
     assert far["found"] == 0.0
     assert np.isnan(far["translation m"])
     assert summarise([]) == []
-
-
-def test_the_picture_is_written(tmp_path):
-    pytest.importorskip("matplotlib")
-    rows = summarise([Sighting(0, 0.0, 10.0, True, 50.0, np.ones(3), 1.0, 30.0, 0.1, 0.2)])
-    path = save_error_curves(tmp_path / "curves.png", {"one": rows, "none": []}, 40.0)
-    assert path.stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

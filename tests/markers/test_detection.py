@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.cameras import project
+from tflane_jax.markers.corner_refinement import refine_corners
 from tflane_jax.markers.detection import (
     DetectorConfig,
     detect,
     detection_score,
     find_markers,
     marker_outline,
-    refine_corners,
     solve_square,
 )
 from tflane_jax.scene import CameraViews

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.world.perfect_tracker import PERFECT
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
@@ -70,7 +71,7 @@ def test_boxes_are_in_the_ego_frame_of_their_frame():
 
 
 def test_perfect_tracker_reports_every_actor():
-    log = simulate(5, WorldConfig(tracker=TrackerConfig.perfect()))
+    log = simulate(5, WorldConfig(tracker=PERFECT))
     assert log.tracks.valid.sum() == log.actors.valid.sum()
     np.testing.assert_array_equal(log.tracks.valid.sum(1), log.actors.valid.sum(1))
     for f in range(0, 80, 7):

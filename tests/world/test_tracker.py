@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.world.perfect_tracker import PERFECT
 from tflane_jax.geometry import transform_points, yaw_pose
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import Tracks
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, visible_share, wrap_angle
 
-PERFECT = TrackerConfig.perfect()
 NO_BUILDINGS = np.zeros((0, 5))
 CAR, TRUCK = (4.5, 1.9, 1.5), (9.0, 2.4, 3.5)
 RATE = 10.0

@@ -37,7 +37,7 @@ from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_graph import titles
+from tflane_jax.tasks.lane_graph import centerlines_of, titles
 
 _RELATION_THRESHOLD = 0.5
 
@@ -51,11 +51,11 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
-    lanes, elements = answer.centerlines, answer.elements
+    lanes, elements = centerlines_of(answer), answer.elements
     assert lanes is not None, "a lane-graph task predicts centerlines"
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
-    successor = expit(lanes.successor_logits)
+    successor = expit(np.asarray(lanes.successor_logits))
 
     make_folder(options.out)
     arrays = {"points": points, "scores": scores, "successor": successor}

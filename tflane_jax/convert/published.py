@@ -6,7 +6,10 @@ from pathlib import Path
 
 from tflane_jax.convert.lstr import load_lstr
 from tflane_jax.convert.toponet import load_host
+from tflane_jax.errors import UserError
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.parameters import Params
+from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
@@ -17,4 +20,8 @@ def load_weights(path: Path, task: LaneShapeTask | LaneGraphTask) -> tuple[Param
     Raises:
         UserError: the file cannot be read, or its tensors are not exactly those of the model.
     """
-    return load_lstr(path, task.model) if isinstance(task, LaneShapeTask) else load_host(path, task.model)
+    if isinstance(task, LaneShapeTask):
+        return load_lstr(path, task.model)
+    if not isinstance(task.model, TopoNetConfig | BevFormerDetrConfig):
+        raise UserError(f"no published weights are known for a {type(task.model).__name__}")
+    return load_host(path, task.model)

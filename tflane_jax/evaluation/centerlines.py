@@ -34,7 +34,8 @@ def detections_from_prediction(
 ) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
-    Without topology, no edge has any confidence. No score threshold. The attribute of a traffic element is the one with the highest score of its query.
+    Without topology, no edge has any confidence. No score threshold. The attribute of a traffic element is the one with
+    the highest score of its query.
     """
     scores = expit(np.asarray(prediction.logits)).max(-1)
     order = np.argsort(-scores, kind="stable")

@@ -25,7 +25,7 @@ from tflane_jax.evaluation.vector_maps import map_detections, map_lines, map_tru
 from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import CLASSES, VectorMapMetrics
+from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth, VectorMapMetrics
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import ElementPrediction, Example, LinePrediction, Prediction, SegmentPrediction, TrafficElements
 
@@ -112,14 +112,14 @@ class LaneGraphMetrics:
         return applied | ({"lines": self._lines} if "lines" in measured else {})
 
 
-def _lines(lines: LinePrediction):
+def _lines(lines: LinePrediction) -> MapDetections:
     """Return the lines of the classes that MapTR's metric knows, each of its likeliest class."""
     confidence = expit(np.asarray(lines.logits))
     classes = confidence.argmax(-1)
     return map_detections(np.asarray(lines.points), classes, confidence.max(-1), classes < len(CLASSES))
 
 
-def _true_lines(example: Example):
+def _true_lines(example: Example) -> MapTruth:
     """Return the labelled map lines; without labels, those that lane segments and areas imply."""
     lines = example.map_lines
     if lines is None:

@@ -37,16 +37,16 @@ def auxiliary_losses(
     """
     losses, report = [], {}
     for name in names:
-        if name == "denoised":
+        if name == "denoised" and outputs.denoised is not None:
             terms = denoising(outputs.denoised, lanes)
             losses.append(sum(term.sum() for term in terms.values()))
             report |= {f"denoised_{key}": value for key, value in last_layer(terms).items()}
-        elif name == "lane_cells":
+        elif name == "lane_cells" and outputs.lane_cells is not None:
             each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
             report["cells"] = cell_weight * each(outputs.lane_cells, lanes, bev_range).mean()
             losses.append(report["cells"])
         else:
-            raise ValueError(f"no auxiliary loss is known for {name}")
+            raise ValueError(f"the host names the auxiliary output {name}, which it did not give or no loss knows")
     return losses, report
 
 

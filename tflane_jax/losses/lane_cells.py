@@ -68,14 +68,14 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
     return LaneCells(*(value.reshape(h, w, *value.shape[1:]) for value in (apart < 0.5, near, offset, direction)))
 
 
-def lane_cell_loss(said: Float[Array, "h w 5"], lanes: LaneGraph, range_: PerceptionRange) -> Float[Array, ""]:
+def lane_cell_loss(cells: Float[Array, "h w 5"], lanes: LaneGraph, range_: PerceptionRange) -> Float[Array, ""]:
     """Return the loss of one example: cross entropy, cells with and without a lane weighing alike, and the errors of
     the offsets and directions of the cells near a lane.
     """
-    h, w, _ = said.shape
+    h, w, _ = cells.shape
     true = lane_cells(lanes, (h, w), range_)
-    entropy = optax.sigmoid_binary_cross_entropy(said[..., 0], true.inside.astype(said.dtype))
-    error = jnp.abs(said[..., 1:] - jnp.concatenate([true.offset, true.direction], -1)).sum(-1)
+    entropy = optax.sigmoid_binary_cross_entropy(cells[..., 0], true.inside.astype(cells.dtype))
+    error = jnp.abs(cells[..., 1:] - jnp.concatenate([true.offset, true.direction], -1)).sum(-1)
     return 0.5 * (_mean(entropy, true.inside) + _mean(entropy, ~true.inside)) + _mean(error, true.near)
 
 

@@ -182,6 +182,8 @@ def lane_losses(
     )
     classes, points = layer(prediction.points, prediction.logits, assignment, lanes)  # each (B, D)
     edges = lanes.successor & lanes.valid[:, :, None] & lanes.valid[:, None, :]
+    if prediction.successor_logits is None:
+        raise ValueError("this loss needs a host that predicts topology (successor_logits)")
     related = last_layers(assignment, prediction.successor_logits.shape[1])
     successors = edge_loss(prediction.successor_logits, related, related, edges, config.alpha, config.gamma)
     count = positives(assignment)
@@ -238,6 +240,8 @@ def element_lane_loss(
     config: TopoNetLossConfig,
 ) -> Float[Array, " layers"]:
     """Return the weighted loss of the lane-element topology of every layer of a batch that predicts it."""
+    if prediction.lane_logits is None:
+        raise ValueError("this loss needs a host that predicts lane-element topology (lane_logits)")
     layers = prediction.lane_logits.shape[1]
     edges = elements.lane & lanes.valid[:, :, None] & elements.valid[:, None, :]
     rows, columns = last_layers(lane_assignment, layers), last_layers(element_assignment, layers)

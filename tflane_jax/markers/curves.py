@@ -23,8 +23,6 @@ from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount, CameraRi
 from tflane_jax.world.cameras.sensor import render_window
 from tflane_jax.world.render.camera import FrontCamera
 
-# Standard deviation of the paper's forward error and of its yaw and pitch errors at 60 m, metres and degrees.
-PAPER_DISTANCE, PAPER_FORWARD, PAPER_ANGLE = 60.0, 3.0, 2.0
 # Around a board this many pixels are drawn, and of its own size half as many again.
 _AROUND = 24
 _LANE, _HEIGHT = 3.5, 3.0

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime
 import json
-import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_text
 from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry import invert_pose, resample_lines, transform_points
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers
@@ -241,15 +241,7 @@ def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "surv
     # One line for each marker, so that two versions of a store can be compared as text.
     body = ",\n".join(json.dumps(record, separators=(",", ":"), allow_nan=False) for record in records)
     text = json.dumps(head)[:-1] + ', "markers": [\n' + body + "\n]}\n"
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UserError(f"cannot write the marker store {path}: {error.strerror or error}") from error
-    return path
+    return write_text(path, text)
 
 
 def _in_frame(marker: StoredMarker, frame: Literal["marker", "survey"]) -> Float[np.ndarray, "j p 3"]:

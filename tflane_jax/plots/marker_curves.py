@@ -1,4 +1,4 @@
-"""Curves of marker detection and pose error over distance, with those that the paper assumes (marker paper, Fig. 3)."""
+"""Detection rate and pose errors of fiducial markers over distance, beside the assumptions of the marker paper."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.markers.curves import PAPER_ANGLE, PAPER_DISTANCE, PAPER_FORWARD
 from tflane_jax.plots.figure import new_figure, save_figure
+
+# Standard deviation of the paper's forward error and of its yaw and pitch errors at 60 m, metres and degrees.
+PAPER_DISTANCE, PAPER_FORWARD, PAPER_ANGLE = 60.0, 3.0, 2.0
 
 
 def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma_d: float) -> Path:
-    """Draw detection rate, forward error and rotation error over distance with the paper's curves; return the path.
+    """Draw rate, forward error and rotation error over distance, beside what the paper assumes, and return the path.
 
     Args:
         path: .png, .pdf or .svg.
-        curves: rows of `markers.curves.summarise` by name.
+        curves: rows of `summarise` by name.
         sigma_d: of the paper's probability of detection exp(-d^2 / 2 sigma_d^2), metres.
     """
     figure, axes = new_figure(1, 4, panel=(3.6, 3.0))

@@ -34,7 +34,7 @@ Draw = Callable[[Path, int, Params], None]
 
 
 @dataclass(frozen=True)
-class Model(Generic[ExampleT]):
+class Model:
     """A trained model as comparisons and pictures take it.
 
     Attributes:
@@ -42,7 +42,7 @@ class Model(Generic[ExampleT]):
         params: of one seed.
     """
 
-    task: Task[ExampleT, Any]
+    task: Task[Any, Any]
     params: Params
 
 
@@ -130,7 +130,7 @@ class Task(Generic[ExampleT, DataT]):
         """Return the function that draws predictions for a few validation examples while training."""
         raise NotImplementedError
 
-    def draw_comparison(self, models: Mapping[str, Model[ExampleT]], source: Any, data: DataT, path: Path) -> Path:
+    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: DataT, path: Path) -> Path:
         """Draw what several models predict for the same examples; return the picture's path."""
         raise NotImplementedError
 

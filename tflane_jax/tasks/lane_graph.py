@@ -36,7 +36,7 @@ from tflane_jax.models.host import HostConfig, HostMemory
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
+from tflane_jax.scene import CenterlinePrediction, Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 
 T = TypeVar("T")
@@ -239,18 +239,16 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
                 examples, answer = predict_examples(self, params, dataset, indices)
                 path, names = folder / "pictures" / f"step_{step:08d}.png", titles(dataset, indices)
                 ground, view = source.example.ground, source.example.range
-                lanes = {f"step {step}": answer.centerlines}
+                lanes = {f"step {step}": centerlines_of(answer)}
                 save_examples(path, examples, lanes, titles=names, ground=ground, view=view)
                 if examples.cameras is not None:
                     path = path.with_stem(f"{path.stem}_cameras")
-                    lanes, elements = answer.centerlines, answer.elements
+                    lanes, elements = centerlines_of(answer), answer.elements
                     save_camera_views(path, examples, lanes, elements, titles=names, ground=ground, view=view)
 
         return draw
 
-    def draw_comparison(
-        self, models: Mapping[str, Model[Example]], source: Any, data: Example | Streamed, path: Path
-    ) -> Path:
+    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: Example | Streamed, path: Path) -> Path:
         """Draw the test frames with the most hidden lanes (of streamed data, any), every model beside the truth."""
         from tflane_jax.plots import save_examples
 
@@ -262,7 +260,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
             indices = np.argsort(-hidden, kind="stable")[:_COMPARED_EXAMPLES].tolist()
         examples = stack_examples([dataset.example(index) for index in indices])
         lanes = {
-            name: predict_examples(model.task, model.params, dataset, indices)[1].centerlines
+            name: centerlines_of(predict_examples(model.task, model.params, dataset, indices)[1])
             for name, model in models.items()
         }
         names = titles(dataset, indices)
@@ -296,6 +294,13 @@ def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
     limited = replace(traffic, prior=replace(traffic.prior, top_instances=count))
     priors = replace(task.model.priors, traffic_flow=limited)
     return replace(task, model=replace(task.model, priors=priors))
+
+
+def centerlines_of(prediction: Prediction) -> CenterlinePrediction:
+    """Return the predicted centerlines; raise UserError for a host that predicts none."""
+    if prediction.centerlines is None:
+        raise UserError("this host predicts no centerlines: pictures of other lanes are not drawn yet")
+    return prediction.centerlines
 
 
 def titles(dataset: Dataset, indices: list[int]) -> list[str]:

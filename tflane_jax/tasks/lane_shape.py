@@ -22,7 +22,7 @@ from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
 from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare
 from tflane_jax.evaluation import lane_shapes
-from tflane_jax.evaluation.predict import predict_batch, predictions
+from tflane_jax.evaluation.predict import Predictor, predict_batch, predictions
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
@@ -150,9 +150,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
 
         return draw
 
-    def draw_comparison(
-        self, models: Mapping[str, Model[RoadImage]], source: Any, data: LabelledImages, path: Path
-    ) -> Path:
+    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: LabelledImages, path: Path) -> Path:
         """Draw a few test images, every model beside the truth."""
         from tflane_jax.plots.images import save_road_images
 
@@ -186,15 +184,15 @@ def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
     return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
 
 
-def predict_curves(task: Task[RoadImage, Any], params: Params, examples: RoadImage) -> CurvePrediction:
-    """Return the predictions for stacked images, numpy."""
+def predict_curves(task: Predictor, params: Params, examples: RoadImage) -> CurvePrediction:
+    """Return the curves predicted for stacked images, numpy; raise ValueError for a task that predicts none."""
     ((_, answer),) = predictions(task, params, examples, len(examples.image))
+    if answer.curves is None:
+        raise ValueError("this task predicts no lane shapes")
     return answer.curves
 
 
-def frames_per_second(
-    task: Task[RoadImage, Any], params: Params, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH
-) -> float:
+def frames_per_second(task: Predictor, params: Params, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH) -> float:
     """Return how many images a second a model takes one at a time, from uint8 image to curves, compilation apart."""
     image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
     lines = jax.tree.map(lambda leaf: leaf[None], LaneLines.empty(1, 1))

@@ -1,7 +1,7 @@
 """A scene of the built-in world from its number: roads, traffic, tracker -> `Log`.
 
-Everything is drawn from streams `np.random.default_rng([ROOT, scene id, stream])`, so a scene is the same on any
-machine, and a change of one part (say, the tracker) leaves the others as they were.
+Random draws come from streams `np.random.default_rng([ROOT, scene id, stream])`: a scene is the same on any machine,
+and a change of one part (for example the tracker) does not change the others.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ HISTORY = 20
 
 
 class Stream(enum.IntEnum):
-    """What is drawn from which stream of a scene."""
+    """The random streams of a scene."""
 
     ROADS = 0
     TRAFFIC = 1
@@ -41,9 +41,9 @@ class WorldConfig:
 
     Attributes:
         roads, traffic, tracker: its parts.
-        markers: where fiducial markers stand. They change nothing else in a scene.
-        severity: 0 (clear) to 1 (worst): scales weather and worn paint, mildly also the density of traffic and the
-            noise of the tracker.
+        markers: placement of fiducial markers. They change nothing else in a scene.
+        severity: 0 (clear) to 1 (worst): scales weather and paint wear and, weakly, traffic density and tracker
+            noise.
         duration_s, rate_hz: length of a scene and its frame rate.
         keyframes: moments at which examples are made, evenly spaced, each with 20 frames of history before it.
     """
@@ -66,7 +66,7 @@ class WorldConfig:
 def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
     """Return the scene with this number (not negative).
 
-    Raises UserError where the scene is too short for its key frames, or the severity is not between 0 and 1.
+    Raises UserError if the scene is too short for its key frames or the severity is not between 0 and 1.
     """
     frames = config.frames
     if not 0.0 <= config.severity <= 1.0:

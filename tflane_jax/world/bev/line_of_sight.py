@@ -1,8 +1,7 @@
-"""What a sensor on the vehicle cannot see: line of sight past boxes and buildings (2.5-D).
+"""Occlusion: line of sight from a sensor past boxes and buildings on flat ground (2.5-D).
 
-The world stands on flat ground: a ray runs straight from the sensor above the ego origin to a target point,
-and it is blocked where it passes through the volume of a box. A low box does not hide what the ray reaches
-over its roof.
+A straight ray from the sensor to a target point is blocked if it passes through the volume of a box. A ray may pass
+over the roof of a low box.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 # Widens each angular interval of the prefilter so that rounding never drops a pair; the exact test decides.
 _ANGLE_MARGIN = 1e-9
-# Stands for a zero ray direction along an axis: far smaller than any real one, and its inverse is finite.
+# Replaces a zero component of a ray direction: far smaller than any real one, and its inverse is finite.
 _NO_DIRECTION = 1e-30
 
 
@@ -36,9 +35,9 @@ def hidden_points(
         boxes: rows x, y, length, width, yaw, height, base_z (centre in x and y; base_z is the underside).
         buildings: rows x, y, length, width, yaw; opaque from the ground to any height.
         sensor_height: metres above the ground.
-        target_height: height of the points, one for all or one each.
-        exclude: for each point the row of `boxes` that must not hide it (an actor asked about itself); a
-            number that is no row excludes nothing.
+        target_height: height of the points, a scalar or one value per point.
+        exclude: for each point the row of `boxes` that must not hide it (the actor's own box); any other number
+            excludes nothing.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     occluders = _occluders(boxes, buildings)
@@ -65,7 +64,7 @@ def _occluders(boxes: np.ndarray, buildings: np.ndarray) -> Float[np.ndarray, "o
 
 
 def _pairs_in_angle(points: np.ndarray, occluders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (point, occluder) index pairs in which the occluder may stand before the point.
+    """Return (point, occluder) index pairs in which the occluder may hide the point.
 
     Seen from the origin a convex footprint covers one interval of directions below half a turn, so sorting
     the points by direction turns "which points lie behind this box" into one slice for each box.

@@ -1,7 +1,6 @@
-"""What is painted on the ground and where the road ends, as dense points: a map made ready for a raster.
+"""A map as dense points on paint, road edges and crossings, ready to be rasterised.
 
-Sampled once for each map, in global metres, so that dashes and wear stay where they are while the vehicle
-passes.
+Sampled once per map in global metres, so that dashes and wear stay fixed to the ground.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from tflane_jax.geometry.polylines import arc_length, sample_at
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import VectorMap
 
-# Half a cell of the usual grid: no cell on a line is missed.
+# Half a cell of the usual grid, so that no cell on a line is missed, metres.
 SPACING = 0.25
 # Length of a dash and of dash with gap, metres.
 DASH, DASH_PERIOD = 3.0, 9.0
@@ -68,7 +67,7 @@ def sample_map(vector_map: VectorMap) -> MapSamples:
 
 
 def painted_lines(vector_map: VectorMap) -> list[tuple[np.ndarray, int]]:
-    """Return every painted line once: the boundary that two neighbours share is in the map twice."""
+    """Return every painted line once: the common boundary of two neighbours is in the map twice."""
     found: dict[tuple[float, ...], tuple[np.ndarray, int]] = {}
     for line, kind in _boundaries(vector_map):
         if kind != LineType.NONE and len(line) > 1:
@@ -77,7 +76,7 @@ def painted_lines(vector_map: VectorMap) -> list[tuple[np.ndarray, int]]:
 
 
 def line_key(line: np.ndarray) -> tuple[float, ...]:
-    """Return what two copies of one line have in common, whichever way they run."""
+    """Return a key that is equal for two copies of one line, in either direction."""
     ends = sorted(tuple(np.round(point[:2], 1)) for point in (line[0], line[-1]))
     middle = np.round(sample_at(line, np.array([arc_length(line)[-1] / 2]))[0, :2], 0)
     return (*ends[0], *ends[1], *middle)

@@ -1,9 +1,8 @@
-"""Sensor 1 of the world: a bird's-eye-view evidence raster as a vision network would deliver it.
+"""The BEV sensor of the world: an evidence raster in the ego frame, as a vision network might deliver it.
 
-Lane paint, road edges, crossings and the visible faces of obstacles are drawn into the ego frame, hidden
-behind what
-stands in the line of sight, and degraded: softer, fainter and misplaced with range, worn along lines, with
-lost and invented patches, worse in bad weather. Everything random is seeded; the occlusion is exact.
+Lane paint, road edges, crossings and the visible faces of obstacles are drawn; occluded cells stay empty. Evidence is
+degraded: blurred, faded and misplaced with range, worn along lines, with missing and false patches, and worse in bad
+weather. All random draws are seeded; the occlusion is exact.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from tflane_jax.scene import BevChannel
 from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.bev.map_samples import MapSamples
 
-# Range at which the strengths below are stated, metres.
+# Range to which the blur and error settings refer, metres.
 _FAR = 50.0
-# Spacing of the noise from which lost and invented patches and the position error grow, metres.
+# Knot spacing of the noise for missing patches, false patches and the position error, metres.
 _LOST_PATCH, _INVENTED_PATCH, _ERROR_PATCH = 8.0, 2.5, 12.0
 # Wavelengths of wear along a line, metres.
 _WEAR_WAVES = np.array([60.0, 23.0, 9.0])
-# Points around the outline of an obstacle, how far outside its faces they are looked at, and how deep the
-# evidence of a face reaches, metres.
+# Points around the outline of an obstacle; distance outside its faces at which visibility is tested, and depth of the
+# evidence behind a face, metres.
 _OUTLINE_POINTS, _OUTSIDE, _DEPTH = 64, 0.02, 0.6
 # Brings a blurred line back to nearly full evidence.
 _GAIN = 1.4
@@ -43,12 +42,12 @@ class BevSensorConfig:
         severity: scales all degradations below, and the log's own weather and paint wear; 0 gives a perfect
             raster in which only occlusion is left.
         sight_range: range at which confidence has fallen to 1/e in clear weather, metres.
-        weather_range_loss: share of that range which the worst weather takes.
+        weather_range_loss: fraction of that range lost in the worst weather.
         far_blur: 0 to 1, how much softer evidence is at 50 m.
         far_error: standard deviation of the misplacement along the ray at 50 m, metres.
-        lost: share of the ground on which evidence is lost in patches.
-        invented: share of the visible ground on which each channel holds invented evidence.
-        noise: standard deviation of the cell noise, of full evidence 1.
+        lost: fraction of the ground where evidence is missing, in patches.
+        invented: fraction of the visible ground with false evidence, for each channel.
+        noise: standard deviation of the cell noise; full evidence is 1.
     """
 
     grid: BevGrid = BevGrid()
@@ -89,8 +88,7 @@ def render_bev(
         boxes, buildings: obstacles in the ego frame, as `hidden_points` takes them.
         hidden: `hidden_cells` of the same obstacles.
         weather, paint_wear: 0 to 1, see `logs.Log`.
-        log_seed: root of the log's randomness; wear depends on nothing else, so that it lasts from frame to
-            frame.
+        log_seed: seed of the log; wear depends on it alone, so it is the same in all frames.
         frame: number of the frame in the log.
     """
     severity, lattice = config.severity, _lattice(config.grid)
@@ -110,7 +108,7 @@ def render_bev(
     evidence *= np.clip((lattice.noise(rng, 1, _LOST_PATCH) - ndtri(lost)) * 2.0 + 0.5, 0.0, 1.0)
     invented = min(config.invented * severity * (1.0 + weather), 1.0)
     patches = lattice.noise(rng, len(BevChannel), _INVENTED_PATCH) + ndtri(invented)
-    # Evidence of the ground is hidden with it; a face that is seen stands on ground that it hides.
+    # Ground evidence is masked by visibility. Obstacle faces are not: a visible face hides the ground below itself.
     evidence[: BevChannel.OBSTACLE] *= visible
     evidence += visible * np.clip(patches * 0.8, 0.0, 0.6)
     noise = rng.standard_normal(evidence.shape, np.float32)
@@ -120,7 +118,7 @@ def render_bev(
 
 @dataclass(frozen=True)
 class _Lattice:
-    """A grid with what every frame needs of it: cell centres (H W, 2) and their range (H, W), metres."""
+    """A grid with values that every frame needs: cell centres (H W, 2) and their range (H, W), metres."""
 
     grid: BevGrid
     centres: np.ndarray
@@ -135,7 +133,7 @@ class _Lattice:
         return rows @ coarse @ columns.T
 
     def splat(self, points: np.ndarray, channel: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "c h w"]:
-        """Add points (M, 2) with weights to the four cells around each; points outside are left out."""
+        """Add points (M, 2) with weights to the four cells around each; points outside are ignored."""
         h, w = self.grid.rows, self.grid.columns
         pixel = self.grid.pixel(points)
         corner = np.floor(pixel).astype(int)
@@ -175,13 +173,13 @@ def _upsampling(cells: int, patches: float) -> Float[np.ndarray, "cells knots"]:
 def paint_left(
     line: Int[np.ndarray, " m"], along: Float[np.ndarray, " m"], lines: int, paint_wear: float, log_seed: int
 ) -> Float[np.ndarray, " m"]:
-    """Return what wear leaves of each paint point, 0 to 1, varying smoothly along each line and from line to line.
+    """Return the fraction of paint left at each point, 0 to 1; it varies smoothly along a line and between lines.
 
     Args:
         line, along: the painted line (as `map_samples.painted_lines` numbers it) and the distance along it, metres.
-        lines: how many there are.
+        lines: number of painted lines.
         paint_wear: 0 to 1, see `logs.Log`.
-        log_seed: root of the log's randomness; wear depends on nothing else.
+        log_seed: seed of the log; wear depends on it alone.
     """
     rng = np.random.default_rng([log_seed, _WEAR_STREAM])
     phase = rng.uniform(0.0, 2 * np.pi, (lines, len(_WEAR_WAVES)))
@@ -213,7 +211,7 @@ def _draw_ground(
 def _draw_obstacles(
     boxes: np.ndarray, buildings: np.ndarray, lattice: _Lattice, error: np.ndarray
 ) -> Float[np.ndarray, "h w"]:
-    """Draw the faces that the sensor sees at half their height; standing and moving boxes look the same."""
+    """Draw the faces visible at half their height; parked and moving boxes look the same."""
     drawn = boxes[_margin(lattice.grid.range, 10.0).contains(boxes[:, :2])]
     outline, inward = _outlines(drawn)
     height = np.repeat(drawn[:, 6] + drawn[:, 5] / 2, _OUTLINE_POINTS)
@@ -238,7 +236,7 @@ def _outlines(boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _misplace(points: np.ndarray, lattice: _Lattice, error: np.ndarray) -> np.ndarray:
-    """Move points along their rays by the error field, which is stated at 50 m and grows with the range squared."""
+    """Move points along their rays by the error field, which is given at 50 m and grows with the range squared."""
     distance = np.linalg.norm(points, axis=-1, keepdims=True)
     return points * (1.0 + error[lattice.cell_of(points)][:, None] * distance / _FAR**2)
 

@@ -1,1 +1,1 @@
-"""The renderer that front views and ring cameras share: camera, polygons, weather."""
+"""Rendering code used by both front views and ring cameras: camera, polygons, weather, noise, exposure."""

@@ -1,4 +1,4 @@
-"""A forward camera above flat ground, as a car carries it behind its windscreen."""
+"""A pinhole camera above flat ground, as mounted behind a windscreen: projection, ground lookup, random mounting."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from tflane_jax.geometry.cameras import ground_points
 from tflane_jax.geometry.poses import invert_pose
 from tflane_jax.world.roads.config import Range
 
-# The image that focal lengths and rows are stated for: TuSimple's, pixels.
+# Image size to which focal lengths and rows refer: TuSimple's, pixels.
 REFERENCE_WIDTH, REFERENCE_HEIGHT = 1280, 720
-# What lies nearer than this to the image plane is not drawn, metres.
+# Near plane: nothing at a smaller depth is drawn, metres.
 NEAR = 0.6
 
 
 @dataclass(frozen=True)
 class FrontCameraConfig:
-    """Ranges that a scene's camera is drawn from. The defaults put the vanishing points where TuSimple's labels have
-    them: rows 205 to 285 and columns 520 to 770 of 1280 x 720.
+    """Ranges from which a scene's camera is drawn.
+
+    The defaults put the vanishing points where TuSimple's labels have them: rows 205 to 285 and columns 520 to 770 of
+    1280 x 720.
 
     Attributes:
         width, height: of the image, pixels.
@@ -68,14 +70,14 @@ class FrontCamera:
         return (self.intrinsics @ self.camera_from_ego[:3]).T
 
     def image_of(self, points: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-        """Return pixels and depths of points in the ego frame; the pixel of one nearer than `NEAR` means nothing."""
-        # `geometry.project` in fewer steps: this is called for every polygon.
+        """Return pixels and depths of points in the ego frame; pixels at depths below `NEAR` are arbitrary."""
+        # Faster than `geometry.project`: this is called for every polygon.
         image = points @ self._projection[:3] + self._projection[3]
         depth = image[:, 2]
         return image[:, :2] / np.maximum(depth, NEAR)[:, None], depth
 
     def ground_at(self, pixels: Float[np.ndarray, "k 2"]) -> tuple[Float[np.ndarray, "k 2"], Bool[np.ndarray, " k"]]:
-        """Return the ground seen at pixels (x, y in the ego frame), and whether there is any."""
+        """Return the ground points seen at pixels (x, y in the ego frame) and which pixels see ground."""
         points, valid = ground_points(pixels, self.intrinsics, self.camera_from_ego)
         return points[:, :2], valid
 
@@ -94,7 +96,7 @@ class FrontCamera:
 
     @cached_property
     def _rise(self) -> Float[np.ndarray, "3"]:
-        """How much the ray of pixel (u, v, 1) rises for every metre of depth."""
+        """Coefficients: the ray of pixel (u, v) rises by their product with (u, v, 1), metres per metre of depth."""
         return self.camera_from_ego[:3, 2] @ np.linalg.inv(self.intrinsics)
 
 

@@ -1,4 +1,4 @@
-"""Flat-coloured polygons in space, shaded by the weather and drawn into an image from far to near."""
+"""Flat-coloured 3-D polygons: shading by weather, near clipping, and drawing from far to near (painter's algorithm)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ HEADLIGHTS = 38.0
 
 @dataclass
 class Solid:
-    """Polygons that are drawn together, in the order in which they were added.
+    """Polygons drawn together, in the order in which they were added.
 
     Attributes:
         distance: from the camera, metres; farther solids are drawn first.
-        corners: (m, 3) each, ego frame, metres; seen from the side on which they run counter-clockwise.
+        corners: (m, 3) each, ego frame, metres; counter-clockwise as seen from the visible side.
         colours: display values 0 to 1, one for each.
         light: 0 lit by the sun, 1 shines by itself, one for each.
     """
@@ -44,7 +44,7 @@ class Solid:
 def draw_solids(
     image: UInt8[np.ndarray, "h w 3"], solids: Sequence[Solid], camera: FrontCamera, weather: Weather
 ) -> None:
-    """Draw solids into the image, the farthest first; polygons seen from behind are left out."""
+    """Draw solids into the image, the farthest first; polygons seen from behind are skipped."""
     import cv2
 
     ordered = sorted((solid for solid in solids if solid.corners), key=lambda solid: -solid.distance)
@@ -80,7 +80,7 @@ def draw_solids(
 
 
 def fixed_point(pixels: Float[np.ndarray, "m 2"]) -> Int[np.ndarray, "m 2"]:
-    """Return pixels, counted from the image's corner, as cv2 takes them: from the first pixel's centre, in 1/16."""
+    """Convert pixels, counted from the image corner, to cv2's fixed point: 1/16 pixel from the first pixel's centre."""
     return np.round((np.clip(pixels, -_LIMIT, _LIMIT) - 0.5) * (1 << SHIFT)).astype(np.int32)
 
 
@@ -102,7 +102,7 @@ def shade(
     place: Float[np.ndarray, "k 3"],
     weather: Weather,
 ) -> Float[np.ndarray, "k 3"]:
-    """Return display colours 0 to 255 of surfaces in the light and haze of the weather."""
+    """Return display colours (0 to 255) of surfaces under the light and haze of the weather."""
     unit = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
     distance = np.linalg.norm(place[:, :2], axis=-1)
     sky = 0.8 + 0.2 * unit[:, 2]

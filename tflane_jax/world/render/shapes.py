@@ -1,4 +1,4 @@
-"""Bodies made of flat polygons, from which vehicles and what stands beside the road are put together."""
+"""Building blocks of vehicles and roadside objects: boxes, frusta, panels and wheels made of flat polygons."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def frustum(
         solid: receives them.
         low, high: x of the rear, x of the front, and z, of bottom and top, metres.
         half: half the width of bottom and top, metres.
-        colours: by name of the face: top, left, right, front, rear; "all" for those that are not named.
+        colours: by face name: top, left, right, front, rear; "all" for the remaining faces.
 
     Returns:
         The corners (4, 3) of each face, from the one at its lower left as seen from outside, counter-clockwise.
@@ -61,14 +61,14 @@ def frustum(
 def inset(
     face: Float[np.ndarray, "4 3"], across: tuple[float, float], up: tuple[float, float]
 ) -> Float[np.ndarray, "4 3"]:
-    """Return the part of a face between shares (0 to 1) of its width, from the left, and of its height."""
+    """Return the part of a face between two fractions of its width (from the left) and two of its height."""
     return insets(face, np.array([across]), np.array([up]))[0]
 
 
 def insets(
     face: Float[np.ndarray, "4 3"], across: Float[np.ndarray, "n 2"], up: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 4 3"]:
-    """Return `inset` for n pairs of shares."""
+    """Return `inset` for n pairs of fractions."""
     lower_left, lower_right, upper_right, upper_left = face
     u, v = across[:, [0, 1, 1, 0], None], up[:, [0, 0, 1, 1], None]
     return (1 - v) * ((1 - u) * lower_left + u * lower_right) + v * ((1 - u) * upper_left + u * upper_right)
@@ -90,7 +90,7 @@ def panel(
 
 
 def wheels(solid: Solid, places: tuple[float, ...], half: float, radius: float) -> None:
-    """Add what is seen of the wheels from the sides."""
+    """Add the wheels as discs, seen from the sides."""
     angle = np.linspace(0.0, 2.0 * np.pi, 9)[:-1]
     for x in places:
         for side in (-1.0, 1.0):

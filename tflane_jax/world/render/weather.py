@@ -1,4 +1,4 @@
-"""Light and weather of a front view: what they do to colours, shadows, sight and the camera's picture."""
+"""Light and weather of an image: sun, sky, fog, rain and night, and the camera's exposure, noise and blur."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Sky(enum.Enum):
 
 @dataclass(frozen=True)
 class FrontWeatherConfig:
-    """How often each kind of weather comes at severity 1, and how strong it is there.
+    """Frequency and strength of each kind of weather at severity 1.
 
     Attributes:
         kinds: relative frequencies at severity 1; at severity 0 all is clear.
-        fog: visibility in fog, metres (where contrast has fallen to 1/e).
+        fog: visibility in fog, metres (distance at which contrast has fallen to 1/e).
         rain: the same in rain.
         noise: standard deviation of the sensor noise at severity 1, of full brightness 1; night doubles it.
         blur: largest blur of the lens, pixels.
@@ -65,14 +65,14 @@ class Weather:
     Attributes:
         kind: of weather.
         sun: (3,) unit vector towards the sun, ego frame.
-        direct, ambient: strength of sunlight and of light from everywhere; together about 1 by day.
+        direct, ambient: strength of sunlight and of ambient light; their sum is about 1 by day.
         zenith, horizon: colours of the sky.
         cloud: 0 to 1, how much of the sky is clouded.
         visibility: metres.
         rain: 0 to 1.
         night: 0 to 1; the ego's headlights shine.
         wear: of paint, 0 to 1.
-        dirt: 0 to 1, how much there is on the road that is not paint.
+        dirt: 0 to 1, amount of stains, seams and cracks on the road.
         exposure, contrast: factors of the picture; contrast about its middle.
         tint: (3,) factors.
         noise: standard deviation.
@@ -111,7 +111,7 @@ _LIGHT: dict[Sky, tuple[float, float, tuple[float, ...], tuple[float, ...], floa
 
 
 def draw_weather(rng: np.random.Generator, config: FrontWeatherConfig, severity: float) -> Weather:
-    """Draw the weather; the amount drawn from `rng` depends on nothing.
+    """Draw the weather; the number of draws from `rng` is always the same.
 
     Args:
         rng: stream.

@@ -1,4 +1,4 @@
-"""The drivable area of a map, from the lines that bound it."""
+"""Closed rings around the drivable area, assembled from road boundaries."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _CLOSED = 0.05
 
 
 def road_rings(boundaries: Sequence[Float[np.ndarray, "_ 3"]]) -> list[Float[np.ndarray, "_ 2"]]:
-    """Return rings that bound the drivable area by the even-odd rule: its outline, and the islands in it.
+    """Return rings that bound the drivable area by the even-odd rule: outlines and islands.
 
-    Boundaries that are not closed have the road on their left and end at the border of the map, where the next one
-    begins on the other side of the same street: the end of each is joined to the nearest beginning.
+    An open boundary has the road on its left and ends at the border of the map. The next one begins there, on the other
+    side of the same street, so each end is joined to the nearest start.
     """
     lines = [np.asarray(line, np.float64)[:, :2] for line in boundaries if len(line) > 1]
     rings = [line for line in lines if np.linalg.norm(line[0] - line[-1]) < _CLOSED]

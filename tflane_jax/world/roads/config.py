@@ -1,4 +1,4 @@
-"""What kinds of road the built-in world draws, and the ranges that it draws their measures from."""
+"""Settings of the road networks: scene kinds, and the ranges from which dimensions and probabilities are drawn."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class SceneKind(enum.Enum):
 
 @dataclass(frozen=True)
 class RoadConfig:
-    """Measures and probabilities of the procedural road networks. Lengths in metres, speeds in m/s, angles in degrees.
+    """Dimensions and probabilities of procedural road networks. Lengths in metres, speeds in m/s, angles in degrees.
 
     Attributes:
         kinds: scene kinds with their relative frequencies.

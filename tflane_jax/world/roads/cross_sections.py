@@ -1,4 +1,4 @@
-"""Cross-sections: the strips of one direction of travel of a street.
+"""Cross-sections of streets: the lanes and strips of one direction of travel.
 
 Each direction of travel is a *side*: strips counted from the axis outwards to the right of travel (half the median,
 vehicle lanes, bike lane, parking, gutter, kerb). A side may have extra lanes over a part of its length, which fork from
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from tflane_jax.world.roads.curves import smoothstep
 
-# Stations nearer than this (metres) are one: far below any spacing, far above rounding.
+# Stations nearer than this are the same, metres: far below any spacing, far above rounding errors.
 SAME_STATION = 1e-6
 
 
@@ -45,7 +45,7 @@ class ExtraLane:
     merges: float = 0.0
 
     def presence(self, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return its share of a lane width at distances along the side: 0 where absent, 1 where complete."""
+        """Return its width at distances along the side as a fraction of a lane width: 0 absent, 1 full."""
         up = smoothstep((t - self.start) / self.forks) if self.forks else t >= self.start - SAME_STATION
         down = smoothstep((self.stop - t) / self.merges) if self.merges else t <= self.stop + SAME_STATION
         return up * down

@@ -1,4 +1,4 @@
-"""Plane curves that roads are made of: clothoid-like reference lines, kerb fillets and connector curves."""
+"""Plane curves for road layout: clothoid-like reference lines, kerb fillets and connector curves."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def smoothstep(u: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
 
 
 def grid_with(stations: Sequence[float], spacing: float) -> Float[np.ndarray, " n"]:
-    """Return increasing stations at most `spacing` apart that hold every given one exactly."""
+    """Return increasing stations at most `spacing` apart that contain every given station exactly."""
     stops = np.unique(np.asarray(stations, np.float64))
     stops = stops[np.concatenate([[True], np.diff(stops) > 1e-6])]
     pieces = [np.linspace(a, b, int(np.ceil((b - a) / spacing)), endpoint=False) for a, b in pairwise(stops)]
@@ -93,7 +93,7 @@ def clothoid_line(
         knots: (station, curvature 1/m); constant outside.
     """
     knot_s, knot_k = np.asarray(knots, np.float64).reshape(-1, 2).T
-    # The integral runs over a grid that holds s = 0, where the line is pinned.
+    # The grid of the integral contains s = 0, where position and heading are given.
     at_zero = np.searchsorted(s, 0.0)
     pinned = at_zero < len(s) and s[at_zero] == 0.0
     grid = s if pinned else np.insert(s, at_zero, 0.0)

@@ -1,4 +1,4 @@
-"""The shape of an intersection: how far its arms reach in, the roundings of its kerbs and its pedestrian crossings."""
+"""Geometry of an intersection: stop distances of its arms, kerb roundings and pedestrian crossings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from tflane_jax.world.roads.curves import blend, cross, direction, fillet, right_of
 
-# Kerbs of neighbouring arms that open wider than this run on smoothly instead of meeting in a corner.
+# Above this angle between neighbouring arms their kerbs are joined by a smooth curve, without a corner.
 _NO_CORNER = np.deg2rad(155.0)
 # Between the kerb rounding and the crossing, and between the crossing and the stop line, metres.
 _CLEARANCE = 0.8
@@ -41,7 +41,7 @@ class Arm:
 
 
 def stop_distances(arms: Sequence[Arm], radius: float) -> Float[np.ndarray, " arms"]:
-    """Return how far from its origin each arm's lanes end, so that roundings and crossings fit in front of them.
+    """Return the distance from each arm's origin to its stop line, which leaves room for roundings and crossings.
 
     Args:
         arms: in counter-clockwise order.
@@ -63,7 +63,7 @@ def stop_distances(arms: Sequence[Arm], radius: float) -> Float[np.ndarray, " ar
 def kerb_corners(
     arms: Sequence[Arm], distances: Float[np.ndarray, " arms"], radius: float
 ) -> list[Float[np.ndarray, "n 2"]]:
-    """Return for each arm the kerb from beside its incoming lanes around to the next arm's outgoing lanes.
+    """Return for each arm the kerb from its incoming lanes around the corner to the next arm's outgoing lanes.
 
     The first and last points lie on the two kerbs at the arms' stop distances.
     """

@@ -26,7 +26,7 @@ _RING_HALF_ANGLE = np.deg2rad(29.0)
 
 @dataclass(frozen=True)
 class _Mouth:
-    """A laid-out street where it meets an intersection."""
+    """A laid-out street at its intersection, with the sides that lead in and out."""
 
     arm: ArmPlan
     street: Street
@@ -167,7 +167,7 @@ def _lay_intersection(
         config.vertex_spacing,
         corner_radius=junction.corner_radius,
     )
-    # Lights make sense only where there is traffic to hold back.
+    # Traffic lights need at least two phases with incoming traffic.
     used = sorted({p for p, a in zip(phases(approaches), approaches, strict=True) if a.incoming})
     signalised = junction.signalised and len(used) > 1
     set_priorities(ids, movements, approaches, network, index, signalised)

@@ -1,4 +1,4 @@
-"""Collecting lane segments while a road network is being laid out, before they become a `VectorMap`."""
+"""Mutable lane segments of a road network under construction, before they become a `VectorMap`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class LaneEnd:
 
 @dataclass
 class Draft:
-    """A lane segment in the making: paired vertices (n, 2) of its boundaries, and what `RoadNetwork` tells of it."""
+    """A lane segment under construction: paired boundary vertices (n, 2) and its attributes in `RoadNetwork`."""
 
     left: Float[np.ndarray, "n 2"]
     right: Float[np.ndarray, "n 2"]
@@ -64,7 +64,7 @@ class LaneNetwork:
 
     Attributes:
         drafts: by segment id.
-        yield_to: segment -> segments whose traffic it must let pass.
+        yield_to: segment -> segments whose traffic has priority over its own.
         signal_phase: connector -> (intersection index, phase index).
     """
 
@@ -83,7 +83,7 @@ class LaneNetwork:
         self.drafts[segment].successors.append(successor)
 
     def weld(self, segment: int, successor: int, *, keep: int) -> None:
-        """Connect two segments whose boundaries meet up to rounding: the other takes over the ends of `keep`."""
+        """Connect two segments whose boundaries meet up to rounding; the other copies the end vertices of `keep`."""
         a, b = self.drafts[segment], self.drafts[successor]
         if keep == segment:
             b.left[0], b.right[0] = a.left[-1], a.right[-1]
@@ -126,9 +126,9 @@ class LaneNetwork:
         return out
 
     def routes(self, shortest: float) -> tuple[tuple[int, ...], ...]:
-        """Return every way through the segments open to the ego vehicle that is at least `shortest` metres long.
+        """Return every route over the segments open to the ego vehicle that is at least `shortest` metres long.
 
-        A way starts where no such segment leads in and goes on as far as it can; it never drives a segment twice.
+        A route starts at a segment without such a predecessor, goes on as far as possible and repeats no segment.
         """
         inside = {i for i, d in self.drafts.items() if d.ego and d.vehicle}
         entered = {j for i in inside for j in self.drafts[i].successors}

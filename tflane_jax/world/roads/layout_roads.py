@@ -11,7 +11,7 @@ from tflane_jax.world.roads.cross_sections import ExtraLane, Place, SidePlan
 from tflane_jax.world.roads.layouts import StreetStyle, centred, chance, draw, draw_style, left_pocket
 from tflane_jax.world.roads.streets import StreetPlan
 
-# Roads run on beyond the reach of the map by this much, for bends bring their ends nearer, metres.
+# Roads extend beyond the map by this much, because bends bring their ends nearer to its centre, metres.
 _BEYOND = 14.0
 _LONGEST_ARC = 90.0
 
@@ -22,7 +22,7 @@ class RampPlan:
 
     Attributes:
         enters: the ramp leads onto the road (else it leaves it).
-        turn: by how much it has swung away from the road at its far end, radians.
+        turn: angle between the ramp's far end and the road, radians.
         radius: of its arc, metres.
         speed: limit, m/s.
     """
@@ -42,7 +42,7 @@ class RoadPlan:
         style: its cross-section.
         ramp: a ramp beside it.
         crossing: station of a mid-block pedestrian crossing and its width, metres.
-        urban: pedestrians walk beside it and buildings stand near.
+        urban: pedestrians walk beside it, and buildings are close to it.
     """
 
     street: StreetPlan
@@ -161,7 +161,7 @@ def _winding(
     half = config.reach + _BEYOND
     station = -half
     while station < half:
-        # A road that has turned far turns back, lest it runs into itself.
+        # A road that has turned far turns back, so that it does not cross itself.
         hand = rng.uniform(-1, 1) if abs(turned) < 0.4 else -turned
         peak = 0.0 if chance(rng, 0.25) else float(np.copysign(1.0 / draw(rng, radius), hand))
         longest = 1.0 / max(abs(peak), 1.0 / _LONGEST_ARC)

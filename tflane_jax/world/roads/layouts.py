@@ -1,4 +1,4 @@
-"""Plans of whole road networks, and the draws that all kinds of scene share: cross-sections and bends of streets."""
+"""Random draws common to all scene kinds: cross-sections and bends of streets, and the arms of intersections."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ArmPlan:
         style: seen outwards: `forward` leads out, `backward` in (with turning lanes).
         crossing: width of its pedestrian crossing, 0 without one.
         minor: its traffic gives way.
-        no_left: its traffic must not turn left.
+        no_left: left turns are forbidden.
         bend: turn of the axis beyond the intersection, radians, and the radius at which it turns, metres.
     """
 
@@ -66,7 +66,7 @@ class ArmPlan:
 
     @property
     def arm(self) -> Arm:
-        """Its shape as the intersection sees it."""
+        """Its geometry at the intersection."""
         style = self.style
         return Arm(
             self.origin,
@@ -77,7 +77,7 @@ class ArmPlan:
         )
 
     def street(self, stop_distance: float, config: RoadConfig) -> StreetPlan:
-        """Return the plan of the street once the intersection has told where it ends."""
+        """Return the plan of the street that starts at the intersection's stop distance."""
         return StreetPlan(
             origin=self.origin,
             heading=self.heading,
@@ -97,7 +97,7 @@ def bend_knots(start: float, turn: float, radius: float) -> tuple[tuple[float, f
     peak = np.copysign(1.0 / radius, turn)
     length = abs(turn) * radius
     ramp = min(20.0, length)
-    # A clothoid pair of length `ramp` each turns by ramp / radius; the arc between does the rest.
+    # Two clothoids of length `ramp` together turn by ramp / radius; the arc between them turns by the rest.
     arc = max(length - ramp, 0.0)
     stations = np.cumsum([start, ramp, arc, ramp])
     return tuple(zip(stations.tolist(), (0.0, float(peak), float(peak), 0.0), strict=True))
@@ -152,7 +152,7 @@ def draw_style(
 
 
 def left_pocket(style: StreetStyle) -> Place:
-    """Return where a left-turning lane finds room: in the median if that is wide enough."""
+    """Return where a left-turning lane is placed: in the median if that is wide enough."""
     return Place.MEDIAN if style.median >= style.forward.lane_width + LEAST_MEDIAN else Place.LEFT
 
 

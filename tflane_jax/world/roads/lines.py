@@ -1,4 +1,4 @@
-"""Roads as single lines, as a road map without lanes has them."""
+"""Road centre lines without lanes, the input of the SD map."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tflane_jax.world.roads.streets import Street
 def road_lines(streets: Sequence[Street], plan: JunctionsPlan | None = None) -> tuple[Float[np.ndarray, "n 2"], ...]:
     """Return one line for each street, midway between its kerbs (in the median where it has one), metres.
 
-    Lines of streets that meet at an intersection all end in its middle, and at a roundabout on its lane, which is a
-    closed line of its own behind the others.
+    Streets that meet at an intersection all end at its centre. At a roundabout they end on its circulating lane, which
+    is a closed line of its own and comes last.
 
     Args:
         streets: laid out.
@@ -38,7 +38,7 @@ def road_lines(streets: Sequence[Street], plan: JunctionsPlan | None = None) -> 
 
 
 def _node(end: Float[np.ndarray, "2"], plan: JunctionsPlan) -> Float[np.ndarray, "2"]:
-    """Return the point at which a road that ends here joins the others."""
+    """Return the junction point nearest to a road's end."""
     centers = np.stack([junction.center for junction in plan.junctions])
     center = centers[np.argmin(np.linalg.norm(centers - end, axis=-1))]
     if plan.ring is None:

@@ -1,7 +1,7 @@
-"""Where fiducial markers stand: beside the road, before junctions, splits and merges (marker paper, section IV-A).
+"""Placement of fiducial markers: beside the road, before junctions, splits and merges (marker paper, section IV-A).
 
-The places follow from the map alone, and the little that is drawn (ids, small deviations of each board) comes from a
-stream of its own, so that markers change nothing else in a scene.
+The positions depend on the map alone. Ids and small deviations of the boards are drawn from a separate stream, so
+markers change nothing else in a scene.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from tflane_jax.geometry import pose_matrix
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers, VectorMap
 
 ROOT = 20_251_122
-# Lane ends are side by side where they lie within so many metres along and across the road and in heading.
+# Two lane ends are side by side within these limits: along and across the road (metres) and in heading.
 _ALONG, _ACROSS, _TURNED = 10.0, 25.0, np.deg2rad(30.0)
-# A kerb farther from the lane than this belongs to something else (a parking lot), metres.
+# A kerb farther from the lane than this belongs to another area such as a parking lot, metres.
 _FARTHEST_KERB = 8.0
 # Without a kerb: from the lane's right boundary to the edge of the road, metres.
 _NO_KERB = 0.5
-# A board nearer than this to the middle of a lane would stand in the road, metres.
+# A board nearer than this to a centerline would be on the road, metres.
 _CLEAR = 2.0
 
 
 @dataclass(frozen=True)
 class PlacementConfig:
-    """How markers are put up.
+    """How markers are placed.
 
     Attributes:
-        per: "approach": a marker at every approach of a junction, split or merge; "scene": one of these for each map,
-            as in the paper.
-        side: "near": only there, before the junction; "both": also behind it, to the right of the lanes that leave it,
-            facing those who come across, who see it from farther away and until they have passed.
+        per: "approach": a marker at every approach of a junction, split or merge; "scene": one of these per map, as in
+            the paper.
+        side: "near": before the junction only; "both": also beyond it, to the right of the lanes that leave it, facing
+            traffic that crosses the junction, which sees it from farther away and for longer.
         size: side of the black square, metres (paper: 1).
         height: of the marker's middle above the road, metres.
         setback: from the kerb to the marker's middle, metres.
-        toe_in: how far the board is turned from straight against the traffic towards the road, degrees.
-        jitter: largest deviation of a board from that (uniform): of its yaw, degrees.
-        dictionary: ids run from 0 to this less one; a map never has more markers than ids.
+        toe_in: yaw of the board from facing the traffic towards the road, degrees.
+        jitter: largest deviation of a board's yaw (uniform), degrees.
+        dictionary: number of ids, from 0; a map never has more markers than ids.
     """
 
     per: Literal["approach", "scene"] = "approach"
@@ -57,9 +57,10 @@ def place_markers(vector_map: VectorMap, seed: int, config: PlacementConfig = Pl
     """Return the markers of a map, in no particular order: to the right of each approach, facing its traffic.
 
     An approach is all lanes that end side by side where an intersection, a split or a merge begins. The marker stands
-    behind the kerb to the right of the lanes' end (`side`: or beyond the junction as well). Where that would be in the
-    middle of another lane there is none.
-    The same map and seed give the same bits. A map without such places, or without lanes, has no marker.
+    behind the kerb to the right of the lanes' end, and also beyond the junction with `side` "both". A position in the
+    middle of another lane is skipped.
+
+    The same map and seed give the same bits. A map without approaches has no markers.
     """
     lanes = vector_map.segments
     sides = [_roadside([lanes[i] for i in _approach_lanes(lanes)], end=-1)]
@@ -121,14 +122,14 @@ def _roadside(segments: list[LaneSegment], *, end: int) -> tuple[Float[np.ndarra
 
 
 def _rightmost(right: Float[np.ndarray, "n 3"], heading: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Return, of each set of lane ends side by side, the one farthest to the right."""
+    """Return the rightmost end of each set of lane ends that are side by side."""
     delta = right[None, :, :2] - right[:, None, :2]
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
     along = cos * delta[..., 0] + sin * delta[..., 1]
     to_right = sin * delta[..., 0] - cos * delta[..., 1]
     turned = np.abs((heading[None] - heading[:, None] + np.pi) % (2 * np.pi) - np.pi)
     beside = (np.abs(along) < _ALONG) & (np.abs(to_right) < _ACROSS) & (turned < _TURNED)
-    # Of two ends on one spot (a lane that the map holds twice) the first counts as the one to the right.
+    # Of two coinciding ends (a duplicated lane) the first counts as the one to the right.
     index = np.arange(len(right))
     further = (to_right > 1e-6) | ((np.abs(to_right) <= 1e-6) & (index[None] < index[:, None]))
     return np.flatnonzero(~(beside & further).any(-1))
@@ -137,7 +138,7 @@ def _rightmost(right: Float[np.ndarray, "n 3"], heading: Float[np.ndarray, " n"]
 def _kerb_distance(
     start: Float[np.ndarray, "m 2"], direction: Float[np.ndarray, "m 2"], boundaries: tuple[np.ndarray, ...]
 ) -> Float[np.ndarray, " m"]:
-    """Return how far it is from each point in its direction to the next road boundary."""
+    """Return the distance from each point, along its direction, to the next road boundary."""
     lines = [line for line in boundaries if len(line) > 1]
     a = np.concatenate([np.zeros((0, 2)), *(line[:-1, :2] for line in lines)])
     step = np.concatenate([np.zeros((0, 2)), *(line[1:, :2] for line in lines)]) - a

@@ -13,7 +13,7 @@ from tflane_jax.world.roads.curves import blend, right_of, wrap
 from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 
 LEFT, THROUGH, RIGHT = 1, 0, -1
-# A way that turns by less than this, and less than the other ways, runs straight on.
+# The exit with the smallest turn counts as straight on if it turns by less than this.
 STRAIGHT = np.deg2rad(50.0)
 # Between a turning lane and the kerb at the corner, metres.
 _KERB_CLEARANCE = 0.5
@@ -26,8 +26,8 @@ class Approach:
     Attributes:
         heading: outwards, radians.
         incoming, outgoing: lanes (vehicles and bicycles).
-        minor: its traffic gives way to that of the other arms.
-        no_left: its traffic must not turn left.
+        minor: its traffic yields to that of the other arms.
+        no_left: left turns are forbidden.
         speed: limit of the street, m/s.
         incoming_kerb, outgoing_kerb: (2,) kerb beside the incoming and the outgoing lanes at the stop line, metres.
     """
@@ -60,7 +60,7 @@ class Movement:
 
 
 def plan_movements(approaches: Sequence[Approach]) -> list[Movement]:
-    """Decide which lane leads where; every outgoing lane that can be reached is reached."""
+    """Assign exits to lanes; every reachable outgoing lane gets at least one connector."""
     movements: list[Movement] = []
     for i, approach in enumerate(approaches):
         ways = _ways(approaches, i)
@@ -77,7 +77,7 @@ def plan_movements(approaches: Sequence[Approach]) -> list[Movement]:
 
 
 def _ways(approaches: Sequence[Approach], arm: int) -> dict[int, int]:
-    """Return the arm to which each turn leads: LEFT, THROUGH, RIGHT -> arm, as far as they exist and are allowed."""
+    """Return the arm to which each existing and allowed turn leads: LEFT, THROUGH or RIGHT -> arm."""
     inbound = approaches[arm].heading + np.pi
     turns = {
         j: float(wrap(other.heading - inbound))
@@ -100,7 +100,7 @@ def _ways(approaches: Sequence[Approach], arm: int) -> dict[int, int]:
 def _assign_lanes(
     arm: int, lanes: list[LaneEnd], ways: dict[int, int], approaches: Sequence[Approach]
 ) -> list[Movement]:
-    """Return the movements of one arm: turning lanes turn, the outer lanes share, the rest runs straight on."""
+    """Return the movements of one arm: turning lanes only turn, outer lanes turn or go straight, others go straight."""
     general = [lane for lane in lanes if lane.pocket == 0 or _turn_of(lane) not in ways]
     left = [lane for lane in lanes if lane.pocket == -1 and LEFT in ways]
     right = [lane for lane in lanes if lane.pocket == 1 and RIGHT in ways]
@@ -183,7 +183,7 @@ def lay_connectors(
         network: receives the segments.
         lateral_acceleration: comfortable, m/s^2; limits the speed in curves.
         spacing: largest distance between vertices, metres.
-        corner_radius: of the kerbs' roundings, around which turns must keep, metres; None where there are none.
+        corner_radius: of the kerbs' roundings, which turns must not cut, metres; None without roundings.
     """
     if not movements:
         return []

@@ -32,18 +32,18 @@ _JUNCTIONS = (SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS,
 
 @dataclass(frozen=True)
 class RoadNetwork:
-    """A map and the rules of driving and walking on it.
+    """A map with its traffic rules, sidewalks, parking slots and ego routes.
 
     Attributes:
         map: lane segments, crossings, road boundaries, traffic elements, buildings.
         speed_limit: m/s for each segment id.
-        yield_to: segment -> segments whose traffic it must let pass before its own may enter it.
+        yield_to: segment -> segments whose traffic has priority over traffic that enters it.
         signal_phase: connector -> (intersection index, phase index); absent where there are no signals.
         sidewalks: (n, 2) lines on which pedestrians walk, metres.
         walk_across: (2, 2) start and end of the walk over each pedestrian crossing, behind the kerbs.
         parking: (P, 3) x, y, yaw of kerb-side slots for parked vehicles.
-        ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; all that it
-            perceives on the way (+-51.2 m x +-25.6 m) lies inside the map.
+        ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; its perception
+            range (+-51.2 m x +-25.6 m) stays inside the map all along.
         kind: the central feature.
     """
 

@@ -1,4 +1,4 @@
-"""Who goes first at an intersection: conflicting connectors, priorities and signal phases."""
+"""Right of way at an intersection: conflicting connectors, priorities and signal phases."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from tflane_jax.world.roads.curves import wrap
 from tflane_jax.world.roads.lane_network import LaneNetwork
 from tflane_jax.world.roads.movements import LEFT, RIGHT, STRAIGHT, THROUGH, Approach, Movement
 
-# Traffic on two connectors collides if their centerlines come nearer than about a vehicle's width, metres.
+# Two connectors conflict if their centerlines come nearer than about a vehicle's width, metres.
 _CONFLICT = 2.2
 
 
 def conflicts(ids: Sequence[int], movements: Sequence[Movement], network: LaneNetwork) -> Bool[np.ndarray, "c c"]:
-    """Return which connectors come so near to each other that their traffic could collide.
+    """Return which pairs of connectors conflict.
 
-    Those of one arm part and do not collide, but for bicycles that go straight on beside a vehicle that turns.
+    Connectors of one arm diverge and do not conflict, except a bicycle's with a vehicle's.
     """
     lines = []
     for connector in ids:
@@ -60,11 +60,11 @@ def set_priorities(
     intersection: int,
     signalised: bool,
 ) -> None:
-    """Enter right of way, and signal phases where there are signals, into the network.
+    """Write right of way, and signal phases where there are signals, into the network.
 
-    Of two conflicting connectors the one of higher rank goes first: major before minor arm, straight before right
-    before left, then by arm. A strict order has no circles, so traffic that obeys it never waits for itself. Under
-    signals only connectors that are green together yield to one another.
+    Of two conflicting connectors the one of higher rank has priority: major before minor arm, straight before right
+    before left, then by arm. The order is strict, so it cannot cause a deadlock. At signals only connectors of the same
+    phase yield to each other.
     """
     meet = conflicts(ids, movements, network)
     phase = phases(approaches)

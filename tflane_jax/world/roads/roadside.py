@@ -1,4 +1,4 @@
-"""What lies beside the road: walking lines behind the kerbs, slots of parked vehicles, buildings."""
+"""Roadside of a network: walking lines behind the kerbs, parking slots, buildings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tflane_jax.world.roads.streets import Side
 # Parked vehicles keep clear of stop lines, junctions and crossings by these distances, metres.
 _CLEAR_BEFORE_STOP, _CLEAR_AFTER_JUNCTION, _CLEAR_OF_CROSSING = 14.0, 8.0, 7.0
 _SLOT = 6.5
-# Buildings stay away from every kerb by this much, also from those around the corner, metres.
+# Distance of buildings from every kerb, those around a corner included, metres.
 _BUILDING_CLEARANCE = 3.2
 
 
@@ -40,7 +40,7 @@ def _side_slots(side: Side, site: Site) -> Float[np.ndarray, "p 3"]:
     if not plan.parking:
         return np.zeros((0, 3))
     t = np.arange(_CLEAR_AFTER_JUNCTION, side.line.s[-1] - _CLEAR_BEFORE_STOP, _SLOT)
-    # Extra lanes take the room of the strip.
+    # Extra lanes replace the parking strip.
     for extra in plan.extras:
         t = t[(t < extra.start - _SLOT) | (t > extra.stop + _SLOT)]
     xy, heading = side.line.at(t)
@@ -52,7 +52,7 @@ def _side_slots(side: Side, site: Site) -> Float[np.ndarray, "p 3"]:
 
 
 def buildings(rng: np.random.Generator, site: Site, setback: Range, density: float) -> Float[np.ndarray, "b 5"]:
-    """Return x, y, length, width and yaw of blocks that stand along the kerbs and nowhere near the road.
+    """Return x, y, length, width and yaw of buildings along the kerbs, clear of every road.
 
     Args:
         rng: stream.
@@ -99,7 +99,7 @@ def _contains(
 
 
 def _apart(boxes: Float[np.ndarray, "b 5"]) -> Bool[np.ndarray, " b"]:
-    """Return which boxes to keep so that none stands in an earlier one that is kept."""
+    """Return which boxes to keep: a box that overlaps an earlier kept one is dropped."""
     grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 5)), -1).reshape(-1, 2)
     along, across = direction(boxes[:, 4]), right_of(boxes[:, 4])
     points = (

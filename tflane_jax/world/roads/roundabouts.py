@@ -79,9 +79,9 @@ def _curve(
 def lay_ring(
     ring: Ring, approaches: Sequence[Approach], network: LaneNetwork, spacing: float
 ) -> list[tuple[Movement, int | None]]:
-    """Add the ring's segments to the network and return the movements that lead onto it and off it.
+    """Add the ring's segments to the network and return its entries and exits.
 
-    With each movement comes the ring segment whose traffic it must let pass, None for those that leave the ring.
+    Each movement is paired with the ring segment to which it yields; None for exits.
 
     Args:
         ring: its shape.
@@ -90,7 +90,7 @@ def lay_ring(
         spacing: largest distance between vertices, metres.
     """
     headings = np.array([a.heading for a in approaches])
-    # Going round: past arm 0's entry, to arm 1's exit, to arm 1's entry, ...
+    # Counter-clockwise: arm 0's entry, arm 1's exit, arm 1's entry, ...
     stops = np.stack([headings + ring.half_angle, np.roll(headings, -1) - ring.half_angle], 1).reshape(-1)
     stops = stops[0] + np.concatenate([[0.0], np.cumsum(np.diff(stops, append=stops[0]) % (2 * np.pi))])
     ids = [_arc(ring, a, b, network, spacing) for a, b in pairwise(stops.tolist())]

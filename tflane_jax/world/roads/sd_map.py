@@ -1,8 +1,7 @@
-"""What a navigation map says of the roads around the vehicle: coarse lines, put where the vehicle believes it is.
+"""Simulated SD maps: coarse road lines of a navigation map, placed by an erroneous vehicle pose.
 
-Three things part an SD map from the truth, each with its own knob: it was drawn with few points (`tolerance`), its
-points were surveyed inexactly (`survey`), and the vehicle reads it at the pose that its GNSS receiver reports
-(`translation`, `yaw_deg`). Lines are cut at the range that the vehicle believes to be around it.
+An SD map has three kinds of error, each with its own setting: few vertices (`tolerance`), inexact survey (`survey`) and
+a GNSS pose error (`translation`, `yaw_deg`). Lines are cut at the perception range around the erroneous pose.
 """
 
 from __future__ import annotations
@@ -21,26 +20,26 @@ from tflane_jax.geometry.poses import yaw_pose
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.scene.logs import Log
 
-# Streams of a log's seed; `world.bev.sensor` has 1 and 2.
+# Random streams of a log's seed; `world.bev.sensor` uses 1 and 2.
 _SURVEY_STREAM, _GNSS_STREAM = 31, 32
-# Waves of the survey's error, and their typical length, metres: neighbouring roads are off together.
+# Number of waves in the survey error and their typical length, metres: errors of neighbouring roads agree.
 _WAVES, _WAVE_LENGTH = 16, 120.0
 
 
 @dataclass(frozen=True)
 class SdMapConfig:
-    """Size and faults of an SD map; all faults 0 puts its lines in the middle of the roads.
+    """Size and errors of an SD map; without errors its lines lie in the middle of the roads.
 
     Attributes:
-        lines: most lines R; the nearest stay.
+        lines: capacity R; the nearest lines are kept.
         points: on each line, P, equally spaced (SMERF: 11).
         range: where lines are cut, ego frame.
-        tolerance: by how much a line with fewer points may miss the road's own, metres.
+        tolerance: largest distance of a dropped vertex from the simplified line, metres.
         survey: standard deviation of the error of the map's points along each axis, metres. It changes slowly from
             place to place, so roads that meet still meet.
         translation: standard deviation of the GNSS receiver's error along each axis, metres.
         yaw_deg: standard deviation of the error of its heading, degrees.
-        drift_s: time after which error of position and heading are others altogether, seconds: the error is
+        drift_s: decorrelation time of position and heading errors, seconds: the error is
             sigma (a cos wt + b sin wt), w = pi / (2 drift_s), with a and b drawn once for each scene.
         crossings: whether pedestrian crossings are lines of the map.
     """
@@ -57,9 +56,9 @@ class SdMapConfig:
 
 
 def make_sd_map(log: Log, keyframe: int, config: SdMapConfig) -> tuple[SdMap, int]:
-    """Return the SD map of a key frame, and how many of its lines found no room (the farthest).
+    """Return the SD map of a key frame and the number of lines dropped for lack of capacity (the farthest).
 
-    Seeded by the log: the map is the same in all its frames, only the vehicle's place on it drifts.
+    Seeded by the log: the map is the same in all frames of a log; only the vehicle's pose error changes.
 
     Raises:
         UserError: the log's map has no roads.
@@ -96,7 +95,7 @@ def pack_lines(
     points: int,
     range_: PerceptionRange,
 ) -> tuple[SdMap, int]:
-    """Return lines cut at a range and resampled as an SD map, and how many pieces found no room (the farthest).
+    """Return lines cut at a range and resampled as an SD map, and the number of dropped pieces (the farthest).
 
     Args:
         lines: ego frame, metres, none empty.
@@ -153,7 +152,7 @@ def _distance(
 
 
 def crossing_line(ring: Float[np.ndarray, "5 2"]) -> Float[np.ndarray, "2 2"]:
-    """Return the way over a pedestrian crossing of the built-in world, from kerb to kerb."""
+    """Return the centre line of a pedestrian crossing of the built-in world, from kerb to kerb."""
     return np.stack([0.5 * (ring[0] + ring[3]), 0.5 * (ring[1] + ring[2])])
 
 
@@ -166,7 +165,7 @@ def survey_error(points: Float[np.ndarray, "n 2"], seed: int) -> Float[np.ndarra
 
 
 def gnss_error(seed: int, seconds: float, config: SdMapConfig) -> Float[np.ndarray, "3"]:
-    """Return what the receiver adds to x and y (global, metres) and heading (radians) at a time of a scene."""
+    """Return the receiver's error of x, y (global, metres) and heading (radians) at a time of a scene."""
     first, second = np.random.default_rng([seed, _GNSS_STREAM]).normal(size=(2, 3))
     turn = 0.5 * math.pi * seconds / config.drift_s
     sigma = np.array([config.translation, config.translation, math.radians(config.yaw_deg)])

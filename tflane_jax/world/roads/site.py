@@ -1,4 +1,4 @@
-"""What a laid-out network consists of besides its lane segments."""
+"""The parts of a laid-out road network besides its lane segments: streets, kerbs, islands, crossings, elements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tflane_jax.world.roads.streets import Street
 
 @dataclass
 class Site:
-    """Streets and the furniture that laying them out has produced so far.
+    """Streets, kerbs, crossings and traffic elements produced by the layout so far.
 
     Attributes:
         streets: all of them.
@@ -21,7 +21,7 @@ class Site:
         islands: closed rings inside the drivable surface (medians, roundabout islands).
         crossings: closed rings of pedestrian crossings.
         elements: traffic lights and signs.
-        urban: pedestrians walk behind the kerbs and buildings stand near.
+        urban: pedestrians walk behind the kerbs, and buildings are close to the road.
     """
 
     streets: list[Street]

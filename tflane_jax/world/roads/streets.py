@@ -17,7 +17,7 @@ from tflane_jax.world.roads.cross_sections import SAME_STATION, ExtraLane, Place
 from tflane_jax.world.roads.curves import ReferenceLine, clothoid_line, grid_with
 from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 
-# Cuts nearer to each other than this would leave scraps of segments.
+# Smallest distance between two cuts, metres: it avoids very short segments.
 _CLOSEST_CUTS = 6.0
 
 
@@ -30,7 +30,7 @@ class StreetPlan:
         start, stop: stations between which the street runs.
         bends: knots (station, curvature 1/m) of the axis.
         forward, backward: the side that drives towards increasing and decreasing stations.
-        stops_at_start, stops_at_end: traffic that reaches this end meets an intersection.
+        stops_at_start, stops_at_end: this end is at an intersection.
         speed: limit, m/s.
         ego: stations between which ego routes may run.
     """
@@ -112,7 +112,7 @@ def build_street(plan: StreetPlan, network: LaneNetwork, solid_before_stop: floa
 
 
 def _cuts(plan: SidePlan, length: float, ego: tuple[float, float], solid: float) -> Float[np.ndarray, " k"]:
-    """Return the distances at which the lanes of a side are cut: where markings or neighbours change."""
+    """Return the distances at which a side is cut into segments: where markings or neighbours change."""
     if not plan.lanes:
         return np.array([0.0, length])
     fixed = {0.0, length}
@@ -128,7 +128,7 @@ def _cuts(plan: SidePlan, length: float, ego: tuple[float, float], solid: float)
 
 @dataclass
 class _Column:
-    """The boundaries of a lane along the whole side, meaningful where the lane exists."""
+    """The boundaries of a lane along the whole side; arbitrary where the lane does not exist."""
 
     left: Float[np.ndarray, "n 2"]
     right: Float[np.ndarray, "n 2"]
@@ -159,7 +159,7 @@ def _build_side(
     dividers = line.offset(plan.inner + w * np.arange(plan.lanes + 1)[:, None] + shift)
     columns = [_Column(a, b, None) for a, b in pairwise(dividers)]
     for extra, share in zip(plan.extras, presence, strict=True):
-        # The line shared with the neighbour comes out as the same numbers as the neighbour's where share = 1.
+        # Where share = 1 the boundary is bit-identical to the neighbour's.
         if extra.place is Place.RIGHT:
             left, right = plan.outer + shift - w * (1.0 - share), plan.outer + shift + w * share
         else:
@@ -246,7 +246,7 @@ def _divider(columns: Sequence[_Column], order: Sequence[int], place: int, middl
 def _connect_sections(
     plan: SidePlan, rows: Sequence[dict[int, int]], bounds: Float[np.ndarray, " k"], network: LaneNetwork
 ) -> None:
-    """Tie each section's lanes to the next section's: straight on, forking and merging."""
+    """Connect each section's lanes to the next section's: straight on, forks and merges."""
     for row, following, joint in zip(rows[:-1], rows[1:], bounds[1:-1], strict=True):
         for i in row:
             if i in following:

@@ -15,7 +15,7 @@ from tflane_jax.world.roads.streets import Street, StreetPlan, build_street
 
 # Medians keep this distance from the lines of the lanes beside them, metres.
 _MEDIAN_MARGIN = 0.3
-# The kerbs of a road and its ramp part where this much ground lies between them, metres.
+# The kerbs of a road and its ramp separate where the gap between them reaches this width, metres.
 _GORE_NOSE = 0.5
 
 
@@ -75,7 +75,7 @@ def _add_ramp(road: Street, plan: RoadPlan, ramp: RampPlan, network: LaneNetwork
     line = side.line
     attach = extra.start if ramp.enters else extra.stop
     at = int(np.argmin(np.abs(line.s - attach)))
-    # Routes on the ramp, which runs beside the road for long, must not come near the road's end either.
+    # A ramp runs beside the road for a long way, so routes on it must keep away from the road's end too.
     ego = config.ego_reach - abs(attach - 0.5 * line.s[-1])
     lane = ramp_side(plan.style)
     bare = SidePlan(lanes=0, gutter=lane.gutter)
@@ -123,7 +123,7 @@ def _add_ramp(road: Street, plan: RoadPlan, ramp: RampPlan, network: LaneNetwork
 
 
 def _gore(gore: Float[np.ndarray, "n 2"], line: ReferenceLine, kerb: float) -> tuple[int, int]:
-    """Return the vertex of the ramp's inner kerb, and the nearest one of the road, at which the two kerbs part.
+    """Return where the two kerbs separate: the vertex of the ramp's inner kerb and the nearest vertex of the road.
 
     Args:
         gore: inner kerb of the ramp, away from the road.

@@ -40,9 +40,9 @@ def traffic_lights(approaches: Sequence[Approach], green: int, beyond: float) ->
 def signs(approaches: Sequence[Approach], movements: Sequence[Movement], medians: Sequence[bool]) -> list[MapElement]:
     """Return the signs of an intersection.
 
-    Over each incoming lane from which, on an arm that offers more, only one turn is allowed: that turn's sign. Beside
-    the stop line: no left or right turn where an arm lies there that must not be entered, no U-turn where the arm has
-    a median.
+    Above an incoming lane with a single allowed turn, on an arm that offers several: the sign of that turn. Beside the
+    stop line: "no left turn" or "no right turn" where an arm on that side must not be entered, and "no U-turn" where
+    the arm has a median.
 
     Args:
         approaches: arms of the intersection.
@@ -73,7 +73,7 @@ def signs(approaches: Sequence[Approach], movements: Sequence[Movement], medians
 
 
 def _present(approaches: Sequence[Approach], arm: int) -> set[int]:
-    """Return the turns, LEFT and RIGHT, towards which an arm lies, whether it may be entered or not."""
+    """Return on which sides, LEFT and RIGHT, other arms lie, whether they may be entered or not."""
     ahead = approaches[arm].heading + np.pi
     turns = [float(wrap(other.heading - ahead)) for j, other in enumerate(approaches) if j != arm]
     return {LEFT if t > 0 else RIGHT for t in turns if abs(t) > STRAIGHT}

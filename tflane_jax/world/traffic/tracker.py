@@ -57,23 +57,6 @@ class TrackerConfig:
     switch_rate: float = 0.02
     switch_distance: float = 3.5
 
-    @classmethod
-    def perfect(cls) -> TrackerConfig:
-        """Return a tracker that reports the truth."""
-        return cls(
-            range=np.inf,
-            falloff=0.0,
-            view_needed=0.0,
-            drop=0.0,
-            position_noise=0.0,
-            position_noise_growth=0.0,
-            yaw_noise=0.0,
-            size_noise=0.0,
-            velocity_noise=0.0,
-            coast=0,
-            switch_rate=0.0,
-        )
-
     def with_noise(self, scale: float) -> TrackerConfig:
         """Return the tracker with noise and misses scaled."""
         return replace(

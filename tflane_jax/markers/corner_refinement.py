@@ -1,0 +1,111 @@
+"""Refining the corners of a marker by fitting its printed cells to the image."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from tflane_jax.files.images import opencv
+
+# Refinement: standard deviation of the blur of lens and pixels, pixels; most steps; how far a corner may move,
+# cells; misfit that halves a weight, share of the contrast.
+_SPREAD, _STEPS, _REACH, _DOUBT = 0.8, 12, 0.6, 0.15
+
+
+def refine_corners(
+    grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"]
+) -> Float[np.ndarray, "4 2"]:
+    """Return the corners (pixels) of the black square for which its cells fit the image best.
+
+    Gauss-Newton with Cauchy weights on a + b T(q) - I(H(q)) over points q of the marker and half a cell around it: T
+    the printed cells as a lens and pixels blur them, H the homography that the four corners fix, a and b brightness and
+    contrast (solved for in each step). All edges of all cells count, not the four corners alone. Where it does not
+    settle within a quarter of a cell of where it began, the corners are returned as they came.
+
+    Args:
+        grey: image.
+        corners: a first guess, in the order of `ImageMarkers`.
+        cells: of the marker, as `marker_cells`.
+    """
+    cv2 = opencv()
+    n = len(cells)
+    cell = np.linalg.norm(corners - np.roll(corners, 1, 0), axis=-1).mean() / n
+    # Points in shares of the square, from its upper left corner; the blur in points.
+    fine = int(np.clip(np.ceil(cell / 2.0) * 2.0, 4, 8))
+    board = np.kron(np.pad(cells, 1, constant_values=True), np.ones((fine, fine))).astype(np.float32)
+    # Both are blurred until an edge is wider than the points are apart: else it could move between them unseen.
+    spread = max(_SPREAD, cell / fine)
+    blurred = cv2.GaussianBlur(board, (0, 0), spread * fine / cell, borderType=cv2.BORDER_REPLICATE)
+    edge = fine // 2
+    template = blurred[edge:-edge, edge:-edge].ravel().astype(np.float64)
+    share = (np.arange(edge, (n + 2) * fine - edge) + 0.5 - fine) / (n * fine)
+    s, t = (axis.ravel() for axis in np.meshgrid(share, share))
+    points = np.stack([s, t, np.ones_like(s)])
+    around = 3.0 * spread + 2.0 * cell
+    low = np.maximum(np.floor(corners.min(0) - around), 0).astype(int)
+    high = np.maximum(np.ceil(corners.max(0) + around), low + 1).astype(int)
+    picture = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    if not picture.size:
+        return corners
+    if spread > 1.1 * _SPREAD:
+        extra = float(np.sqrt(spread**2 - _SPREAD**2))
+        picture = cv2.GaussianBlur(picture, (0, 0), extra, borderType=cv2.BORDER_REPLICATE)
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], np.float32)
+    now, weight = corners.astype(np.float64), np.ones_like(s)
+    for _ in range(_STEPS):
+        # The image and its slope, from the points and from half a pixel to either side of them.
+        image_from_square = cv2.getPerspectiveTransform(square, now.astype(np.float32))
+        top = image_from_square @ points
+        pixels = top[:2] / top[2]
+        u, v = (pixels - low[:, None] - 0.5).astype(np.float32)
+
+        def seen(du: float, dv: float, u: np.ndarray = u, v: np.ndarray = v) -> np.ndarray:
+            return (
+                cv2.remap(
+                    picture, u + np.float32(du), v + np.float32(dv), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                )
+                .ravel()
+                .astype(np.float64)
+            )
+
+        slope = np.stack([seen(0.5, 0.0) - seen(-0.5, 0.0), seen(0.0, 0.5) - seen(0.0, -0.5)])
+        # How the pixel of a point moves with the eight numbers of the homography, and these with the corners.
+        moves = _homography_slopes(s, t, pixels) / top[2]
+        at_corners = (
+            _homography_slopes(square[:, 0], square[:, 1], now.T)
+            / (image_from_square @ np.vstack([square.T, np.ones(4)]))[2]
+        )
+        by_corner = np.linalg.inv(at_corners.transpose(2, 0, 1).reshape(8, 8))
+        along = np.einsum("cp,ckp->pk", slope, moves) @ by_corner
+        unknown = np.column_stack([along, -np.ones_like(s), -template])
+        brightness = seen(0.0, 0.0)
+        weighted = (unknown * weight[:, None]).T
+        matrix = weighted @ unknown
+        if np.linalg.matrix_rank(matrix) != 10:
+            return corners
+        step = np.linalg.solve(matrix, -weighted @ brightness)
+        if not step[9] > 0.0:
+            return corners
+        now = now + step[:8].reshape(4, 2)
+        if np.abs(now - corners).max() > max(_REACH * cell, 1.0) or not np.isfinite(now).all():
+            return corners
+        # What stands before a part of the board fits badly and counts little.
+        weight = 1.0 / (1.0 + ((unknown @ step + brightness) / (_DOUBT * step[9])) ** 2)
+        # cv2.remap looks at 1/32 of a pixel.
+        if np.abs(step[:8]).max() < 0.02:
+            return now
+    return corners
+
+
+def _homography_slopes(
+    s: Float[np.ndarray, " p"], t: Float[np.ndarray, " p"], pixels: Float[np.ndarray, "2 p"]
+) -> Float[np.ndarray, "2 8 p"]:
+    """Return how the pixel of (s, t) moves with the first eight entries of a homography, times its third coordinate."""
+    one, none = np.ones(len(s)), np.zeros(len(s))
+    u, v = pixels
+    return np.array(
+        [
+            [s, t, one, none, none, none, -u * s, -u * t],
+            [none, none, none, s, t, one, -v * s, -v * t],
+        ]
+    )

@@ -87,7 +87,7 @@ def draw_trips(
         ego_way: segment indices that the ego vehicle must drive first.
         start, stop: seconds.
         vehicles_per_metre: target density on a lane in free flow.
-        bicycles_per_metre: the same for bicycles on bike lanes, and, at half the fraction, at the edge of slow outer lanes.
+        bicycles_per_metre: the same for bicycles on bike lanes; at half the fraction, at the edge of slow outer lanes.
         category_share: motor vehicles by category.
     """
     categories, shares = zip(*category_share, strict=True)

@@ -1,9 +1,8 @@
-"""Fiducial markers: their patterns, finding them in images, and the lane graphs that their ids name.
+"""Fiducial markers: detection in images, simulated detection, and the store of lane graphs by marker id.
 
-Paper: "Confidence-Gated Topology Reasoning with Fiducial Marker Priors" (shared/papers/marker_fusion.txt), sections III
-and IV-A.
+Paper ("the marker paper"): "Confidence-Gated Topology Reasoning with Fiducial Marker Priors", sections III and IV-A.
 
-The **frame of a marker**, the same everywhere: origin at the middle of its black square, x to the right and y up in its
-plane as one sees it who looks at it, z out of it towards whoever looks; metres. Its **size** is the side of the black
-square, as OpenCV counts it; the white margin around it is not part of it.
+The **marker frame** is the same everywhere: origin at the centre of the black square, x to the right and y up as seen
+from the front, z out of the board towards the viewer; metres. The **size** of a marker is the side of its black square,
+as in OpenCV, without the white margin.
 """

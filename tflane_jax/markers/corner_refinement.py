@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.files.images import opencv
 
-# Refinement: standard deviation of the blur of lens and pixels, pixels; most steps; how far a corner may move,
-# cells; misfit that halves a weight, share of the contrast.
+# Standard deviation of the blur of lens and pixels, pixels; most steps; largest shift of a corner, cells; residual that
+# halves a weight, as a fraction of the contrast.
 _SPREAD, _STEPS, _REACH, _DOUBT = 0.8, 12, 0.6, 0.15
 
 
@@ -18,9 +18,9 @@ def refine_corners(
     """Return the corners (pixels) of the black square for which its cells fit the image best.
 
     Gauss-Newton with Cauchy weights on a + b T(q) - I(H(q)) over points q of the marker and half a cell around it: T
-    the printed cells as a lens and pixels blur them, H the homography that the four corners fix, a and b brightness and
-    contrast (solved for in each step). All edges of all cells count, not the four corners alone. Where it does not
-    settle within a quarter of a cell of where it began, the corners are returned as they came.
+    is the blurred pattern of the cells, H the homography given by the four corners, a and b brightness and contrast
+    (solved for in each step). All edges of all cells contribute, not only the four corners. The input corners are
+    returned if the iteration does not converge or moves a corner by more than 0.6 cells (at least 1 pixel).
 
     Args:
         grey: image.
@@ -30,10 +30,10 @@ def refine_corners(
     cv2 = opencv()
     n = len(cells)
     cell = np.linalg.norm(corners - np.roll(corners, 1, 0), axis=-1).mean() / n
-    # Points in shares of the square, from its upper left corner; the blur in points.
+    # Points as fractions of the square, from its upper left corner; the blur in points.
     fine = int(np.clip(np.ceil(cell / 2.0) * 2.0, 4, 8))
     board = np.kron(np.pad(cells, 1, constant_values=True), np.ones((fine, fine))).astype(np.float32)
-    # Both are blurred until an edge is wider than the points are apart: else it could move between them unseen.
+    # Both are blurred until an edge is wider than the spacing of the points, so that any shift changes the residual.
     spread = max(_SPREAD, cell / fine)
     blurred = cv2.GaussianBlur(board, (0, 0), spread * fine / cell, borderType=cv2.BORDER_REPLICATE)
     edge = fine // 2
@@ -53,7 +53,7 @@ def refine_corners(
     square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], np.float32)
     now, weight = corners.astype(np.float64), np.ones_like(s)
     for _ in range(_STEPS):
-        # The image and its slope, from the points and from half a pixel to either side of them.
+        # The image and its gradient, at the points and at half a pixel to either side.
         image_from_square = cv2.getPerspectiveTransform(square, now.astype(np.float32))
         top = image_from_square @ points
         pixels = top[:2] / top[2]
@@ -69,7 +69,7 @@ def refine_corners(
             )
 
         slope = np.stack([seen(0.5, 0.0) - seen(-0.5, 0.0), seen(0.0, 0.5) - seen(0.0, -0.5)])
-        # How the pixel of a point moves with the eight numbers of the homography, and these with the corners.
+        # Derivatives of a point's pixel by the eight entries of the homography, and of these by the corners.
         moves = _homography_slopes(s, t, pixels) / top[2]
         at_corners = (
             _homography_slopes(square[:, 0], square[:, 1], now.T)
@@ -89,9 +89,9 @@ def refine_corners(
         now = now + step[:8].reshape(4, 2)
         if np.abs(now - corners).max() > max(_REACH * cell, 1.0) or not np.isfinite(now).all():
             return corners
-        # What stands before a part of the board fits badly and counts little.
+        # Occluded parts of the board have large residuals and get small weights.
         weight = 1.0 / (1.0 + ((unknown @ step + brightness) / (_DOUBT * step[9])) ** 2)
-        # cv2.remap looks at 1/32 of a pixel.
+        # cv2.remap interpolates at steps of 1/32 pixel.
         if np.abs(step[:8]).max() < 0.02:
             return now
     return corners
@@ -100,7 +100,7 @@ def refine_corners(
 def _homography_slopes(
     s: Float[np.ndarray, " p"], t: Float[np.ndarray, " p"], pixels: Float[np.ndarray, "2 p"]
 ) -> Float[np.ndarray, "2 8 p"]:
-    """Return how the pixel of (s, t) moves with the first eight entries of a homography, times its third coordinate."""
+    """Return derivatives of the pixel of (s, t) by a homography's first eight entries, times its third coordinate."""
     one, none = np.ones(len(s)), np.zeros(len(s))
     u, v = pixels
     return np.array(

@@ -1,7 +1,7 @@
-"""How detection and pose of markers get worse with distance, measured in images of the built-in world.
+"""Detection rate and pose errors of markers over distance, measured in images of the built-in world.
 
-Counterpart of the paper's Fig. 3, which assumes such curves (section IV-A): a vehicle drives along a straight street
-towards three boards beside it that are turned by different angles; nothing stands between.
+Counterpart of Fig. 3 of the marker paper, which assumes such curves (section IV-A): a vehicle drives along a straight
+street towards three unoccluded boards beside it, which are turned by different angles.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount, CameraRi
 from tflane_jax.world.cameras.sensor import render_window
 from tflane_jax.world.render.camera import FrontCamera
 
-# Around a board this many pixels are drawn, and of its own size half as many again.
+# Margin around a board in the rendered window, pixels, in addition to half the size of the board.
 _AROUND = 24
 _LANE, _HEIGHT = 3.5, 3.0
 
 
 @dataclass(frozen=True)
 class CurveConfig:
-    """What is measured.
+    """Scenes and detector of a measurement.
 
     Attributes:
         distances: from the camera to the boards along the street, metres.
-        turns: how far each of the boards is turned from facing the traffic, degrees.
-        seeds: scenes; each has its own weather, light, calibration and place of the boards.
-        mounts: cameras; the first one in whose image a board lies is asked.
-        scale: of their images, 1 is native.
+        turns: yaw of each board from facing the traffic, degrees.
+        seeds: number of scenes; each has its own weather, light, calibration and board positions.
+        mounts: cameras; a board is detected in the first one whose image contains it.
+        scale: of their images; 1 is native.
         severity: of weather and camera, 0 (clear day, perfect camera) to 1.
-        detector: that looks.
+        detector: settings.
     """
 
     distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
@@ -51,7 +51,7 @@ class CurveConfig:
     detector: DetectorConfig = DetectorConfig()
 
     def validate(self) -> None:
-        """Raise UserError for numbers that mean nothing."""
+        """Raise UserError for numbers out of range."""
         self.detector.validate()
         if not self.distances or min(self.distances) <= 1.0:
             raise UserError("markers are measured at distances above 1 m: give at least one")
@@ -69,7 +69,7 @@ class Sighting:
         found: its id was read.
         translation: (3,) of the estimate minus truth, along the line of sight, to the right, down, metres.
         rotation: angle between estimated and true orientation, degrees.
-        other: the same of the pose that was not preferred.
+        other: the same for the rejected pose.
         pixels: mean side of the black square.
         error: reprojection error, pixels.
         ambiguity: ratio of the two errors.
@@ -88,10 +88,10 @@ class Sighting:
 
 
 def measure(configs: Sequence[CurveConfig]) -> list[list[Sighting]]:
-    """Draw every scene and return what each detector makes of each board that lies wholly in an image.
+    """Draw every scene and return the result of each detector for each board that lies wholly in an image.
 
-    The same configs give the same numbers. Raises UserError for a config that means nothing, or for configs that differ
-    in more than the detector.
+    The same configs give the same numbers. Raises UserError for an invalid config, or for configs that differ in more
+    than the detector.
     """
     found: list[list[Sighting]] = [[] for _ in configs]
     for config in configs:
@@ -185,7 +185,7 @@ def _compared(
     ego_from_marker: Float[np.ndarray, "4 4"],
     detector: DetectorConfig,
 ) -> Sighting:
-    """Return the sighting with what its corners say about the pose."""
+    """Return the sighting with the pose errors of its corners."""
     fit = solve_square(corners, camera.intrinsics, camera.camera_from_ego, detector)
     truth = camera.camera_from_ego @ ego_from_marker
     along = truth[:3, 3] / np.linalg.norm(truth[:3, 3])
@@ -205,11 +205,11 @@ def _compared(
 
 
 def summarise(sightings: Sequence[Sighting]) -> list[dict[str, Any]]:
-    """Return one row for each distance: rate of detection and errors of what was found.
+    """Return one row for each distance: detection rate, and errors of the detected boards.
 
-    translation m: mean distance between estimate and truth; forward m: standard deviation along the line of sight about
-    zero; sideways m: the same across it; rotation: median and root mean square; wrong pose: share in which the pose
-    that was not preferred is nearer to the truth by more than a degree.
+    translation m: mean distance between estimate and truth; forward m: root mean square error along the line of sight;
+    sideways m: the same across it; rotation: median and root mean square, degrees; wrong pose: fraction in which the
+    rejected pose is nearer to the truth by more than a degree.
     """
     rows = []
     for distance in sorted({sighting.distance for sighting in sightings}):
@@ -244,7 +244,7 @@ def street(seed: int, config: CurveConfig) -> Log:
     global_from_street = yaw_pose(place[0], place[1], np.asarray(heading))
     eyes = np.array([config.mounts[0].x + distance for distance in config.distances])
     keyframes = [global_from_street @ yaw_pose(-eye, np.asarray(-0.5 * _LANE), np.zeros(())) for eye in eyes]
-    # The boards stand beside each other, so that none hides another.
+    # The boards are side by side, so that none hides another.
     lateral = -_LANE - 1.0 - 1.8 * np.arange(len(config.turns)) - rng.uniform(0.0, 0.5)
     height = _HEIGHT + rng.uniform(-0.3, 0.3, len(config.turns))
     poses = [
@@ -279,13 +279,13 @@ def street(seed: int, config: CurveConfig) -> Log:
 
 
 def _turns(seed: int, config: CurveConfig) -> list[float]:
-    """Return the angles of the boards from the road outwards, another order and side in every scene."""
+    """Return the yaw of the boards from the road outwards; order and signs differ between scenes."""
     rng = np.random.default_rng([20_251_123, seed])
     return (rng.permutation(config.turns) * rng.choice([-1.0, 1.0], len(config.turns))).tolist()
 
 
 def _facing_back(x: float, y: float, z: float, turn: float) -> Float[np.ndarray, "4 4"]:
-    """Return the pose of an upright marker that faces those who come along x, turned by `turn` (radians)."""
+    """Return the pose of an upright marker that faces traffic along x, turned by `turn` (radians)."""
     face = np.array([-np.cos(turn), -np.sin(turn), 0.0])
     up = np.array([0.0, 0.0, 1.0])
     pose = np.eye(4)
@@ -306,7 +306,7 @@ def _street_map(global_from_street: Float[np.ndarray, "4 4"], length: float) -> 
         )
         for n, y in enumerate((0.5 * _LANE, -0.5 * _LANE))
     }
-    # A closed ring has no kerb along which trees and lamps could stand before the boards.
+    # A closed ring has no open kerb, along which scenery would place trees and lamps in front of the boards.
     low, high = line(-_LANE - 0.5), line(_LANE + 0.5)
     ring = np.concatenate([low, high[::-1], low[:1]])
     return VectorMap(lanes, road_boundaries=(ring,))

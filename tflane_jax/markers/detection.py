@@ -1,7 +1,7 @@
-"""Finding fiducial markers in calibrated images: which, where, turned how, and how sure (section III of the paper).
+"""Detection of fiducial markers in calibrated images: ids, poses and scores (marker paper, section III).
 
-OpenCV (extra `images`) finds the squares and reads their ids; pose, score and the choice between the two poses that a
-square can have are ours.
+OpenCV (extra `images`) finds the squares and decodes their ids. This file computes the pose, resolves the ambiguity
+between the two poses of a square, and computes the score.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from tflane_jax.scene.marker_patterns import MarkerFamily, cells_across, correct
 
 # Corners of a marker of size 2 in its own frame, in OpenCV's order: upper left, upper right, lower right, lower left.
 _SQUARE = np.array([(-1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (-1.0, -1.0, 0.0)])
-# Errors below this are alike, pixels: it keeps the ratio of two perfect fits at 1.
+# Added to both errors of a pose ratio, so that the ratio of two perfect fits is 1, pixels.
 _EXACT = 1e-3
-# Score: pixels of a cell's side and error of the fit (pixels) at which their factors fall to 1 - 1/e and exp(-1/2).
+# Scales of the score, pixels: side of a cell whose factor is 1 - 1/e, reprojection error whose factor is exp(-1/2).
 _CELL, _ERROR = 2.0, 1.0
-# Widths of the windows of OpenCV's thresholds, pixels: its defaults.
+# Window widths of OpenCV's adaptive threshold, pixels: its defaults.
 _WINDOWS = (3, 13, 23)
 # Moves the corners by less than a ten-thousandth of a pixel.
 _NUDGE = 3e-8 * np.array([(1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-1.0, 1.0)])
@@ -34,20 +34,20 @@ _NUDGE = 3e-8 * np.array([(1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-1.0, 1.0)])
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """How markers are looked for.
+    """Settings of the detector.
 
     Attributes:
         family: dictionary of the markers.
         size: side of the black square, metres.
-        capacity: most markers reported for a frame; the best scores stay.
-        corners: "pattern" moves the corners until the printed cells fit the image best, "subpixel" finds each corner
-            between the pixels by itself, "none" takes the pixels of the outline.
-        enlarge: each image is enlarged so many times before the search, which finds smaller markers and takes longer.
-        least_pixels: shorter sides are not looked at, pixels of the given image.
-        ambiguous: where the better of the two poses fits less than so many times better than the other (ratio of errors
-            above this), the prior chooses; 1 never asks the prior.
-        tilt, turn: standard deviations of the prior, radians: how far the marker's y axis leans from the vertical, and
-            how far its face is turned away from the camera.
+        capacity: most markers reported per frame; the best scores are kept.
+        corners: "pattern" fits all printed cells to the image, "subpixel" refines each corner separately, "none" keeps
+            the pixels of the outline.
+        enlarge: factor by which images are enlarged before the search; a larger one finds smaller markers, more slowly.
+        least_pixels: smallest side of a detected square, pixels of the given image.
+        ambiguous: the prior chooses between the two poses if the ratio of the smaller to the greater error is above
+            this; 1 never uses the prior.
+        tilt, turn: standard deviations of the prior, radians: of the angle between the marker's y axis and the
+            vertical, and of the angle between its face and the direction to the camera.
     """
 
     family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
@@ -61,7 +61,7 @@ class DetectorConfig:
     turn: float = 0.8
 
     def validate(self) -> None:
-        """Raise UserError for numbers that mean nothing."""
+        """Raise UserError for numbers out of range."""
         for name, least in (("capacity", 1), ("enlarge", 1)):
             if getattr(self, name) < least:
                 raise UserError(f"DetectorConfig.{name} must be at least {least}, not {getattr(self, name)}")
@@ -71,13 +71,13 @@ class DetectorConfig:
 
 
 class ImageMarkers(NamedTuple):
-    """K markers found in one image, ids ascending and each once.
+    """K markers found in one image, with unique ascending ids.
 
     Attributes:
         marker_id: (K,).
         corners: (K, 4, 2) pixels from the image's corner: upper left, upper right, lower right, lower left of the
             black square as printed.
-        wrong_bits: (K,) cells whose brightness is on the wrong side, border included.
+        wrong_bits: (K,) cells read with the wrong colour, border included.
     """
 
     marker_id: Int[np.ndarray, " k"]
@@ -86,11 +86,11 @@ class ImageMarkers(NamedTuple):
 
 
 class SquarePose(NamedTuple):
-    """The two poses that a square can have.
+    """The two candidate poses of a square.
 
     Attributes:
         camera_from_marker: (2, 4, 4) the preferred one first.
-        error: (2,) root mean square distance between seen and projected corners, pixels.
+        error: (2,) root mean square distance between detected and projected corners, pixels.
     """
 
     camera_from_marker: Float[np.ndarray, "2 4 4"]
@@ -98,20 +98,20 @@ class SquarePose(NamedTuple):
 
     @property
     def ambiguity(self) -> float:
-        """Smaller over greater error, 0 (only one pose fits) to 1 (both fit alike)."""
+        """Ratio of the smaller to the greater error: 0 (only one pose fits) to 1 (both fit equally well)."""
         return float((self.error.min() + _EXACT) / (self.error.max() + _EXACT))
 
 
 class DetectedMarkers(NamedTuple):
-    """Markers found in the images of one frame, the best score first; what is not valid is padding.
+    """Markers found in the images of one frame, by descending score; rows that are not valid are padding.
 
     Attributes:
         marker_id: (M,) int32.
         pose: (M, 4, 4) ego_from_marker, metres (frame: `tflane_jax.markers`).
         score: (M,) 0 to 1, see `detection_score`.
-        reprojection: (M,) root mean square distance between seen and projected corners, pixels.
-        ambiguity: (M,) 0 (only one pose fits) to 1 (both fit alike).
-        camera: (M,) int32 view of the frame that it was taken from.
+        reprojection: (M,) root mean square distance between detected and projected corners, pixels.
+        ambiguity: (M,) 0 (only one pose fits) to 1 (both fit equally well).
+        camera: (M,) int32 index of the view it was detected in.
         valid: (M,).
     """
 
@@ -125,17 +125,17 @@ class DetectedMarkers(NamedTuple):
 
     @classmethod
     def empty(cls, capacity: int) -> DetectedMarkers:
-        """Return room for `capacity` markers and none valid."""
+        """Return padding for `capacity` markers."""
         number, real = np.zeros(capacity, np.int32), np.zeros(capacity, np.float32)
         pose = np.tile(np.eye(4, dtype=np.float32), (capacity, 1, 1))
         return cls(number, pose, real, real.copy(), real.copy(), number.copy(), np.zeros(capacity, bool))
 
 
 def detect(views: CameraViews, config: DetectorConfig = DetectorConfig()) -> DetectedMarkers:
-    """Return the markers in all images of a frame; of an id that several images show, or one shows twice, the best.
+    """Return the markers in all images of a frame; an id detected several times is reported once, with its best score.
 
-    Views that are not valid, and pixels beyond a view's size, are not looked at. Raises UserError without OpenCV or for
-    a config that means nothing.
+    Invalid views, and pixels beyond a view's size, are ignored. Raises UserError without OpenCV or for an invalid
+    config.
     """
     rows: dict[int, tuple[float, int, np.ndarray, float, float]] = {}
     for number in np.flatnonzero(np.asarray(views.valid)).tolist():
@@ -152,7 +152,7 @@ def detect(views: CameraViews, config: DetectorConfig = DetectorConfig()) -> Det
                 pose = invert_pose(camera_from_ego) @ fit.camera_from_marker[0]
                 rows[marker_id] = (score, number, pose, float(fit.error[0]), fit.ambiguity)
     answer = DetectedMarkers.empty(config.capacity)
-    # Equal scores stay in the order of ids, so that the answer does not depend on the order of the views.
+    # Ties are broken by id, so that the result does not depend on the order of the views.
     best = sorted(rows, key=lambda marker_id: (-rows[marker_id][0], marker_id))[: config.capacity]
     for place, marker_id in enumerate(best):
         score, camera, pose, error, ambiguity = rows[marker_id]
@@ -164,10 +164,10 @@ def detect(views: CameraViews, config: DetectorConfig = DetectorConfig()) -> Det
 def find_markers(
     image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"], config: DetectorConfig = DetectorConfig()
 ) -> ImageMarkers:
-    """Return the markers of the family in an image without lens distortion, RGB or grey; of an id that is found twice,
-    the one whose cells are read best.
+    """Return the markers of the family in an undistorted image, RGB or grey.
 
-    Raises UserError without OpenCV or for a config that means nothing.
+    An id found several times is reported once, where its cells are read best. Raises UserError without OpenCV or for an
+    invalid config.
     """
     config.validate()
     cv2 = opencv()
@@ -176,12 +176,12 @@ def find_markers(
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else np.ascontiguousarray(image)
     if config.enlarge > 1:
         grey = cv2.resize(grey, None, fx=config.enlarge, fy=config.enlarge, interpolation=cv2.INTER_CUBIC)
-    # Before a bright sky the white margin looks as dark as the square at some widths of the threshold's window, and the
-    # outline is that of the board. OpenCV tries the outermost outline first; each width by itself, the best is kept.
+    # Against a bright sky some threshold windows merge the white margin with the square, and the outline is that of the
+    # board. OpenCV prefers the outermost outline, so each width is tried separately and the best result is kept.
     best: dict[int, tuple[tuple[int, float], np.ndarray]] = {}
     for width in _WINDOWS:
         outlines, ids, _ = _detector(cv2, max(grey.shape), config, width).detectMarkers(grey)
-        # OpenCV counts from the middle of the first pixel, we from its corner.
+        # OpenCV has its origin at the centre of the first pixel, this package at its corner.
         squares = np.asarray(outlines, np.float64).reshape(-1, 4, 2) + 0.5
         for marker_id, corners in zip([] if ids is None else np.ravel(ids).tolist(), squares, strict=True):
             cells = marker_cells(config.family, marker_id)
@@ -209,13 +209,14 @@ def _detector(cv2: Any, longest: int, config: DetectorConfig, window: int) -> An
 def _fit(
     cv2: Any, grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"]
 ) -> tuple[int, float]:
-    """Return how many cells look white that are black, or black that are white, and less the contrast of the others,
-    0 to 255: the smaller, the better."""
+    """Return the number of cells read with the wrong colour, and black minus white brightness (-255 to 255).
+
+    Lower is better for both."""
     across, fine = len(cells), 8
     square = fine * across * np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5
     flat = cv2.getPerspectiveTransform((corners - 0.5).astype(np.float32), square.astype(np.float32))
     seen = cv2.warpPerspective(grey, flat, (fine * across, fine * across), flags=cv2.INTER_LINEAR)
-    # The middle of each cell: its edge mixes with its neighbours.
+    # Only the middle of each cell: its edge is blurred with its neighbours.
     middle = seen.reshape(across, fine, across, fine)[:, 2:6, :, 2:6].mean((1, 3))
     white, black = middle[cells].mean(), middle[~cells].mean()
     return int(((middle > 0.5 * (white + black)) != cells).sum()), float(black - white)
@@ -227,25 +228,25 @@ def solve_square(
     camera_from_ego: Float[np.ndarray, "4 4"],
     config: DetectorConfig = DetectorConfig(),
 ) -> SquarePose:
-    """Return both poses of a marker whose corners are seen (in the order of `ImageMarkers`), the preferred one first.
+    """Return both poses of a marker from its corners (in the order of `ImageMarkers`), the preferred one first.
 
-    A square seen from afar looks nearly the same when its face is mirrored about the line of sight, so that four
-    corners fit two poses (infinitesimal plane-based pose estimation, Collins and Bartoli 2014; OpenCV's IPPE_SQUARE).
-    The rule: the pose with the smaller error is preferred, unless the ratio of both errors is above `config.ambiguous`.
+    From afar a square looks nearly the same when its normal is mirrored about the line of sight, so four corners have
+    two candidate poses (infinitesimal plane-based pose estimation, Collins and Bartoli 2014; OpenCV's IPPE_SQUARE).
+    The pose with the smaller error is preferred, unless the ratio of both errors is above `config.ambiguous`.
     Then the prior prefers the one with the smaller (lean / tilt)^2 + (turned / turn)^2 + (error / least error)^2, with
-    lean the angle between the marker's y axis and the ego frame's z axis (a marker stands upright on its post), and
-    turned the angle between its z axis and the direction to the camera (it faces those whom it addresses).
+    lean the angle between the marker's y axis and the ego frame's z axis (boards are upright), and
+    turned the angle between its z axis and the direction to the camera (boards face the traffic).
     """
     cv2 = opencv()
     square = 0.5 * config.size * _SQUARE
     rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(np.asarray(intrinsics, np.float64)).T
-    # A marker that faces the camera is turned by half a circle, where OpenCV's rotation vectors break down (always for
-    # an upright marker before a level camera). Seen in a mirror, y turned round, it is hardly turned at all; its own z
-    # is turned round as well, of which a flat square shows nothing.
+    # A marker that faces the camera is rotated by about 180 degrees, where OpenCV's rotation vectors are unstable
+    # (always for an upright marker and a level camera). So the problem is solved with y of the image and z of the
+    # marker mirrored, where the rotation is small; z does not matter for a flat square.
     seen = rays[:, :2] / rays[:, 2:] * [1.0, -1.0]
     count, turns, places = _two_poses(cv2, square, seen)
     if not np.isfinite(turns).all():
-        # Seen exactly from the front, one of them is the root of a number that rounding makes negative.
+        # Exactly from the front OpenCV takes the root of a number that rounding makes negative.
         count, turns, places = _two_poses(cv2, square, seen + _NUDGE)
     mirror, back = np.array([1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0])
     rotation = mirror[:, None] * np.stack([cv2.Rodrigues(turn)[0] for turn in turns]) * back
@@ -272,7 +273,7 @@ def solve_square(
 def _two_poses(
     cv2: Any, square: Float[np.ndarray, "4 3"], seen: Float[np.ndarray, "4 2"]
 ) -> tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Return how many poses there are, their rotation vectors, and their places."""
+    """Return the number of poses, their rotation vectors and their translations."""
     count, turns, places, _ = cv2.solvePnPGeneric(
         square, np.ascontiguousarray(seen), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
@@ -280,15 +281,15 @@ def _two_poses(
 
 
 def detection_score(corners: Float[np.ndarray, "4 2"], wrong_bits: int, error: float, family: MarkerFamily) -> float:
-    """Return how far a detection may be trusted, 0 to 1: the product of three factors.
+    """Return the confidence of a detection, 0 to 1, as the product of three factors.
 
-    - bits: 1 - h / (c + 1), at least 0; h wrong cells, of which c can be corrected in this family,
+    - bits: max(0, 1 - h / (c + 1)); h wrong cells, c cells that the family can correct,
     - size: 1 - exp(-p / 2); p mean side of a cell in pixels,
     - fit: exp(-e^2 / 2); e reprojection error in pixels.
 
     Args:
         corners: of the black square, pixels.
-        wrong_bits: cells that were read wrong.
+        wrong_bits: cells read with the wrong colour.
         error: reprojection error of the pose, pixels.
         family: of the marker.
     """
@@ -304,7 +305,7 @@ def marker_outline(
     intrinsics: Float[np.ndarray, "3 3"],
     camera_from_ego: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "4 2"]:
-    """Return the pixels of a marker's corners, in the order of `ImageMarkers`; what lies behind the camera is zeros.
+    """Return the pixels of a marker's corners, in the order of `ImageMarkers`; corners behind the camera are zeros.
 
     Args:
         pose: ego_from_marker.

@@ -1,6 +1,6 @@
-"""From detected markers to the observed prior: ids become lanes in the ego frame (marker paper, section III).
+"""From detected markers to the marker prior: lanes of the store in the ego frame (marker paper, section III).
 
-The same function serves detections in images (`markers.detection`) and simulated ones (`markers.simulation`).
+Used for detections in images (`markers.detection`) and for simulated ones (`markers.simulation`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tflane_jax.scene import MarkerObservations
 
 
 class Detected(Protocol):
-    """Markers found at one moment; `MarkerObservations` is one of its kinds.
+    """Markers detected at one moment; satisfied by `MarkerObservations` too.
 
     Attributes:
         marker_id: (D,) identity.
@@ -39,13 +39,13 @@ class Detected(Protocol):
 
 @dataclass(frozen=True)
 class Observed:
-    """What was observed, and what was left out.
+    """The marker prior, and counts of what was dropped.
 
     Attributes:
         markers: the prior.
-        unknown, stale: detected ids that the store does not hold, and whose entry is out of date.
-        markers_dropped: markers that found no room (the farthest).
-        lanes_dropped: lanes that found no room (of each marker, the farthest from it).
+        unknown, stale: number of detected ids that are not in the store, and of ids whose entry is out of date.
+        markers_dropped: markers beyond the capacity (the farthest).
+        lanes_dropped: lanes beyond the capacity (of each marker, the farthest from it).
     """
 
     markers: MarkerObservations
@@ -69,25 +69,25 @@ def observe(
     today: datetime.date | None = None,
     max_age_days: int | None = None,
 ) -> Observed:
-    """Return the lanes that the detected markers name, moved into the ego frame by the detected poses.
+    """Return the stored lanes of the detected markers, moved into the ego frame by the detected poses.
 
-    Nearest markers come first, and an id that was found several times counts once, with its best score. Lanes are cut
-    at the perception range, as the truth is: what lies outside is left out, and a lane that the border cuts into
-    several pieces gives several. A marker none of whose lanes lies in the range stays, without lanes.
+    Markers are ordered by distance; an id detected several times counts once, with its best score. Lanes are cut at the
+    perception range, as in the ground truth; each piece becomes a lane. A marker without lanes in the range is kept,
+    without lanes.
 
-    `residual` is r of Eq. (2): the mean distance in the ground plane between where this detection and the previous one
-    put the marker's stored lane points (the marker itself where it has no lanes), the vehicle's motion between them
-    taken out.
+    `residual` is r of Eq. (2) of the paper: the mean distance in the ground plane between the marker's stored lane
+    points placed by this detection and by the previous one, after compensating the vehicle's motion. A marker without
+    lanes uses its own position.
 
     Args:
         detected: at this moment; padding may hold anything.
-        store: what the ids mean. Warns where it does not hold one, see `look_up`.
+        store: lanes by id. Warns about unknown and stale ids, see `look_up`.
         range_: in the ego frame.
         markers, lanes, points: M, J and P of the result: capacities, and points on each lane (at least 2).
-        previous: what was detected a little earlier, in the ego frame of then; None where there is no such moment.
+        previous: detections of an earlier moment, in its own ego frame; None without one.
         now_from_previous: pose of that ego frame in this one; needed with `previous`.
-        first_residual: residual of a marker that `previous` does not hold, metres.
-        today, max_age_days: see `look_up`; None asks for no dates.
+        first_residual: residual of a marker that is not in `previous`, metres.
+        today, max_age_days: see `look_up`; None ignores dates.
     """
     if previous is not None and now_from_previous is None:
         raise ValueError("previous detections need the vehicle's motion since: give now_from_previous")
@@ -113,15 +113,17 @@ def observe(
 
 
 def pose_residual(entry: StoredMarker, pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> float:
-    """Return how far apart two poses of a marker in one frame put its lane points: their mean distance in the ground
-    plane, metres; that of the marker itself where it has no lanes."""
+    """Return the mean distance (ground plane, metres) between a marker's lane points placed by two poses.
+
+    Without lanes it is the distance between the two marker positions.
+    """
     points = entry.lanes.reshape(-1, 3) if entry.lanes.size else np.zeros((1, 3))
     apart = transform_points(pose, points) - transform_points(other, points)
     return float(np.hypot(apart[:, 0], apart[:, 1]).mean())
 
 
 def _best(detected: Detected) -> np.ndarray:
-    """Return the rows of the distinct ids, of each the one with the best score."""
+    """Return the row of the best score for each distinct id."""
     rows = np.flatnonzero(np.asarray(detected.valid))
     rows = rows[np.argsort(-np.asarray(detected.score)[rows], kind="stable")]
     return rows[np.unique(np.asarray(detected.marker_id)[rows], return_index=True)[1]]
@@ -136,7 +138,7 @@ def _pose_of(detected: Detected, marker_id: int) -> Float[np.ndarray, "4 4"] | N
 def _fill_lanes(
     out: MarkerObservations, slot: int, entry: StoredMarker, pose: Float[np.ndarray, "4 4"], range_: PerceptionRange
 ) -> int:
-    """Write a marker's lanes and their connectivity into its slot; return how many found no room."""
+    """Write a marker's lanes and their connectivity into its slot; return the number of dropped lanes."""
     whole = transform_points(pose, entry.lanes.reshape(-1, 3)).reshape(entry.lanes.shape)
     cut = [clip_to_range(line, range_) for line in whole]
     pieces = [part for parts in cut for part in parts]

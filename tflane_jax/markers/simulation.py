@@ -1,8 +1,7 @@
-"""Observations of markers without pixels: the noise model of the marker paper (section IV-A).
+"""Simulated marker detections without images: the noise model of the marker paper (section IV-A).
 
-A marker is seen where the vehicle approaches its face and nothing stands between; whether it is detected, and how wrong
-its pose is, is drawn from a stream of its own for each log, moment and marker. So an observation does not depend on
-which others were asked for, nor in which order.
+A marker is visible to a vehicle that approaches its face without occlusion. Detection and pose errors are drawn from a
+separate random stream for each log, moment and marker, so they do not depend on which other detections are simulated.
 """
 
 from __future__ import annotations
@@ -22,31 +21,31 @@ ROOT = 20_251_123
 
 @dataclass(frozen=True)
 class MarkerSimulationConfig:
-    """Which markers are detected, and how wrong their poses are.
+    """Visibility, detection probability and pose noise of simulated markers.
 
     Attributes:
         forward_sigma: standard deviation of the error along the ego x axis at `reference`, metres (paper: 3 m at 60 m).
-        yaw_sigma, pitch_sigma: of the orientation at `reference`, degrees (paper: 2 degrees at 60 m). The marker turns
-            about its own middle.
-        reference: distance at which these hold, metres.
-        growth: how all three grow with the distance from 0: "linear" or "quadratic". The paper says only that they
-            grow; a depth that is read off the marker's size in pixels has an error that grows with the square.
+        yaw_sigma, pitch_sigma: of the orientation at `reference`, degrees (paper: 2 degrees at 60 m). The marker
+            rotates about its own centre.
+        reference: distance to which the three values refer, metres.
+        growth: how all three grow with the distance from 0: "linear" or "quadratic". The paper states only that they
+            grow; the error of a depth estimated from the marker's size in pixels grows with the square.
         jump: probability of an abrupt jump (paper: 0.05 a frame), on top of the other errors.
         jump_distance: of a jump, in a random direction in the ground plane, metres (paper: about 25).
         jump_yaw: of a jump, to a random side, degrees (paper: about 90).
-        jump_spread: standard deviation of both, as a share.
-        detection_sigma: sigma_d of P = exp(-d^2 / (2 sigma_d^2)), metres. The paper fits it and does not say it. The
+        jump_spread: relative standard deviation of both.
+        detection_sigma: sigma_d of P = exp(-d^2 / (2 sigma_d^2)), metres. The paper fits it but does not report it. The
             default puts P = 1/2 at 47 m, where a 1 m marker is 38 pixels wide in the front camera of Argoverse 2, some
             5 pixels for each of the 7 cells of a 5x5 ArUco marker.
-        range: farthest that a marker is seen, metres (the paper's curves end at 60 m).
+        range: largest distance at which a marker is visible, metres (the paper's curves end at 60 m).
         field_of_view: full angle of view ahead, degrees.
         frontal: largest angle, from straight at the face, of both the line of sight and the vehicle's heading, degrees:
             a marker is visible only to a vehicle that approaches it frontally.
         occlusion: "line_of_sight": road users and buildings hide markers; "none": nothing does.
         score: range from which the detection score is drawn (uniform).
-        residual_interval: r compares with the observation so many seconds before (the paper's frames come at 2 Hz);
+        residual_interval: r compares with the observation this many seconds before (the paper's frames come at 2 Hz);
             None compares with the previous key frame.
-        first_residual: r of a marker that was not detected then, metres.
+        first_residual: r of a marker that was not detected in that earlier frame, metres.
     """
 
     forward_sigma: float = 3.0
@@ -68,7 +67,7 @@ class MarkerSimulationConfig:
     first_residual: float = 0.0
 
     def growth_at(self, distance: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-        """Return by what the standard deviations at `reference` are multiplied at a distance (metres)."""
+        """Return the factor on the standard deviations at a distance (metres); 1 at `reference`."""
         share = distance / self.reference
         return share if self.growth == "linear" else share**2
 
@@ -87,10 +86,10 @@ class MarkerConfig:
 
     Attributes:
         markers, lanes, points: capacities M and J, and points P on each lane. In 2000 frames of the test world never
-            more than one marker was detected, with at most 34 lanes in range. What does not fit is left out, the
-            farthest markers and the lanes farthest from their marker.
-        radius: lanes within so many metres of a marker are stored.
-        simulation: of what is detected.
+            more than one marker was detected, with at most 34 lanes in range. Beyond the capacities the
+            farthest markers, and the lanes farthest from their marker, are dropped.
+        radius: lanes within this distance of a marker are stored, metres.
+        simulation: of the detections.
     """
 
     markers: int = 2
@@ -107,7 +106,7 @@ class SimulatedMarkers(NamedTuple):
         marker_id: (M,) identity.
         pose: (M, 4, 4) float64 noisy ego_from_marker, metres; the identity where not valid.
         score: (M,) detection score.
-        jump: (M,) the pose has jumped. Never a model input: it is there for evaluation.
+        jump: (M,) the pose has jumped. For evaluation only, never a model input.
         valid: (M,) detected.
     """
 
@@ -145,7 +144,7 @@ def simulate_detections(
 
 
 def visible(ego_from_marker: Float[np.ndarray, "m 4 4"], config: MarkerSimulationConfig) -> Bool[np.ndarray, " m"]:
-    """Return which markers a vehicle with free sight sees: within range, ahead, and approached frontally."""
+    """Return which markers are visible without occlusion: within range, ahead, and approached frontally."""
     place, face = ego_from_marker[:, :2, 3], ego_from_marker[:, :2, 2]
     distance = np.hypot(place[:, 0], place[:, 1])
     ahead = np.abs(np.arctan2(place[:, 1], place[:, 0])) <= np.deg2rad(config.field_of_view) / 2
@@ -155,8 +154,11 @@ def visible(ego_from_marker: Float[np.ndarray, "m 4 4"], config: MarkerSimulatio
 
 
 def moment_before(log: Log, keyframe: int, interval: float | None) -> KeyFrame | None:
-    """Return the moment with which the residual compares: the track frame nearest to `interval` seconds before the key
-    frame, or for None the previous key frame; None where the log has no such moment."""
+    """Return the earlier moment of the residual; None if the log has none.
+
+    It is the track frame nearest to `interval` seconds before the key frame, or the previous key frame for `interval`
+    None.
+    """
     moment = log.keyframes[keyframe]
     if interval is None:
         return log.keyframes[keyframe - 1] if keyframe > 0 else None
@@ -165,14 +167,14 @@ def moment_before(log: Log, keyframe: int, interval: float | None) -> KeyFrame |
         return None
     off = np.abs(earlier - (moment.timestamp_ns - interval * 1e9))
     frame = int(off.argmin())
-    # A gap in the record, or its start: the nearest frame is no stand-in for the one that is wanted.
+    # At a gap or at the start of the log the nearest frame is too far from the requested time.
     if off[frame] > 0.5e9 * interval:
         return None
     return KeyFrame(int(earlier[frame]), log.global_from_ego[frame], frame)
 
 
 class _Draws(NamedTuple):
-    """What is drawn for each marker: (M, 4) in [0, 1) and (M, 5) standard normal; 0 for markers that nobody sees."""
+    """Random numbers of each marker: (M, 4) in [0, 1) and (M, 5) standard normal; 0 for invisible markers."""
 
     uniform: Float[np.ndarray, "m 4"]
     normal: Float[np.ndarray, "m 5"]
@@ -193,11 +195,11 @@ def _perturbed(
     drawn: _Draws,
     config: MarkerSimulationConfig,
 ) -> Float[np.ndarray, "m 4 4"]:
-    """Return the poses with the errors of section IV-A: the marker moves along x, jumps, and turns about itself."""
+    """Return poses with the errors of section IV-A: shift along x, jump, and rotation about the marker's centre."""
     growth = config.growth_at(distance)
     forward, yaw, pitch, further, turned = drawn.normal.T
     yaw, pitch = growth * config.yaw_sigma * yaw, growth * config.pitch_sigma * pitch
-    # One number gives the direction of a jump and, by its half, the side to which it turns.
+    # One number gives the direction of a jump and the sign of its yaw.
     angle = 2.0 * np.pi * drawn.uniform[:, 3]
     length = np.where(jump, config.jump_distance * (1.0 + config.jump_spread * further), 0.0)
     side = np.where(drawn.uniform[:, 3] * 8.0 % 2.0 < 1.0, 1.0, -1.0)
@@ -216,7 +218,7 @@ def _about_y(angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 3 3"]:
 
 
 def _hidden(log: Log, moment: KeyFrame, ego_from_marker: Float[np.ndarray, "m 4 4"]) -> Bool[np.ndarray, " m"]:
-    """Return which markers stand behind road users or buildings. All stand on flat ground, as everywhere in sight."""
+    """Return which markers are hidden by road users or buildings; the ground is flat."""
     actors, frame = log.actors, moment.track_frame
     ego_from_track = relative_pose(moment.global_from_ego, log.global_from_ego[frame])
     there = actors.valid[frame]

@@ -1,7 +1,7 @@
-"""The on-board store: marker id -> the local lane graph that the marker names (marker paper, section III).
+"""The on-board store: marker id -> local lane graph around the marker (marker paper, section III).
 
 A store is built from any lane graph (`store_of`), kept in a JSON file (`save_store`, `load_store`; docs/markers.md has
-the format) and asked by id (`look_up`). An id that it does not hold, or whose entry is out of date, gives no prior.
+the format) and queried by id (`look_up`). An unknown id, or one whose entry is out of date, gives no prior.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _LARGEST_ID = 2**31 - 1
 
 
 class UnknownMarkerWarning(UserWarning):
-    """A marker was seen that the store does not hold."""
+    """A detected marker is not in the store."""
 
 
 class StaleMarkerWarning(UserWarning):
-    """A marker was seen whose entry in the store is out of date."""
+    """The store's entry of a detected marker is out of date."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,14 @@ class StoredMarker:
     """A marker and the lanes around it.
 
     Attributes:
-        marker_id: what the pattern says.
-        global_from_marker: (4, 4) float64, where it was surveyed, metres. Used only to look at a store on a map: on the
-            road the pose comes from the detection.
+        marker_id: encoded in the pattern.
+        global_from_marker: (4, 4) float64 surveyed pose, metres. Used only to show a store on a map; on the road the
+            pose comes from the detection.
         lanes: (J, P, 3) float64 centerlines in driving direction, **marker frame** (see `tflane_jax.markers`), metres.
         successor: (J, J) [i, j] true where the end of lane i is the start of lane j.
         size: side of the black square, metres.
         surveyed: day of the survey.
-        expires: first day on which the entry counts no longer.
+        expires: first day on which the entry is invalid.
     """
 
     marker_id: int
@@ -63,7 +63,7 @@ class StoredMarker:
     expires: datetime.date | None = None
 
     def outdated(self, today: datetime.date, max_age_days: int | None = None) -> bool:
-        """Return whether the entry has expired, or is older than the limit; without a date of survey it is."""
+        """Return whether the entry has expired or is older than the limit; an unknown age exceeds any limit."""
         if self.expires is not None and today >= self.expires:
             return True
         return max_age_days is not None and (
@@ -77,7 +77,7 @@ class MarkerStore:
 
     Attributes:
         markers: the entries.
-        source: where they come from, for messages.
+        source: origin of the entries, for messages.
     """
 
     markers: Mapping[int, StoredMarker]
@@ -86,11 +86,11 @@ class MarkerStore:
 
 @dataclass(frozen=True)
 class Lookup:
-    """What a store says about some ids.
+    """Result of a query by ids.
 
     Attributes:
-        found: for each id its entry, None where it gives no prior.
-        unknown, stale: how many ids it does not hold, and how many entries are out of date.
+        found: the entry of each id, None where it gives no prior.
+        unknown, stale: number of ids that are not in the store, and of entries out of date.
     """
 
     found: tuple[StoredMarker | None, ...]
@@ -103,13 +103,13 @@ def look_up(
 ) -> Lookup:
     """Return the entries of some ids.
 
-    Warns (`UnknownMarkerWarning`, `StaleMarkerWarning`) with one text for each store, which Python's default filter
-    shows once.
+    Warns (`UnknownMarkerWarning`, `StaleMarkerWarning`) with a text that depends on the store alone, so that Python's
+    default filter shows it once.
 
     Args:
-        store: where to look.
-        ids: of the markers that were seen.
-        today: entries that are out of date on this day give no prior; None asks for no dates.
+        store: to query.
+        ids: of the detected markers.
+        today: entries that are out of date on this day give no prior; None ignores dates.
         max_age_days: entries surveyed longer ago are out of date; needs `today`.
     """
     if max_age_days is not None and today is None:
@@ -146,19 +146,19 @@ def store_of(
     expires: datetime.date | None = None,
     source: str = "marker store",
 ) -> MarkerStore:
-    """Return the store of these markers: for each the lanes within a radius.
+    """Build a store: for each marker the lanes within a radius.
 
-    Lanes are cut where they leave the circle and resampled (both in the ground plane); a lane that the circle cuts into
-    several pieces gives several. [i, j] of `successor` is true where piece i holds the end of its lane, piece j the
-    start of its lane, and the graph joins the two lanes.
+    Lanes are cut where they leave the circle and resampled (both in the ground plane); each piece
+    becomes a lane. `successor` [i, j] is true if piece i contains the end of its lane, piece j the start of its lane,
+    and the second lane is a successor of the first.
 
     Args:
         lanes: any lane graph in global metres, by id; only `centerline` and `successors` are read.
-        markers: where they stand.
+        markers: ids and poses.
         radius: of the circle around each marker, metres.
         points: on each lane, at least 2.
         surveyed, expires: written to all entries.
-        source: where the lanes come from, for messages.
+        source: origin of the lanes, for messages.
     """
     return MarkerStore(
         {
@@ -200,7 +200,7 @@ def _clip_to_circle(
     a, step = points[:-1], np.diff(points, axis=0)
     away = a[:, :2] - centre
     square, dot, beyond = (step[:, :2] ** 2).sum(-1), (away * step[:, :2]).sum(-1), (away**2).sum(-1) - radius**2
-    # |away + t step| = radius; a step of no length is inside where it starts.
+    # Solve |away + t step| = radius; a step of length 0 is inside if its start is.
     root = dot**2 - square * beyond
     moves = square > 0.0
     half = np.sqrt(np.maximum(root, 0.0))
@@ -218,12 +218,12 @@ def _clip_to_circle(
 
 
 def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "survey"] = "marker") -> Path:
-    """Write a store, whole or not at all; raises UserError where that cannot be.
+    """Write a store atomically; raises UserError if that fails.
 
     Args:
         store: what to write.
         path: a .json file, replaced where there is one.
-        frame: of the lanes in the file: the marker's, or that in which the markers were surveyed.
+        frame: of the lanes in the file: the marker frame, or the frame of the survey.
     """
     records = [
         {

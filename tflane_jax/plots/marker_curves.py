@@ -14,7 +14,7 @@ PAPER_DISTANCE, PAPER_FORWARD, PAPER_ANGLE = 60.0, 3.0, 2.0
 
 
 def save_error_curves(path: Path, curves: dict[str, list[dict[str, Any]]], sigma_d: float) -> Path:
-    """Draw rate, forward error and rotation error over distance, beside what the paper assumes, and return the path.
+    """Draw rate, forward error and rotation error over distance, beside the paper's assumptions, and return the path.
 
     Args:
         path: .png, .pdf or .svg.

@@ -1,6 +1,6 @@
-"""Traffic lights and road signs as bodies with lamps and pictograms, and where cameras see them.
+"""Traffic lights and road signs: bodies with lamps and pictograms, image boxes and visibility.
 
-In the frame of an element x points to where it faces, y to the right of whoever looks at it, and z up.
+Frame of an element: x points where it faces, y to the right as seen from the front, z up.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _LAMPS: dict[int, tuple[float, Colour]] = {
     YELLOW: (0.0, (1.0, 0.78, 0.1)),
     GREEN: (-0.345, (0.1, 0.98, 0.5)),
 }
-# Visible share of the points looked at on its face, cosine of the widest angle at which a face is read, share of its
-# box that must lie in the image.
+# Limits of visibility: visible fraction of the points on its face, cosine of the widest viewing angle, fraction of its
+# box inside the image.
 _SEEN, _FACING, _INSIDE = 0.5, np.cos(np.deg2rad(72.0)), 0.6
 
 _STRAIGHT = ([(-0.13, -0.75), (0.13, -0.75), (0.13, 0.15), (-0.13, 0.15)], [(-0.45, 0.15), (0.45, 0.15), (0.0, 0.8)])
@@ -88,7 +88,7 @@ _PICTOGRAMS: dict[int, Pictogram] = {
 
 
 def element_bodies(elements: Sequence[MapElement], attribute: Int[np.ndarray, " e"]) -> Bodies:
-    """Return one body for each element, global frame, showing what it shows at this moment."""
+    """Return one body for each element, global frame, with the given attributes."""
     solids, boxes, places = [], [], []
     for element, shown in zip(elements, np.asarray(attribute).tolist(), strict=True):
         solid = Solid()
@@ -106,7 +106,7 @@ def element_bodies(elements: Sequence[MapElement], attribute: Int[np.ndarray, " 
 
 
 def mast_bodies(elements: Sequence[MapElement], boundaries: Sequence[Float[np.ndarray, "_ 3"]]) -> Bodies:
-    """Return what the elements hang from: posts of low ones, masts beside the road with an arm of high ones."""
+    """Return the supports of the elements: posts of low ones, masts with an arm beside the road for high ones."""
     solids: list[Solid] = []
     boxes: list[Box] = []
 
@@ -138,8 +138,9 @@ def mast_bodies(elements: Sequence[MapElement], boundaries: Sequence[Float[np.nd
 def element_boxes(
     elements: Sequence[MapElement], ego_from_global: Float[np.ndarray, "4 4"], camera: FrontCamera
 ) -> tuple[Float[np.ndarray, "e 2 2"], Bool[np.ndarray, " e"]]:
-    """Return the pixel box of each element in one image, cut at its border, and whether it lies in the image and faces
-    the camera; the box of one that does not means nothing. What stands before it is not asked."""
+    """Return the pixel box of each element, cut at the image border, and which are in the image and face the camera.
+
+    Other boxes are arbitrary. Occlusion is not considered."""
     corners, faces = _corners(elements, ego_from_global)
     pixels, depth = camera.image_of(corners.reshape(-1, 3))
     pixels, depth = pixels.reshape(-1, 8, 2), depth.reshape(-1, 8)
@@ -160,12 +161,12 @@ def unhidden(
     boxes: Float[np.ndarray, "b 7"],
     own: int,
 ) -> Bool[np.ndarray, " e"]:
-    """Return which elements the camera sees for the most part.
+    """Return which elements are not mostly occluded.
 
     Args:
-        elements, ego_from_global, camera: what is looked at, and from where.
+        elements, ego_from_global, camera: elements and viewpoint.
         boxes: of all bodies in the ego frame, as `Bodies.boxes`.
-        own: row of the first element's body in `boxes`; the others follow it.
+        own: row of the first element's body in `boxes`; those of the others follow.
     """
     corners, faces = _corners(elements, ego_from_global)
     share = np.array([(u, v) for u in (0.12, 0.5, 0.88) for v in (0.06, 0.35, 0.65, 0.94)])
@@ -206,7 +207,7 @@ def _corners(
 
 
 def _face(solid: Solid, x: float, ring: Sequence[tuple[float, float]], z: float, colour: Colour, light: float = 0.0):
-    """Add a polygon on the face, given as (right, up) counter-clockwise as seen by whoever looks at it."""
+    """Add a polygon on the face, given as (right, up) counter-clockwise as seen from the front."""
     solid.add(np.array([(x, u, z + v) for u, v in ring]), colour, light)
 
 

@@ -1,9 +1,8 @@
-"""The ground of a map as one picture from above, and how a camera sees it.
+"""The ground of a map as a mipmapped texture: drawing it, and sampling it for a camera.
 
-A window of the ground is drawn once, texel by texel, in global coordinates, so that texture and paint stay where they
-are whoever looks, and halved again and again. A camera looks every pixel up where a texel is about as large as the
-pixel's own footprint (Williams 1983, "Pyramidal Parametrics"), and so thin paint fades with distance and does not
-vanish.
+A window of the ground is drawn once in global coordinates, so that texture and paint are the same for every camera, and
+then halved repeatedly. A camera samples the level whose texels are about as large as the pixel's footprint (Williams
+1983, "Pyramidal Parametrics"), so that thin paint fades with distance without aliasing.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from tflane_jax.world.cameras.paint import Paint
 from tflane_jax.world.render.polygons import SHIFT
 from tflane_jax.world.roads.area import road_rings
 
-# cv2 fills the texels that a smooth edge passes through too: what it draws is wider by this, texels.
+# cv2 also fills the texels under an antialiased edge, which widens shapes by this, texels.
 _GROWTH = 1.4
 _KERB, _SIDEWALK = 0.22, 3.2
 _GRASS = ((0.27, 0.33, 0.15), (0.33, 0.36, 0.19), (0.4, 0.37, 0.25), (0.22, 0.29, 0.13))
 _PAVING = ((0.55, 0.53, 0.5), (0.5, 0.5, 0.5), (0.58, 0.53, 0.47))
-# Sizes of blotches and grain of the ground and of the places from which paint has gone, metres.
+# Cell sizes of the ground's blotches and grain and of worn paint, metres.
 _BLOTCH, _GRAIN, _PATCH = 0.96, 0.04, 0.16
-# Footprints up to this many times longer than wide are averaged over their length as well; longer ones blur sideways.
+# Largest ratio of footprint length to width that is averaged along its length; beyond it, samples blur sideways.
 _STRETCH = 5.0
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A window of the ground: its colours in full even light, in ever coarser levels.
+    """A window of the ground: a mipmap of its albedo.
 
     Attributes:
         window: of the first level; each further one halves it.
@@ -46,7 +45,7 @@ class Ground:
 
     @functools.cached_property
     def beyond(self) -> tuple[float, float, float]:
-        """Colour of the ground outside of the window: the mean of its border."""
+        """Colour of the ground outside the window: the median of its border."""
         coarse = self.levels[-1]
         border = np.concatenate([coarse[0], coarse[-1], coarse[:, 0], coarse[:, -1]])
         red, green, blue = np.median(border, 0).tolist()
@@ -68,7 +67,7 @@ def draw_ground(
 
     Args:
         rng: stream of colours and dirt; the same stream gives the same ground in every window.
-        vector_map, paint: what is there.
+        vector_map, paint: roads and their paint.
         window: what to draw.
         dirt: 0 (spotless asphalt) to 1.
         wet: 0 to 1, darkens.
@@ -180,7 +179,7 @@ def _texture(image: UInt8[np.ndarray, "h w 3"], window: Window, dirt: float) -> 
 
 
 def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) -> None:
-    """Lay paint over the ground, in place; wear takes it where the ground is rough."""
+    """Blend paint over the ground, in place; worn paint is missing where the ground is rough."""
     import cv2
 
     near = np.flatnonzero(window.meets(paint.corners) & (paint.left > 0.02))
@@ -196,7 +195,7 @@ def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) 
         painted = np.flatnonzero(mask)
         share = mask.ravel()[painted].astype(np.float32) * np.float32(1.0 / 255.0)
         if rough is not None:
-            # Half worn paint is gone in half of the places; fresh and vanished paint are the same everywhere.
+            # Partly worn paint is gone in patches; fresh and fully worn paint are uniform.
             height = (rough[np.unravel_index(painted, rough.shape)].astype(np.float32) - 128.0) / NOISE_SIGMA
             share *= np.clip(1.0 + 1.6 * (1.0 - share) * np.minimum(height, 0.6), 0.0, 1.0)
         base = flat[painted].astype(np.float32)
@@ -207,10 +206,10 @@ def _add_paint(image: UInt8[np.ndarray, "h w 3"], paint: Paint, window: Window) 
 def _narrowed(
     corners: Float[np.ndarray, "n 4 2"], paint: Paint, rows: Int[np.ndarray, " n"], texel: float
 ) -> Float[np.ndarray, "n 4 2"]:
-    """Return quadrilaterals made smaller by what cv2 adds, so that what is drawn covers the area that it should."""
+    """Return quadrilaterals shrunk by what cv2 adds, so that the drawn area is right."""
     width, length = paint.width[rows], paint.length[rows]
     across = np.clip(1.0 - _GROWTH * texel / np.maximum(width, 1e-6), 0.02, 1.0)[:, None, None]
-    # Neighbouring pieces of a line touch, so they keep their length but for the half texel at either end.
+    # Neighbouring pieces of a line touch, so they are shortened by half as much.
     along = np.clip(1.0 - 0.5 * _GROWTH * texel / np.maximum(length, 1e-6), 0.02, 1.0)[:, None, None]
     middle = corners.mean(1, keepdims=True)
     u = 0.25 * (corners[:, 1] + corners[:, 2] - corners[:, 0] - corners[:, 3])[:, None]
@@ -228,10 +227,10 @@ def sample_ground(
     across: Float[np.ndarray, " h"],
     along: Float[np.ndarray, " h"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return the ground's colours (0 to 255, float32) at global places seen by the pixels of image rows.
+    """Return the ground's colours (0 to 255, float32) at the global positions seen by an image's pixels.
 
     Args:
-        ground: what lies there.
+        ground: to sample.
         x, y: float32 metres from `ground.window.low`.
         across, along: size of a pixel's footprint in each row, metres.
     """

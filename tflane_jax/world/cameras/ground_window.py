@@ -1,4 +1,4 @@
-"""Axis-aligned windows of the ground, in texels, and noise that stays where it is in every window."""
+"""Axis-aligned windows of the ground, in texels, and noise fixed to the ground."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import SHIFT
 
-# What one standard deviation of noise is in bytes.
+# One standard deviation of noise, grey levels.
 NOISE_SIGMA = 40.0
-# Windows have a multiple of so many texels, so that they can be halved five times.
+# Window sides are multiples of this many texels, so that they can be halved five times.
 _BLOCK = 32
 
 
@@ -33,7 +33,7 @@ class Window:
     rows: int
 
     def fixed(self, points: Float[np.ndarray, "*n 2"]) -> Int[np.ndarray, "*n 2"]:
-        """Return points as cv2 takes them: from the first texel's centre, in 1/16 texels."""
+        """Convert points to cv2's fixed point: 1/16 texel from the first texel's centre."""
         return np.round(((points - np.array(self.low)) / self.texel - 0.5) * (1 << SHIFT)).astype(np.int32)
 
     def meets(self, corners: Float[np.ndarray, "n k 2"]) -> Bool[np.ndarray, " n"]:
@@ -44,8 +44,8 @@ class Window:
 
 
 def window_around(points: Float[np.ndarray, "n 2"], reach: float, texel: float) -> Window:
-    """Return the window that holds all that lies within `reach` metres of the points along x and y."""
-    # On a grid of whole texels, so that windows that overlap have the same texels; halving leaves nothing over.
+    """Return the window that contains everything within `reach` metres of the points along x and y."""
+    # Aligned to whole texels, so that overlapping windows share texels; sides are multiples of the block.
     first = np.floor((points.min(0) - reach) / texel)
     count = np.ceil(((points.max(0) + reach) / texel - first) / _BLOCK) * _BLOCK
     low = first * texel
@@ -58,7 +58,7 @@ def ground_noise(window: Window, cell: float) -> UInt8[np.ndarray, "h w"]:
 
     texels = max(round(cell / window.texel), 1)
     tile = _noise_bytes()
-    # From one cell before the window to one behind it, so that cells lie where they lie in every window.
+    # One cell more on each side, so that cells have the same positions in every window.
     first = [round(low / window.texel) // texels - 1 for low in window.low]
     columns, rows = (
         (start + np.arange(count // texels + 4)) % len(tile)

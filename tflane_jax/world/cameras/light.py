@@ -1,7 +1,6 @@
-"""Weather of a log, its sky all around, and light and shadow on the ground that the ring cameras see.
+"""Light for the ring cameras: weather of a log, sky panorama, light and shadows on the ground.
 
-Directions in the global frame unless a name says otherwise: the sun and the hills stay where they are while the
-vehicle turns.
+Directions are in the global frame unless stated otherwise: sun and hills are fixed while the vehicle turns.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from tflane_jax.world.render.noise import noise_tile
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, clipped, fixed_point
 from tflane_jax.world.render.weather import FrontWeatherConfig, Weather, draw_weather
 
-# Elevations that the panorama covers, radians; what lies higher looks like its upper border.
+# Elevations covered by the panorama, radians; higher elevations repeat its upper border.
 _LOWEST, _HIGHEST = -0.05, 0.95
-# Shadows grow no longer than with the sun this steep (tangent of its elevation).
+# Lower limit of the tangent of the sun's elevation, which bounds the length of shadows.
 _STEEPEST_SHADOW = 0.35
 
 
@@ -33,19 +32,19 @@ def log_weather(rng: np.random.Generator, config: FrontWeatherConfig, *, weather
         weather: how bad it is, 0 to 1, as `logs.Log.weather`.
         severity: of the whole sensor, 0 to 1; 0 also gives a perfect camera.
     """
-    # A log of middling weather has rain or fog more often than not, so that the images show what the log says.
+    # Factor 1.6: a log with weather around 0.5 then has rain or fog more often than not.
     return draw_weather(rng, config, min(1.6 * weather * severity, 1.0))
 
 
 def seen_from_ego(weather: Weather, yaw: float) -> Weather:
-    """Return the weather with its sun in the frame of an ego vehicle that heads along `yaw`."""
+    """Return the weather with its sun in the ego frame of a vehicle with heading `yaw`."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y, z = weather.sun
     return replace(weather, sun=np.array([cos * x + sin * y, cos * y - sin * x, z]))
 
 
 def draw_panorama(rng: np.random.Generator, weather: Weather, columns: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the sky around: columns from azimuth 0 counter-clockwise, rows from the highest elevation down."""
+    """Return the sky panorama: columns from azimuth 0 counter-clockwise, rows from the highest elevation down."""
     import cv2
 
     rows = columns // 6
@@ -53,7 +52,7 @@ def draw_panorama(rng: np.random.Generator, weather: Weather, columns: int) -> U
     elevation = (_HIGHEST - (np.arange(rows) + 0.5) / rows * (_HIGHEST - _LOWEST))[:, None]
     above = np.clip(elevation / 0.55, 0.0, 1.0)[..., None]
     sky = weather.horizon + above**0.6 * (weather.zenith - weather.horizon)
-    # Clouds on a plane far above: small and dense towards the horizon.
+    # Clouds lie on a high plane, so they get smaller and denser towards the horizon.
     reach = 1.0 / np.maximum(np.tan(np.maximum(elevation, 0.01)), 0.06)
     shift = rng.uniform(0.0, 256.0, 2)
     u, v = reach * np.cos(azimuth) * 9.0 + shift[0], reach * np.sin(azimuth) * 9.0 + shift[1]
@@ -86,10 +85,10 @@ def draw_panorama(rng: np.random.Generator, weather: Weather, columns: int) -> U
 
 @dataclass(frozen=True)
 class View:
-    """What each pixel of a camera looks at, in the ego frame; arrays are float32.
+    """Ray and ground point of each pixel of a camera, in the ego frame; arrays are float32.
 
     Attributes:
-        camera: that looks.
+        camera: of the image.
         azimuth, elevation: (H, W) of the rays, radians.
         first_row: rows from here on may show ground; the ground arrays begin there.
         x, y: (h, w) ground, metres.
@@ -110,12 +109,12 @@ class View:
     along: Float[np.ndarray, " h"]
 
 
-# Ground farther away than this is not looked up, metres.
+# Ground farther away than this is not drawn, metres.
 FAR = 500.0
 
 
 def look(camera: FrontCamera) -> View:
-    """Return what the pixels of a camera look at."""
+    """Return the rays and ground points of a camera's pixels."""
     w, h = camera.width, camera.height
     u, v = np.arange(w) + 0.5, (np.arange(h) + 0.5)[:, None]
     # Rays in the ego frame are linear in the pixel.
@@ -147,8 +146,8 @@ def look(camera: FrontCamera) -> View:
 
 
 def show_sky(view: View, panorama: UInt8[np.ndarray, "k l 3"], yaw: float) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the sky (and what else of the panorama) that a camera of an ego vehicle heading along `yaw` sees; rows
-    that show nothing but ground are black."""
+    """Return the part of the panorama seen by a camera of a vehicle with heading `yaw`; rows with ground only are
+    black."""
     import cv2
 
     rows, columns = panorama.shape[:2]
@@ -170,13 +169,13 @@ def light_ground(
     open_sky: Float[np.ndarray, "h w"],
     lamps: Float[np.ndarray, "h w"],
 ) -> None:
-    """Turn the ground's own colours into lit and hazy ones, in place.
+    """Apply light, shadows, haze and wet reflections to the ground's albedo, in place.
 
     Args:
         colour: 0 to 255.
-        view: where it lies.
+        view: positions of the pixels on the ground.
         weather: with its sun in the ego frame.
-        sunny, open_sky: shares of direct and of ambient light that arrive.
+        sunny, open_sky: fractions of direct and of ambient light that arrive.
         lamps: light of street lamps.
     """
     light = weather.direct * sunny + weather.ambient * open_sky
@@ -208,7 +207,7 @@ def cast(corners: Float[np.ndarray, "b 4 2"], height: Float[np.ndarray, " b"], s
 def vehicle_shadows(
     view: View, boxes: Float[np.ndarray, "b 7"], weather: Weather
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Return the shares of direct and ambient light that bodies on the ground let pass.
+    """Return the fractions of direct and ambient light left by the shadows of road users.
 
     Args:
         view: of the camera.
@@ -232,7 +231,7 @@ def vehicle_shadows(
 
 
 def _may_be_seen(camera: FrontCamera, boxes: Float[np.ndarray, "b 7"]) -> Bool[np.ndarray, " b"]:
-    """Return which bodies may throw a shadow into the image: those not far outside of its left and right border."""
+    """Return which bodies may cast a shadow into the image: those not far beyond its left and right borders."""
     local = boxes[:, :3] * [1.0, 1.0, 0.0] @ camera.camera_from_ego[:3, :3].T + camera.camera_from_ego[:3, 3]
     margin = boxes[:, 2] + boxes[:, 6] / _STEEPEST_SHADOW
     half = 0.6 * camera.width / camera.intrinsics[0, 0]

@@ -1,6 +1,6 @@
-"""Fiducial markers as bodies: a printed board on a post beside the road.
+"""Fiducial markers as bodies: a printed board on a post.
 
-Where a marker stands, and its frame, is as `tflane_jax.markers` says: `global_from_marker`, z out of the board.
+The marker frame is that of `tflane_jax.markers`: poses are `global_from_marker`, with z out of the board.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tflane_jax.world.render.shapes import Colour, box
 # The board's thickness and the side of its square post, metres.
 _THICK, _POST = 0.03, 0.1
 _BACK: Colour = (0.55, 0.56, 0.57)
-# Printed white, and how bright in shares of it the leaves are that may hang over a board.
+# Printed white, and the brightness of leaves that cover a board as a fraction of it.
 _WHITE: Colour = (0.93, 0.93, 0.93)
 _LEAVES = 0.22
 
@@ -29,10 +29,10 @@ def marker_bodies(markers: PlacedMarkers | None, covered: float = 0.0) -> Bodies
     """Return a board and a post for each marker, global frame; none for None.
 
     Args:
-        markers: where they stand; the ground is at z = 0, and a board that hangs lower than its post is thick has none.
-        covered: share of each board that leaves hide, from its right edge on, 0 to 1.
+        markers: their poses; the ground is at z = 0, and a board lower than the thickness of a post has no post.
+        covered: fraction of each board that leaves hide, from its right edge, 0 to 1.
 
-    Raises UserError for a share outside 0 to 1, a size that is not positive, or ids that the family does not have.
+    Raises UserError for a fraction outside 0 to 1, a size that is not positive, or ids outside the family.
     """
     if not 0.0 <= covered <= 1.0:
         raise UserError(f"the covered share of a marker is between 0 and 1, not {covered}")
@@ -83,7 +83,7 @@ def _board(pose: Float[np.ndarray, "4 4"], half: float) -> tuple[Solid, Box]:
 
 
 def _picture(family: MarkerFamily, marker_id: int, covered: float) -> Float[np.ndarray, "m m"]:
-    """Return the board's cells, 0 to 1; finer where part of it is covered."""
+    """Return the board's cells, 0 to 1; upsampled if part of it is covered."""
     cells = board_cells(family, marker_id).astype(np.float32)
     if not covered:
         return cells

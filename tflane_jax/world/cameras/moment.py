@@ -1,4 +1,4 @@
-"""One moment of a log around the vehicle: its road users, lights and scenery in the ego frame, and the ground."""
+"""The scene at one key frame: road users, traffic elements and scenery in the ego frame, and the ground."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Moment:
     """One moment of a log.
 
     Attributes:
-        place, yaw: of the vehicle in the global frame, metres and radians.
+        place, yaw: position and heading of the vehicle in the global frame, metres and radians.
         weather: with its sun in the ego frame.
-        bodies: all that stands or moves nearby, ego frame.
+        bodies: static and moving bodies nearby, ego frame.
         users: (u, 7) boxes of the road users, as `Bodies.boxes`.
-        grounds: the coarsest first.
+        grounds: ground windows, the coarsest first.
     """
 
     place: Float[np.ndarray, "2"]
@@ -49,7 +49,7 @@ class Moment:
 
 
 def moment_of(log: Log, keyframe: int, stage: Stage, config: CameraRigConfig) -> Moment:
-    """Return what is around the vehicle at a key frame."""
+    """Return the scene around the vehicle at a key frame."""
     pose = log.keyframes[keyframe].global_from_ego
     yaw = float(pose_yaw(pose))
     return Moment(
@@ -110,7 +110,7 @@ def _users(stage: Stage, log: Log, keyframe: int) -> Bodies:
 
 
 def _local_bodies(stage: Stage, log: Log, frame: int, number: int) -> Bodies:
-    """Return the bodies of one road user in the frame of its box; each is made once for a log, and each step."""
+    """Return the bodies of one road user in the frame of its box, cached by user and phase of the step."""
     step = int(_pace(log, frame, number) * _STEPS)
     if (number, step) not in stage.users:
         actors = log.actors
@@ -129,7 +129,7 @@ def _local_bodies(stage: Stage, log: Log, frame: int, number: int) -> Bodies:
 
 
 def _pace(log: Log, frame: int, number: int) -> float:
-    """Return where in its step a walker is, 0 to 1: by how far it is from where it started."""
+    """Return the phase of a walker's step, 0 to 1, from its distance to its start."""
     if log.actors.category[number] != RoadUser.PEDESTRIAN:
         return 0.0
     first = int(np.argmax(log.actors.valid[:, number]))
@@ -150,7 +150,7 @@ def user_boxes(log: Log, keyframe: int) -> Float[np.ndarray, "u 7"]:
 
 
 def attributes_at(log: Log, keyframe: int) -> Int[np.ndarray, " e"]:
-    """Return what each of the map's traffic elements shows at a key frame."""
+    """Return the attribute of each map element at a key frame."""
     if log.element_attribute is not None:
         return np.asarray(log.element_attribute[log.keyframes[keyframe].track_frame], int)
     return np.array([element.attribute for element in log.map.elements], int)

@@ -1,7 +1,6 @@
-"""Paint on the roads of a map with its true widths: lines, crossings, stop lines, arrows, as pieces that wear.
+"""Road paint of a map as quadrilaterals with wear: lines, crossings, stop lines, arrows.
 
-Global metres. Line types are those of the map; which solid lines are double, and which are yellow, follows from what
-they divide: opposite directions, or lanes of one.
+Global metres. Line types are those of the map. A solid line between opposite directions is double, and may be yellow.
 """
 
 from __future__ import annotations
@@ -18,14 +17,14 @@ from tflane_jax.world.bev.map_samples import DASH, DASH_PERIOD, line_key, painte
 from tflane_jax.world.bev.sensor import paint_left
 
 WHITE, YELLOW = (0.86, 0.86, 0.84), (0.84, 0.66, 0.2)
-# Length of the pieces that wear on their own, widths of lines, metres.
+# Length of pieces with a constant wear, widths of lines and stop lines, metres.
 _PIECE, _WIDTH, _STOP_WIDTH = 1.5, 0.13, 0.4
-# Middle of either line of a double one, metres from the middle of both.
+# Offset of each line of a double line from their common middle, metres.
 _DOUBLE = 0.11
 # Bars of a crossing and their spacing, metres.
 _BAR, _BAR_PERIOD = 0.45, 0.95
 _ARROW_BACK, _ARROW_EARLIER = 7.0, 24.0
-# Turns by more than this are a turn, radians.
+# Connectors that bend by more than this are turns, radians.
 _TURN = np.deg2rad(30.0)
 _SHAFT = np.array([[-2.0, -0.09], [1.0, -0.09], [1.0, 0.09], [-2.0, 0.09]])
 _STRAIGHT_HEAD = np.array([[0.9, -0.36], [2.1, 0.0], [0.9, 0.36]])
@@ -41,7 +40,7 @@ class Paint:
         corners: (N, 4, 2) global metres; the first edge and the third are the long ones of lines.
         width, length: (N,) metres.
         colour: (N, 3) display values 0 to 1.
-        left: (N,) 0 to 1, what wear leaves of it.
+        left: (N,) 0 to 1, remaining fraction of the paint.
     """
 
     corners: Float[np.ndarray, "n 4 2"]
@@ -52,13 +51,13 @@ class Paint:
 
 
 def paint_of(rng: np.random.Generator, vector_map: VectorMap, *, paint_wear: float, log_seed: int) -> Paint:
-    """Return all that is painted on the roads.
+    """Return all paint on the roads.
 
     Args:
-        rng: stream of the scene's habits: yellow or white between directions, zebras or ladders.
-        vector_map: what is there.
+        rng: stream of the scene's style: yellow or white between directions, bars or lines at crossings, arrows.
+        vector_map: with its lanes, crossings and elements.
         paint_wear: 0 (fresh) to 1 (gone).
-        log_seed: root of the log's wear, which is that of the bird's-eye-view sensor.
+        log_seed: seed of the log's wear, the same as in the BEV sensor.
     """
     yellow, zebra, arrows = rng.random() < 0.65, rng.random() < 0.75, rng.random() < 0.8
     parts = [
@@ -96,7 +95,7 @@ def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int
         length = np.maximum(np.linalg.norm(step, axis=-1), 1e-6)
         normal = np.stack([-step[:, 1], step[:, 0]], -1) / length[:, None]
         key = line_key(line)
-        # Left of both its neighbours: it parts opposite directions. Left of its only neighbour: a median's edge.
+        # Left boundary of two lanes: divides opposite directions. Left boundary of one lane alone: a median's edge.
         centre, edge = lefts[key] == 2, lefts[key] == 1 and shared[key] == 1
         offsets = (-_DOUBLE, _DOUBLE) if centre and kind == LineType.SOLID else (0.0,)
         for offset in offsets:
@@ -116,7 +115,7 @@ def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int
 
 
 def _pieces(total: float, kind: LineType) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Return where along a line pieces start and stop; dashes lie as `map_samples` puts them."""
+    """Return where along a line pieces start and stop; dashes are placed as in `map_samples`."""
     if kind == LineType.DASHED:
         first = (total / 2 - DASH / 2) % DASH_PERIOD - DASH_PERIOD
         start = np.arange(first, total, DASH_PERIOD)
@@ -149,7 +148,7 @@ def _strips(start: np.ndarray, stop: np.ndarray, width: float) -> Paint:
 
 
 def _crossing(ring: Float[np.ndarray, "_ 2"], zebra: bool) -> Paint:
-    """Return bars along the road, or a line along either side of those who cross."""
+    """Return bars along the road, or one line along each side of the crossing."""
     a0, a1, b1, b0 = ring[:4]
     if not zebra:
         return _strips(np.stack([a0, b0]), np.stack([a1, b1]), 0.3)
@@ -160,7 +159,7 @@ def _crossing(ring: Float[np.ndarray, "_ 2"], zebra: bool) -> Paint:
 
 
 def _at_lane_ends(vector_map: VectorMap, arrows: bool) -> list[Paint]:
-    """Return stop lines before traffic lights, and arrows on lanes that some turns are allowed from."""
+    """Return stop lines before traffic lights, and arrows on lanes with a choice of turns."""
     lit = {lane for element in vector_map.elements if element.category == 1 for lane in element.lanes}
     parts = []
     for segment in vector_map.segments.values():

@@ -1,7 +1,7 @@
-"""Flat pictures in space, such as the cells of a fiducial marker, seen by a camera.
+"""Flat patterns in space, such as the cells of a fiducial marker, drawn in perspective.
 
-A picture far away is smaller than the pixels: each pixel gets the mean of what lies in it, of the picture and of what
-was drawn before, so that a picture fades out with distance as a camera sees it, and never flickers.
+Pixels are supersampled: each one gets the mean of the pattern and of the background within it, so that a distant
+pattern fades without aliasing.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.world.render.camera import NEAR, FrontCamera
 
-# Each pixel is looked at in so many places along either side; small pictures are looked at more closely, for about so
-# many places in all, and of large ones there are never more than the last number.
+# Samples per pixel along each side, least and most; target number of samples of a small pattern, and largest number of
+# samples of a large one.
 _COARSE, _FINE, _LOOKS, _MOST = 4, 32, 300_000, 4_000_000
 
 
@@ -23,14 +23,14 @@ def paint_picture(
     camera: FrontCamera,
     tones: Float[np.ndarray, "2 3"],
 ) -> None:
-    """Draw a picture in perspective, in place; one that reaches nearer than `NEAR` is left out.
+    """Draw a pattern in perspective, in place; one that reaches nearer than `NEAR` is skipped.
 
     Args:
-        image: what was drawn so far.
+        image: drawn so far.
         corners: of a parallelogram in the ego frame, metres: lower left, lower right, upper right, upper left as seen
-            by whoever looks at it.
+            from the front.
         picture: 0 to 1, top row first.
-        camera: that looks.
+        camera: of the image.
         tones: display colours of 0 and of 1, 0 to 255.
     """
     pixels, depth = camera.image_of(corners)
@@ -42,7 +42,7 @@ def paint_picture(
     (left, top), (right, bottom) = low, high
     area = (right - left) * (bottom - top)
     fine = int(np.clip(np.sqrt(_LOOKS / area), max(min(_COARSE, np.sqrt(_MOST / area)), 1), _FINE))
-    # (s, t, 1), shares of the way from the lower left corner to the right and up, to the pixel (homogeneous).
+    # Homography from (s, t, 1), fractions of the way from the lower left corner to the right and up, to the pixel.
     spans = np.stack([corners[1] - corners[0], corners[3] - corners[0], corners[0]], -1)
     spans = camera.camera_from_ego[:3, :3] @ spans
     spans[:, 2] += camera.camera_from_ego[:3, 3]

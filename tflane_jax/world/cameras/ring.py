@@ -1,7 +1,6 @@
-"""Rings of calibrated cameras on the vehicle, as Argoverse 2 and nuScenes carry them.
+"""Rings of calibrated cameras on the vehicle, as in Argoverse 2 and nuScenes.
 
-The mounts state rounded, typical measures of the two vehicles; every scene has a vehicle of its own, whose calibration
-differs from them a little.
+The mounts are rounded, typical values of the two vehicles. The calibration of each scene deviates slightly from them.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from tflane_jax.world.render.camera import FrontCamera, camera_pose
 from tflane_jax.world.render.weather import FrontWeatherConfig
 
 ROOT = 20_251_121
-# Standard deviations at `jitter` 1: focal length and principal point (shares of the focal length), place (metres),
-# angles (degrees).
+# Standard deviations at `jitter` 1: focal length and principal point (fractions of the focal length), position
+# (metres), angles (degrees).
 _FOCAL, _CENTRE, _PLACE, _ANGLE = 0.003, 0.004, 0.01, 0.35
-# Images smaller than this share of the native ones are drawn twice as large and averaged.
+# Images below this fraction of the native size are drawn twice as large and averaged.
 _SMALL = 0.35
 
 
@@ -31,7 +30,7 @@ class CameraMount:
 
     Attributes:
         name: as the dataset calls it.
-        x, y, z: place in the ego frame, metres.
+        x, y, z: position in the ego frame, metres.
         yaw: of the optical axis, to the left of ahead, degrees.
         pitch: of the optical axis, downwards, degrees.
         focal: pixels of the native image.
@@ -73,15 +72,15 @@ class CameraRigConfig:
     """A ring of cameras and how its images are drawn.
 
     Attributes:
-        cameras: the first looks ahead, and traffic elements are labelled in its image.
+        cameras: the first one faces forward; traffic elements are labelled in its image.
         scale: of the images, 1 is native.
-        multiple: widths and heights are rounded up to multiples of this; what is added shows more to the right and
-            further down.
-        jitter: scales how far a scene's calibration lies from the mounts (1: a third of a degree, a centimetre).
+        multiple: widths and heights are rounded up to multiples of this, which extends the view to the right and
+            downwards.
+        jitter: scales the deviation of a scene's calibration from the mounts (1: 0.35 degrees, 1 cm).
         severity: scales the log's own weather and paint wear; 0 gives a clear day, fresh paint and a perfect camera.
-        weather: kinds of weather, and what the camera does to its picture.
-        element_pixels: a light or sign lower than this in the native image is not part of the truth.
-        markers: draw the scene's fiducial markers, which may hide what stands behind their boards.
+        weather: kinds of weather, and the camera's noise, blur and tone.
+        element_pixels: smallest height of a light or sign in the native image that is part of the truth.
+        markers: draw the scene's fiducial markers, whose boards may hide objects behind them.
     """
 
     cameras: tuple[CameraMount, ...] = NUSCENES_RING
@@ -95,7 +94,7 @@ class CameraRigConfig:
 
     @property
     def supersample(self) -> int:
-        """How many times larger than the image it is drawn, before areas are averaged."""
+        """Factor by which an image is drawn larger before it is averaged down."""
         return 2 if self.scale < _SMALL else 1
 
     def size(self, mount: CameraMount) -> tuple[int, int]:
@@ -106,7 +105,7 @@ class CameraRigConfig:
         return width, height
 
     def validate(self) -> None:
-        """Raise UserError where no images can be made of it."""
+        """Raise UserError for a rig without cameras, too small images or a severity outside 0 to 1."""
         if not self.cameras:
             raise UserError("a camera rig needs at least one camera: give CameraRigConfig.cameras")
         if not 0.0 <= self.severity <= 1.0:
@@ -122,14 +121,14 @@ class CameraRigConfig:
 def draw_rig(seed: int, config: CameraRigConfig) -> tuple[FrontCamera, ...]:
     """Return the calibrated cameras of a scene, one for each mount.
 
-    A camera depends on the seed, its own mount and the image size alone, whatever other cameras there are.
+    A camera depends on the seed, its own mount, scale, multiple and jitter alone, not on the other cameras.
     """
     config.validate()
     return tuple(_draw_camera(seed, mount, config) for mount in config.cameras)
 
 
 def camera_stream(seed: int, mount: CameraMount, *more: int) -> np.random.Generator:
-    """Return the stream of what is drawn for one camera of a scene."""
+    """Return the random stream of one camera of a scene."""
     return np.random.default_rng([ROOT, seed, zlib.crc32(mount.name.encode()), *more])
 
 

@@ -1,6 +1,6 @@
-"""What stands beside the roads of a map: buildings, trees, bushes and street lamps, the same from every camera.
+"""Static scenery beside the roads of a map: buildings, trees, bushes and street lamps.
 
-Global metres. All of it stands off the drivable area, and nothing but lamp arms and crowns reaches over it.
+Global metres. Everything is placed off the drivable area; only lamp arms and tree crowns extend over it.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _LIT: Colour = (0.95, 0.78, 0.45)
 _BARK: Colour = (0.22, 0.17, 0.12)
 _POST: Colour = (0.36, 0.37, 0.38)
 _STOREY = 3.2
-_CELL = 0.5  # of the raster that tells where there is room, metres
+_CELL = 0.5  # of the raster of free space, metres
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """What stands beside the road.
+    """Scenery beside the roads.
 
     Attributes:
         bodies: global frame.
@@ -55,12 +55,12 @@ class Scenery:
 
 
 def draw_scenery(rng: np.random.Generator, vector_map: VectorMap, night: float) -> Scenery:
-    """Draw what stands beside the roads of a map; the same stream and map give the same bits.
+    """Draw the scenery of a map; the same stream and map give the same bits.
 
     Args:
         rng: stream.
         vector_map: with its boundaries and buildings.
-        night: 0 to 1, windows and lamps shine.
+        night: 0 to 1, brightness of windows and lamps.
     """
     kerbs = [line[:, :2] for line in vector_map.road_boundaries if np.linalg.norm(line[0] - line[-1]) > 0.05]
     urban = len(vector_map.crossings) > 0 or len(vector_map.buildings) >= 12
@@ -78,7 +78,7 @@ def draw_scenery(rng: np.random.Generator, vector_map: VectorMap, night: float) 
 
 
 class _Room:
-    """Raster of what is taken: the drivable area with a margin, buildings."""
+    """Raster of occupied space: the drivable area with a margin, and buildings."""
 
     def __init__(self, vector_map: VectorMap):
         import cv2
@@ -97,7 +97,7 @@ class _Room:
         self._grown: dict[int, np.ndarray] = {}
 
     def free(self, xy: Float[np.ndarray, "n 2"], margin: float) -> np.ndarray:
-        """Return which points keep `margin` metres from all that is taken."""
+        """Return which points keep `margin` metres from all occupied space."""
         import cv2
 
         cells = round(margin / _CELL)
@@ -141,7 +141,7 @@ def _building(block: np.ndarray, height: float, look: np.ndarray, night: float) 
             up = 0.1 * _STOREY / top, 0.85 * _STOREY / top
             solid.add(inset(faces[side], (0.05, 0.95), up), _PANE, 0.6 * night)
             storey, column = storey[count:], column[count:]
-        # Which windows are lit is a hash of where they are.
+        # Lit windows are chosen by a hash of their positions.
         lit = (np.sin(91.7 * column + 37.1 * storey + 7.0 * x + 3.0 * y) > 0.55) & (night > 0.0)
         across = (column[:, None] + [0.22, 0.78]) / count
         panes = insets(faces[side], across, (storey[:, None] + [0.3, 0.82]) * (_STOREY / top))
@@ -217,7 +217,7 @@ def _trees(
             boxes.append((x, y, 1.6 * radius, 1.6 * radius, 0.0, low, middle + radius))
             trunks.append(Solid())
             tint = green * (0.8 + 0.4 * look[4]) + [0.04 * look[5], 0.0, 0.0]
-            # Dark leaves low and far, bright ones high and near: later ones are drawn over earlier ones.
+            # Later blobs are drawn over earlier ones: dark and low first, bright and high last.
             blob, offset = np.arange(9), look[6:33].reshape(9, 3) - 0.5
             offset[:, 2] = 0.65 * (blob / 8.0 - 0.45) + 0.3 * offset[:, 2]
             size = radius * (0.62 - 0.035 * blob)

@@ -1,8 +1,8 @@
-"""Sensor 2 of the world: what a ring of calibrated cameras sees at a moment of a log, and which traffic elements.
+"""The camera sensor of the world: images of a ring of calibrated cameras, and the visible traffic elements.
 
-What does not move is drawn once for each log (`camera_stage`): the ground as a picture from above, the scenery, the
-sky. A moment places the road users (`camera_moment`), and every camera looks at all of it. Everything random is seeded
-by the log and by the camera's name, so that an image does not depend on which others are drawn.
+Static content is drawn once per log (`stage`): the ground texture, the scenery and the sky. A key frame adds the road
+users (`moment`), and each camera renders all of it. Random draws are seeded by the log and the camera's name, so an
+image does not depend on which others are drawn.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from tflane_jax.world.render.camera import FrontCamera
 from tflane_jax.world.render.exposure import develop
 from tflane_jax.world.render.weather import Weather
 
-# What a front-view picture of width 640 is to the rain and the lens.
+# Image width to which the strengths of rain streaks and lens blur refer, pixels.
 _PICTURE = 640.0
-# The rays of images up to so many pixels are remembered.
+# The rays of images up to this many pixels are cached.
 _FEW_PIXELS = 500_000
 
 
@@ -41,8 +41,8 @@ class ElementViews:
 
     Attributes:
         box: (E, 2, 2) top-left and bottom-right corners in pixels, cut at the border; arbitrary where not visible.
-        attribute: (E,) what each shows at this moment.
-        visible: (E,) in the image, facing the camera, not hidden for the most part, and large enough.
+        attribute: (E,) attribute of each at the key frame.
+        visible: (E,) in the image, facing the camera, not mostly occluded, and large enough.
     """
 
     box: Float[np.ndarray, "e 2 2"]
@@ -54,7 +54,7 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
     """Return the images of one key frame, all cameras of the rig in its order.
 
     Images smaller than the largest lie in the top-left corner of their array; the rest is black.
-    Raises UserError where the rig can make no images.
+    Raises UserError for an invalid rig.
     """
     cameras = draw_rig(log.seed, config)
     stage = stage_of(log, config)
@@ -80,15 +80,15 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
 def render_window(
     log: Log, keyframe: int, config: CameraRigConfig, corner: tuple[int, int], size: tuple[int, int], *, camera: int = 0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return a part of one camera's image of a key frame: as `render_cameras` draws it, but for its rain and noise.
+    """Return a part of one camera's image: as drawn by `render_cameras`, but with other rain and noise.
 
     Args:
         log, keyframe, config: as for `render_cameras`.
         corner: column and row of the part's upper left pixel.
         size: its width and height.
-        camera: of the rig, by number.
+        camera: index in the rig.
 
-    Raises UserError where the rig can make no images or the part does not lie in the image.
+    Raises UserError for an invalid rig or a part that is not inside the image.
     """
     whole = draw_rig(log.seed, config)[camera]
     (left, top), (width, height) = corner, size
@@ -105,10 +105,9 @@ def render_window(
 
 
 def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> ElementViews:
-    """Return where the map's lights and signs lie in the image of the rig's first camera, and which are seen.
+    """Return the boxes of the map's lights and signs in the image of the rig's first camera, and which are visible.
 
-    The answer comes from the geometry alone: it is the same at every scale, in every weather. Raises UserError where
-    the rig can make no images.
+    Visibility depends on geometry alone, not on scale or weather. Raises UserError for an invalid rig.
     """
     elements, attribute = log.map.elements, attributes_at(log, keyframe)
     camera = draw_rig(log.seed, config)[0]
@@ -133,7 +132,7 @@ def _cached_view(pixels: tuple[int, int, int], intrinsics: bytes, pose: bytes) -
 
 
 def _view(camera: FrontCamera, factor: int) -> View:
-    """Return what the pixels of an enlarged camera look at; the last few small cameras are remembered."""
+    """Return the rays and ground points of an enlarged camera; the last few small cameras are cached."""
     arguments = ((camera.width, camera.height, factor), camera.intrinsics.tobytes(), camera.camera_from_ego.tobytes())
     if camera.width * camera.height > _FEW_PIXELS:
         return _cached_view.__wrapped__(*arguments)
@@ -141,7 +140,7 @@ def _view(camera: FrontCamera, factor: int) -> View:
 
 
 def _draw(stage: Stage, moment: Moment, view: View, config: CameraRigConfig) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw sky, ground and bodies as one camera sees them."""
+    """Draw sky, ground and bodies for one camera."""
     import cv2
 
     weather = moment.weather
@@ -169,7 +168,7 @@ def _draw(stage: Stage, moment: Moment, view: View, config: CameraRigConfig) -> 
 
 
 def _ground_colour(moment: Moment, view: View, x: np.ndarray, y: np.ndarray) -> Float[np.ndarray, "h w 3"]:
-    """Return the ground's own colours; a finer ground replaces the coarser one near the vehicle."""
+    """Return the ground's albedo; near the vehicle a finer ground replaces the coarser one."""
     colour = None
     for ground in moment.grounds:
         shift = (moment.place - np.array(ground.window.low)).astype(np.float32)
@@ -191,7 +190,7 @@ def _ground_colour(moment: Moment, view: View, x: np.ndarray, y: np.ndarray) -> 
 def _develop(
     rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], camera: FrontCamera, weather: Weather, longest: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture at its own size as the camera delivers it; `longest` is the longer side of all it sees."""
+    """Return the delivered image at its own size; `longest` is the longer side of the camera's whole image."""
     import cv2
 
     if picture.shape[0] != camera.height:

@@ -1,8 +1,9 @@
-"""Convex bodies made of flat polygons, packed so that a camera sees all of them at once, drawn from far to near.
+"""Convex bodies made of flat polygons, packed into arrays and drawn from far to near.
 
-Distances do not tell which of two bodies hides the other: a long building beside the road is nearer than the car that
-stands before it. A plane between them does: whatever lies on the camera's side of it is never hidden by the rest
-(Schumacker et al. 1969). Every body brings an upright box, and the planes tried are the faces of these boxes.
+Distance does not decide which of two bodies hides the other: the centre of a long building beside the road may be
+nearer than a car in front of it. A separating plane does: bodies on the camera's side of it are never hidden by those
+beyond (Schumacker et al. 1969). Every body has an upright bounding box; the faces of these boxes are the candidate
+planes.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, Solid, clipped, 
 from tflane_jax.world.render.weather import Weather
 
 Box = tuple[float, float, float, float, float, float, float]
-# Boxes may reach into each other by this much and still be told apart, metres.
+# Boxes that overlap by less than this still count as separated, metres.
 _SLACK = 0.04
 _SIDES = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
 _CORNERS = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
 _OUTLINE = 18
-# Black of pictures: print is never quite black.
+# Display value of printed black.
 _INK = np.full((1, 3), 0.045)
 
 
@@ -44,8 +45,8 @@ class Bodies:
         blobs: (L, 4) centre and radius, metres.
         blob_colours: (L, 3).
         blob_owner: (L,).
-        pictures: (r, c) by the number of the polygon that shows it, top row first: 1 where it has its own colour, 0
-            where it is black. Such a polygon is a parallelogram, its lower left corner first as seen by a viewer.
+        pictures: (r, c) patterns by polygon index, top row first: 1 has the polygon's colour, 0 is black. Such a
+            polygon is a parallelogram; its first corner is the lower left one as seen from the front.
     """
 
     boxes: Float[np.ndarray, "b 7"]
@@ -60,7 +61,7 @@ class Bodies:
     pictures: Mapping[int, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
 
     def placed(self, xy: Float[np.ndarray, "#b 2"], yaw: Float[np.ndarray, " #b"]) -> Bodies:
-        """Return the bodies turned by `yaw` about the origin and then moved by `xy`, all alike or each by its own."""
+        """Return the bodies rotated by `yaw` about the origin, then moved by `xy`: one pose for all, or one each."""
         count = len(self.boxes)
         pose = np.broadcast_to(np.column_stack([xy, np.cos(yaw), np.sin(yaw)]), (count, 4))
         boxes = self.boxes.copy()
@@ -83,7 +84,7 @@ class Bodies:
         )
 
     def chosen(self, keep: Bool[np.ndarray, " b"]) -> Bodies:
-        """Return some of the bodies."""
+        """Return the bodies where `keep` is true."""
         number = np.cumsum(keep) - 1
         kept, blob = keep[self.owner], keep[self.blob_owner]
         counts = _counts(self.stops)
@@ -149,9 +150,9 @@ def draw_bodies(
     weather: Weather,
     edges: Literal["smooth", "hard"] = "smooth",
 ) -> None:
-    """Draw bodies given in the ego frame; `weather.sun` points in the ego frame as well.
+    """Draw bodies given in the ego frame; `weather.sun` is in the ego frame too.
 
-    Hard edges are faster, and enough where several pixels are averaged afterwards.
+    Hard edges are faster, and sufficient if the image is averaged down afterwards.
     """
     import cv2
 
@@ -204,17 +205,17 @@ def _far_to_near(
 
     Args:
         boxes: of the bodies.
-        eye: place of the camera.
-        low, high: corners of what each covers in the image; bodies that do not meet there need no order.
+        eye: position of the camera.
+        low, high: bounding boxes in the image; bodies whose boxes do not overlap need no order.
     """
     before = ~_cannot_hide(boxes, eye) & ((low[:, None] < high) & (low < high[:, None])).all(-1)
-    # [i, j]: i may hide j, and is therefore drawn after it. Where both may hide the other, distance decides.
+    # [i, j]: i may hide j and is drawn after it. If each may hide the other, distance decides.
     before &= ~before.T
     waits = before.sum(1)
     distance = np.hypot(boxes[:, 0] - eye[0], boxes[:, 1] - eye[1])
     left, order = np.ones(len(boxes), bool), []
     for _ in range(len(boxes)):
-        # Among bodies that hide each other in a circle, the farthest is drawn first.
+        # If bodies hide each other in a cycle, the farthest is drawn first.
         ready = left & (waits == 0)
         pick = int(np.argmax(np.where(ready if ready.any() else left, distance, -1.0)))
         order.append(pick)
@@ -260,7 +261,7 @@ def _with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
     right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-6)
     up = np.cross(right, away)
     angle = np.linspace(0.0, 2.0 * np.pi, _OUTLINE + 1)[:-1]
-    # Ragged like leaves, the same for the same place in the world whatever the direction of view.
+    # A ragged outline like leaves; it depends on the blob alone, not on the direction of view.
     ragged = (
         1.0
         + 0.13 * np.sin(5.0 * angle + 90.0 * bodies.blobs[:, 3:])
@@ -301,7 +302,7 @@ def _lit(
         lit += 0.6 * weather.night * beam * np.maximum(-(unit * toward).sum(-1), 0.0)
     factor = np.where(light > 0.0, np.maximum(light, lit), lit)
     clear = np.exp(-distance / weather.visibility)[:, None]
-    # What shines is seen farther than what is lit.
+    # Lamps are visible from farther away than lit surfaces.
     clear = np.where(light[:, None] > 0.5, np.sqrt(clear), clear)
     hazy = colours * factor[:, None] * clear + weather.horizon * (1.0 - clear)
     return np.round(255.0 * np.clip(hazy, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""What does not move in a log, drawn once for all its key frames: weather, paint, ground, scenery, sky, shadows."""
+"""Static content of a log, drawn once for all key frames: weather, paint, ground, scenery, sky, shadows."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from tflane_jax.world.cameras.solids import Bodies, footprints, join
 from tflane_jax.world.render.polygons import SHIFT
 from tflane_jax.world.render.weather import Weather
 
-# The ground is drawn to this distance from the key frames, with texels of this size; light on it with coarser ones;
-# metres.
+# Distance from the key frames up to which the ground is drawn, and its texel size; light and shadow have coarser
+# texels; metres.
 _REACH, _TEXEL = 90.0, 0.08
 SHADE_TEXEL = 0.25
-# Above this scale images show more of the sky than small ones do, and of the ground near the vehicle.
+# Above this image scale the sky, and the ground near the vehicle, are drawn at a finer resolution.
 LARGE = 0.25
 _MOST_WORN = 0.88
 
 
 class Stream(enum.IntEnum):
-    """What is drawn from which stream of a log."""
+    """The random streams of a log."""
 
     WEATHER = 0
     PAINT = 1
@@ -45,18 +45,19 @@ class Stream(enum.IntEnum):
 
 @dataclass(frozen=True)
 class Stage:
-    """What does not move in a log.
+    """Static content of a log.
 
     Attributes:
         weather: with its sun in the global frame.
         paint, scenery: of the map.
         static: scenery, masts and fiducial markers, global frame.
         panorama: of the sky.
-        shade: (h, w) uint8 share of sunlight that buildings and trees let pass, and `lamps` the light of street lamps;
-            both with texels of `SHADE_TEXEL` from `low`.
-        looks: (K, 8) what tells road users apart.
-        ground: of the surroundings of all key frames.
-        users: bodies of road users that were needed so far.
+        low: global x and y of the corner of `shade` and `lamps`, whose texels are `SHADE_TEXEL` metres.
+        shade: (h, w) uint8 fraction of sunlight left by buildings and trees.
+        lamps: (h, w) uint8 light of street lamps; None by day.
+        looks: (K, 8) random numbers that choose shape and colours of the road users.
+        ground: around all key frames.
+        users: cache of road users' bodies.
     """
 
     weather: Weather
@@ -76,8 +77,8 @@ _STAGES: dict[tuple[int, CameraRigConfig], Stage] = {}
 
 
 def stage_of(log: Log, config: CameraRigConfig) -> Stage:
-    """Return what does not move in a log, remembered for as long as the log lives."""
-    # Cameras and their calibration do not change the world.
+    """Return the static content of a log, cached for the lifetime of the log object."""
+    # Cameras and their calibration do not change the static content.
     key = id(log), replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0)
     if key not in _STAGES:
         _STAGES[key] = _set_stage(log, config)
@@ -89,7 +90,7 @@ def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
     weather = log_weather(
         log_stream(log, Stream.WEATHER), config.weather, weather=log.weather, severity=config.severity
     )
-    # However worn, some paint is left in the pores of the asphalt.
+    # Even fully worn lines keep some paint in the pores of the asphalt.
     wear = min(log.paint_wear * config.severity, 1.0) * _MOST_WORN
     paint = paint_of(log_stream(log, Stream.PAINT), log.map, paint_wear=wear, log_seed=log.seed)
     scenery = draw_scenery(log_stream(log, Stream.SCENERY), log.map, weather.night)
@@ -126,7 +127,7 @@ def log_stream(log: Log, stream: Stream) -> np.random.Generator:
 def _static_light(
     places: Float[np.ndarray, "n 2"], scenery: Scenery, weather: Weather
 ) -> tuple[Float[np.ndarray, "2"], UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None]:
-    """Return the shadows of buildings and trees and the light of street lamps on the ground, as `Stage` keeps them."""
+    """Return `low`, `shade` and `lamps` of `Stage`."""
     import cv2
 
     window = window_around(places, _REACH, SHADE_TEXEL)

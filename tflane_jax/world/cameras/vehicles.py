@@ -1,4 +1,4 @@
-"""Road users as the ring cameras see them: bodies of flat polygons in the frame of their own box, from every side."""
+"""Polygon models of road users for the ring cameras, complete from every side, in the frame of their box."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ Parts = list[tuple[Solid, Box]]
 def road_user(
     category: int, size: Float[np.ndarray, "3"], look: Float[np.ndarray, "8"], night: float, pace: float = 0.0
 ) -> Parts:
-    """Return the bodies of a road user that stands at the origin and heads along x.
+    """Return the bodies of a road user at the origin that heads along x.
 
     Args:
         category: `RoadUser`.
         size: length, width, height, metres.
-        look: numbers from 0 to 1 that tell it from others of its kind.
-        night: 0 to 1, how brightly its lamps shine.
-        pace: where in its step a walker is, 0 to 1.
+        look: random numbers from 0 to 1 that choose shape and colours.
+        night: 0 to 1, brightness of its lamps.
+        pace: phase of a walker's step, 0 to 1.
     """
     length, width, height = (float(value) for value in size)
     if category == RoadUser.TRUCK:
@@ -201,7 +201,7 @@ def _bus(solid: Solid, length: float, width: float, height: float, look: np.ndar
 
 
 def _two_wheeler(solid: Solid, length: float, height: float, look: np.ndarray, night: float, motor: bool) -> None:
-    """Add a machine with its rider; wheels are discs seen from the sides and slats seen along the road."""
+    """Add a two-wheeler with its rider; each wheel is a disc seen from the side and a slat seen along the road."""
     x0, x1 = -0.5 * length, 0.5 * length
     paint, coat = _pick(PAINTS, look[0]), _pick(_CLOTHES, look[1])
     radius, thick = (0.31, 0.08) if motor else (0.34, 0.025)

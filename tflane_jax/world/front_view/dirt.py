@@ -1,4 +1,4 @@
-"""What lies on asphalt and is no lane line: seams, tyre marks, cracks, patches, joints, arrows."""
+"""Distractors on the asphalt: seams, tyre marks, cracks, patches, joints and arrows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tflane_jax.world.render.polygons import SHIFT, fixed_point
 
 TRACK = 0.85  # half the distance between the wheels of a car, metres
 _SKID = (0.12, 0.12, 0.12)
-# Nearer ground is not drawn on, metres.
+# Nothing is drawn on nearer ground, metres.
 _NEAREST = 2.0
 _ARROW = np.array([[0.0, -0.08], [2.6, -0.08], [2.6, -0.35], [4.2, 0.0], [2.6, 0.35], [2.6, 0.08], [0.0, 0.08]])
 

@@ -1,4 +1,4 @@
-"""The ground below every pixel: which station and offset of the road it shows, and how large it is there."""
+"""Inverse projection of a front view: road coordinates (station, offset) and depth of the ground at every pixel."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tflane_jax.world.front_view.road import Highway
 from tflane_jax.world.render.camera import FrontCamera, lift
 from tflane_jax.world.roads.curves import ReferenceLine
 
-# Columns between those in which the road is looked up; offsets are all but linear there.
+# Road coordinates are computed in every such column and interpolated linearly in between.
 _COLUMNS = 16
-# Beyond this distance the ground is not looked up any more, metres.
+# Road coordinates are clamped beyond this distance, metres.
 FAR = 400.0
 _NEWTON_STEPS = 4
 
@@ -23,7 +23,7 @@ class Ground:
     """The rows of an image below its horizon. Arrays are float32.
 
     Attributes:
-        first_row: of the image that row 0 of the arrays is.
+        first_row: image row of row 0 of the arrays.
         s, offset: (h, w) station and offset of the road at each pixel's centre, metres.
         depth: (h, w) along the optical axis, metres; `_BEYOND` where a pixel shows no ground.
         length: (h,) metres of road that a row covers.
@@ -45,7 +45,7 @@ _BEYOND = 20_000.0
 
 
 def look_at_ground(camera: FrontCamera, axis: ReferenceLine) -> Ground:
-    """Return what ground each pixel shows."""
+    """Return the ground seen at each pixel."""
     knots = np.arange(0, camera.width + _COLUMNS, _COLUMNS) + 0.5
     horizon = camera.horizon_rows(np.array([0.0, camera.width])).min()
     first = int(np.clip(np.floor(horizon), 0, camera.height - 1))
@@ -53,7 +53,7 @@ def look_at_ground(camera: FrontCamera, axis: ReferenceLine) -> Ground:
     pixels = np.stack(np.meshgrid(knots, rows), -1)
     xy, seen = camera.ground_at(pixels.reshape(-1, 2))
     distance = np.where(seen, np.hypot(xy[:, 0], xy[:, 1]), FAR)
-    # Beyond, the ground keeps its direction and comes nearer, so that all stations are on the axis.
+    # Farther points are moved to distance FAR along their rays, so that all stations lie on the axis.
     s, offset = road_coordinates(axis, xy * np.minimum(1.0, FAR / np.maximum(distance, 1e-9))[:, None])
     coarse = np.stack([s, offset]).reshape(2, *pixels.shape[:2]).astype(np.float32)
     length = np.abs(np.gradient(coarse[0, :, len(knots) // 2]))
@@ -80,7 +80,7 @@ def road_coordinates(
     table = np.concatenate([axis.xy, axis.heading[:, None]], 1)
 
     def from_axis(s):
-        """Return how far ahead of station s, and to its right, the points lie."""
+        """Return the coordinates of the points in the axis frame at s: ahead and to the right."""
         place = (s - start) / spacing
         index = np.clip(place.astype(int), 0, last)
         base = table[index]
@@ -98,16 +98,16 @@ def road_coordinates(
 def image_columns(
     camera: FrontCamera, road: Highway, offset: Float[np.ndarray, " n"], rows: Float[np.ndarray, " r"], reach: float
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, " r"]]:
-    """Return where a line along the road crosses image rows: columns, and stations there.
+    """Return where a line along the road crosses image rows: columns and stations.
 
     Args:
-        camera: that looks.
+        camera: of the image.
         road: whose axis the line follows.
         offset: of the line at the axis' vertices.
         rows: v, pixels, ascending.
         reach: the line ends at this station.
 
-    Both are NaN in rows that the line does not reach.
+    Both results are NaN in rows that the line does not reach.
     """
     axis = road.axis
     keep = axis.s <= reach
@@ -118,7 +118,7 @@ def image_columns(
         ground, s = np.concatenate([ground, end]), np.append(s, reach)
     pixels, depth = camera.image_of(lift(ground))
     seen = depth > 1.0
-    # Farther is higher in the image.
+    # Farther points are higher in the image.
     u, v, s = pixels[seen, 0][::-1], pixels[seen, 1][::-1], s[seen][::-1]
     if len(v) < 2:
         return np.full(len(rows), np.nan), np.full(len(rows), np.nan)

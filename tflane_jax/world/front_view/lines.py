@@ -1,4 +1,4 @@
-"""Which lane lines a TuSimple annotator would mark in a front view, and where they lie in the image."""
+"""TuSimple labels of a front view: which lane lines are annotated, and their points in the image."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from tflane_jax.world.front_view.ground import image_columns
 from tflane_jax.world.front_view.road import Highway
 from tflane_jax.world.render.camera import FrontCamera
 
-# TuSimple's rows, as shares of the image's height: 160, 170, ..., 710 of 720.
+# TuSimple's rows, as fractions of the image's height: 160, 170, ..., 710 of 720.
 ROWS = np.arange(160, 720, 10) / 720.0
 CAPACITY = 8
-# Two lines on each side of the vehicle are marked; a fifth where it drives this near to one, metres.
+# Two lines on each side of the vehicle are annotated; five if it is nearer than this to a line, metres.
 _ON_LINE = 0.6
 _MOST = 5
-# A line of fewer points is not marked.
+# A line with fewer points is not annotated.
 _FEWEST_POINTS = 3
 
 
 def label_lines(camera: FrontCamera, road: Highway, reach: float) -> LaneLines:
-    """Return the lane lines in the image, left to right: through vehicles, dashes and wear alike.
+    """Return the lane lines in the image, left to right; occlusion, dashes and wear leave no gaps.
 
     Args:
-        camera: that looks.
-        road: on which the ego drives.
-        reach: lines are marked up to this station, metres.
+        camera: of the image.
+        road: with its lane lines.
+        reach: lines are annotated up to this station, metres.
     """
     lines = LaneLines.empty(CAPACITY, len(ROWS))
     lines.points[..., 1] = ROWS
@@ -40,7 +40,7 @@ def label_lines(camera: FrontCamera, road: Highway, reach: float) -> LaneLines:
 
 
 def marked_lines(road: Highway) -> Int[np.ndarray, " k"]:
-    """Return the numbers of the lines that are marked, left to right."""
+    """Return the indices of the annotated lines, left to right."""
     here = np.array([np.interp(0.0, road.axis.s, line) for line in road.lines]) - road.ego_offset
     there = np.array([np.interp(0.0, road.axis.s, line) for line in road.present.astype(float)]) > 0.5
     numbers, beside = np.flatnonzero(there), here[there]
@@ -51,7 +51,7 @@ def marked_lines(road: Highway) -> Int[np.ndarray, " k"]:
     else:
         right = int(np.argmax(beside > 0.0))
         chosen = numbers[(order >= right - 2) & (order <= right + 1)]
-    # The line at which a lane opens ahead lies between two that are marked, or is not.
+    # The line of a lane that opens ahead is annotated if it lies between two annotated lines.
     later = np.flatnonzero(~there)
     return np.sort(np.append(chosen, later[(later > chosen[0]) & (later < chosen[-1])]))[:_MOST]
 
@@ -59,7 +59,7 @@ def marked_lines(road: Highway) -> Int[np.ndarray, " k"]:
 def _points(
     camera: FrontCamera, road: Highway, number: int, reach: float
 ) -> tuple[Float[np.ndarray, " p"], Bool[np.ndarray, " p"]]:
-    """Return u (share of the width) of one line at `ROWS`, and where it has a point."""
+    """Return u (fraction of the width) of one line at `ROWS`, and where it has a point."""
     u, s = image_columns(camera, road, road.lines[number], ROWS * camera.height, reach)
     there = np.interp(np.nan_to_num(s), road.axis.s, road.present[number].astype(float)) > 0.5
     u = u / camera.width

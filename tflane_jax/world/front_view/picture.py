@@ -24,13 +24,13 @@ def light_ground(
     ground: Ground,
     weather: Weather,
 ) -> None:
-    """Turn the ground's own colours into lit and hazy ones, in place."""
+    """Apply light, shadows, haze and wet reflections to the ground's albedo, in place."""
     light, open_sky = _shadows(traffic, roadside, road, camera, ground, weather)
     light *= weather.direct
     open_sky *= weather.ambient
     light += open_sky
     if weather.night:
-        # Two beams on the road before the ego, wider with distance.
+        # The headlight beam on the road ahead of the ego widens with distance.
         near = ground.depth / HEADLIGHTS
         lateral = (ground.offset - np.float32(road.ego_offset)) / (3.0 + 0.12 * ground.depth)
         light += weather.night * 0.75 * np.exp(-near * near - lateral * lateral)
@@ -48,7 +48,7 @@ def light_ground(
 
 
 def show_ground(image: UInt8[np.ndarray, "h w 3"], colour: Float[np.ndarray, "3 k w"], ground: Ground) -> None:
-    """Put the ground's colours into the picture, below the horizon."""
+    """Copy the ground's colours into the image, below the horizon."""
     import cv2
 
     shown = cv2.convertScaleAbs(cv2.merge(list(colour)), alpha=255.0)
@@ -58,7 +58,7 @@ def show_ground(image: UInt8[np.ndarray, "h w 3"], colour: Float[np.ndarray, "3 
 def _shadows(
     traffic: FrontTraffic, roadside: Roadside, road: Highway, camera: FrontCamera, ground: Ground, weather: Weather
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share of direct and of ambient light that reaches the ground (0 to 1)."""
+    """Return the fractions of direct and of ambient light that reach the ground (0 to 1)."""
     import cv2
 
     shape = (camera.height - ground.first_row, camera.width)
@@ -107,7 +107,7 @@ def _fill(
 
 
 def draw_backdrop(rng: np.random.Generator, camera: FrontCamera, weather: Weather) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the sky with clouds, the sun's glow, hills and woods on the horizon."""
+    """Return an image of the sky with clouds and the sun's glow, and of hills and woods on the horizon."""
     import cv2
 
     w, h = camera.width, camera.height

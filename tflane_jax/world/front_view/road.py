@@ -1,8 +1,7 @@
-"""Motorways and trunk roads as a camera in the traffic sees them: axis, lane lines, paint, surfaces.
+"""Motorways and trunk roads of front views: axis, lane lines, paint and edges of the pavement.
 
-The road is made of the world's own curves and cross-sections: a clothoid axis, which is the left edge line of the ego's
-carriageway, and lines at offsets from it (metres to the right), which may vary along it where a lane opens or closes.
-Everything lies in the ego frame of the moment, on flat ground.
+The axis is a clothoid along the left edge line of the ego's carriageway. Lines lie at offsets from it (metres to the
+right), which vary where a lane opens or closes. Everything is in the ego frame, on flat ground.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from tflane_jax.world.roads.curves import ReferenceLine, clothoid_line
 # Where the drawn road starts and ends, metres along its axis; beyond, haze and horizon hide it.
 _START, _END = -12.0, 420.0
 _SPACING = 1.0
-# Curvature has faded this far ahead, so that no road runs in circles.
+# Curvature fades to 0 between these stations, so that no road closes a circle, metres.
 _FADE = (220.0, 330.0)
-# An opening lane has a line of its own where this share of its width is there.
+# An opening lane has its own line where it has more than this fraction of its full width.
 _SEPARATED = 0.5
 
 Colour = tuple[float, float, float]
@@ -31,7 +30,7 @@ YELLOW: Colour = (0.88, 0.68, 0.2)
 
 
 class Beside(enum.Enum):
-    """What ends a carriageway on one side."""
+    """Kinds of edge of a carriageway."""
 
     VERGE = "grass or earth"
     BARRIER = "concrete wall"
@@ -40,18 +39,18 @@ class Beside(enum.Enum):
 
 @dataclass(frozen=True)
 class HighwayConfig:
-    """Measures and probabilities of front-view roads. Lengths in metres.
+    """Dimensions and probabilities of front-view roads. Lengths in metres.
 
     Attributes:
         lanes: relative frequency of 2, 3, 4 and 5 lanes on the ego's carriageway.
         lane_width: of all its lanes.
-        between: probability that the ego keeps to a lane between two others where there is one.
+        between: probability that the ego drives on an inner lane where there is one.
         straight: probability of a straight road.
         radius: of curves at the ego; their inverse is drawn uniformly.
         curvature_change: largest change of the curvature within 100 m, 1/m.
         sway: standard deviation of the ego's distance from the middle of its lane.
-        lane_change: probability that the ego is anywhere across its lane.
-        two_way: probability that oncoming traffic is only a double line away.
+        lane_change: probability that the ego's lateral position in its lane is uniform.
+        two_way: probability of an undivided road with oncoming traffic beyond a double line.
         extra_lane: probability that a lane opens or closes on the right within sight.
         inner_shoulder, outer_shoulder: beside the edge lines.
         opposite: distance between the edge lines of the two carriageways.
@@ -74,14 +73,14 @@ class HighwayConfig:
 
 @dataclass(frozen=True)
 class Stripe:
-    """Something long and narrow on the ground that follows the road: paint, a seam, a tyre mark.
+    """A narrow strip on the ground along the road: paint, a seam, a tyre mark.
 
     Attributes:
         offset: (n,) of its middle at the axis' vertices.
         width: metres.
         colour: linear RGB, 0 to 1.
         opacity: (n,) 0 to 1 at the axis' vertices.
-        period, dash, phase: it is there for `dash` of every `period` metres, starting at `phase`; period 0: always.
+        period, dash, phase: dashes of `dash` metres every `period` metres, from `phase` on; period 0: solid.
     """
 
     offset: Float[np.ndarray, " n"]
@@ -95,18 +94,18 @@ class Stripe:
 
 @dataclass(frozen=True)
 class Highway:
-    """One road, seen from the ego's place on it.
+    """One road in the ego frame.
 
     Attributes:
         axis: left edge line of the ego's carriageway; n vertices, station 0 beside the ego.
         ego_offset: of the ego.
         lane_width: metres.
         lines: (k, n) offsets of the lane lines of the ego's carriageway, left to right.
-        present: (k, n) where each line is there.
+        present: (k, n) where each line exists.
         paint: the lines' paint, and that of the opposite carriageway.
         lanes: (l,) offsets of the middles of the lanes on the ego's carriageway.
         oncoming: (o,) those of the opposite carriageway.
-        left, right: what ends the carriageway, and its offset; left of it lies the median.
+        left, right: kind of edge of the carriageway, and its offset; the median is to the left.
         edges: (4,) offsets of the pavement: opposite carriageway from, to; own from, to. Equal where there is none.
     """
 
@@ -134,7 +133,7 @@ def draw_highway(rng: np.random.Generator, config: HighwayConfig, wear: float) -
     Args:
         rng: stream.
         config: what to draw.
-        wear: 0 (fresh paint) to 1 (some of it gone).
+        wear: 0 (fresh paint) to 1 (partly gone).
     """
     count = 2 + int(rng.choice(4, p=np.asarray(config.lanes) / np.sum(config.lanes)))
     width = rng.uniform(*config.lane_width)
@@ -255,7 +254,7 @@ _DASH_SHARE = (0.3, 0.15, 0.15, 0.12, 0.12, 0.08, 0.08)
 
 
 def _worn(rng: np.random.Generator, n: int, wear: float) -> Float[np.ndarray, " n"]:
-    """Draw how much paint is left along a line: here and there less, seldom hardly any."""
+    """Draw the opacity of a worn line: lower in places, and rarely almost 0 everywhere."""
     base = 1.0 - wear * rng.uniform(0.0, 0.6)
     coarse = rng.uniform(0.0, 1.0, n // 12 + 2)
     waves = np.interp(np.arange(n) / 12.0, np.arange(len(coarse)), coarse)

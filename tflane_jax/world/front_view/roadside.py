@@ -1,4 +1,4 @@
-"""What stands beside and above the road of a front view: walls, rails, trees, lamps, signs, bridges, buildings."""
+"""Roadside objects of a front view: walls, rails, trees, lamps, signs, bridges, buildings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tflane_jax.world.render.camera import lift
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.render.shapes import box
 
-# Long things are cut at these stations, so that each piece can be hidden by, and hide, what stands beside it.
+# Long objects are cut at these stations, so that each piece is sorted by its own distance when drawn, metres.
 _CUTS = np.array([-9.0, -3.0, 3.0, 8.0, 14.0, 22.0, 34.0, 52.0, 80.0, 120.0, 180.0, 280.0])
 _CONCRETE = (0.6, 0.59, 0.56)
 _STEEL = (0.62, 0.64, 0.66)
@@ -21,10 +21,10 @@ _POST = (0.4, 0.41, 0.42)
 
 @dataclass(frozen=True)
 class Roadside:
-    """Solids beside the road, and the shadows that some of them throw on it.
+    """Solids beside the road, and the objects among them that cast shadows on it.
 
     Attributes:
-        solids: to be drawn.
+        solids: of all objects.
         crowns: (t, 4) x, y, height of the middle and radius of tree crowns, metres.
         bridges: station and half length along the road of each bridge.
     """
@@ -35,7 +35,7 @@ class Roadside:
 
 
 def draw_roadside(rng: np.random.Generator, road: Highway) -> Roadside:
-    """Draw what stands beside the road; the same stream and road give the same bits."""
+    """Draw the roadside objects; the same stream and road give the same bits."""
     solids: list[Solid] = []
     for (kind, offset), hand in ((road.left, -1.0), (road.right, 1.0)):
         if kind is Beside.BARRIER:
@@ -67,7 +67,7 @@ def _sheet(road: Highway, s0: float, s1: float, offset: float, hand: float, z: t
     high = lift(base, z[1])
     # Counter-clockwise as seen from the road.
     ring = np.concatenate([low[::-1], high])
-    # The first three corners tell which way it faces, so they must not lie on one line.
+    # The first three corners define the normal, so they must not be collinear.
     return np.roll(ring if hand > 0 else ring[::-1], 1, axis=0)
 
 

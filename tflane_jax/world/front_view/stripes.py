@@ -1,4 +1,4 @@
-"""Drawing what is long and narrow on the ground, each pixel by the share of it that is covered."""
+"""Drawing stripes on the ground with exact pixel coverage (antialiasing)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from tflane_jax.world.render.camera import FrontCamera
 def draw_stripe(
     colour: Float[np.ndarray, "3 h w"], stripe: Stripe, camera: FrontCamera, road: Highway, ground: Ground
 ) -> None:
-    """Blend a stripe into the ground's colours, each pixel by the share of it that the stripe covers."""
+    """Blend a stripe into the ground's colours, weighted by the fraction of each pixel that it covers."""
     h, w = colour.shape[1:]
     rows = ground.first_row + np.arange(h + 1) + 0.5
     left, _ = image_columns(camera, road, stripe.offset - 0.5 * stripe.width, rows, FAR)
     right, s = image_columns(camera, road, stripe.offset + 0.5 * stripe.width, rows, FAR)
     middle = 0.5 * (left + right)
-    # A pixel sees as far to its sides as the stripe moves within its row; whole pixels, so that no paint is lost.
+    # Blur by the sideways shift of the stripe within a row, in whole pixels so that the total coverage is kept.
     blur = np.maximum(1.0, np.round(np.abs(np.diff(middle))))
     length = np.maximum(np.abs(np.diff(s)), 1e-3)
     left, right, s = left[:-1], right[:-1], s[:-1]
@@ -46,7 +46,7 @@ def draw_stripe(
 def _dashed(
     s: Float[np.ndarray, " k"], length: Float[np.ndarray, " k"], period: float, dash: float
 ) -> Float[np.ndarray, " k"]:
-    """Return the share of dashes in a stretch of road about each station."""
+    """Return the painted fraction of a stretch of road about each station."""
 
     def painted(x):
         whole = np.floor(x / period)

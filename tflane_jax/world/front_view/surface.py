@@ -1,4 +1,4 @@
-"""The drawn ground: grass, asphalt, paint, wear and dirt, as colours per pixel."""
+"""Colours of the ground of a front view: grass, asphalt, paint, wear and dirt."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tflane_jax.world.front_view.stripes import draw_stripe
 from tflane_jax.world.render.camera import FrontCamera
 from tflane_jax.world.render.noise import TILE, noise_tile
 
-# The profile across the road is tabled at this spacing, metres, to this offset on either side.
+# Spacing of the tabulated colours across the road, and the largest offset on either side, metres.
 _STEP, _WIDEST = 0.04, 80.0
 _GRASS = ((0.30, 0.35, 0.18), (0.36, 0.38, 0.22), (0.42, 0.38, 0.26), (0.25, 0.3, 0.16), (0.5, 0.44, 0.32))
 
@@ -20,11 +20,11 @@ _GRASS = ((0.30, 0.35, 0.18), (0.36, 0.38, 0.22), (0.42, 0.38, 0.26), (0.25, 0.3
 def paint_ground(
     rng: np.random.Generator, camera: FrontCamera, road: Highway, ground: Ground, *, dirt: float, wet: float
 ) -> Float[np.ndarray, "3 h w"]:
-    """Return the colours of the ground in full even light, for the rows of `ground`.
+    """Return the albedo of the ground (colours in full even light) for the rows of `ground`.
 
     Args:
         rng: stream of colours, dirt and texture.
-        camera, road, ground: what is seen.
+        camera, road, ground: of the view.
         dirt: 0 (a spotless road) to 1.
         wet: 0 to 1.
     """

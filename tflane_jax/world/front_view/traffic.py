@@ -1,4 +1,4 @@
-"""Vehicles on the road of a front view: where they are, and where they keep light from the ground."""
+"""Vehicles of a front view: positions, and their shadows on the ground."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FrontTrafficConfig:
     Attributes:
         empty: probability of a road without traffic.
         density: vehicles per metre of lane.
-        clear_ahead: free road before the ego, metres.
+        clear_ahead: free road ahead of the ego, metres.
         categories: relative frequencies of cars, trucks, buses and motorcycles.
     """
 
@@ -43,7 +43,7 @@ class FrontTraffic:
         yaw: (k,) radians.
         size: (k, 3) length, width, height, metres.
         category: (k,) `RoadUser`.
-        look: (k, 4) 0 to 1: colour, shape and the like.
+        look: (k, 4) 0 to 1, random numbers that choose colour and shape.
     """
 
     xy: Float[np.ndarray, "k 2"]
@@ -86,7 +86,7 @@ def draw_traffic(rng: np.random.Generator, road: Highway, config: FrontTrafficCo
 def ground_shadows(
     traffic: FrontTraffic, sun: Float[np.ndarray, "3"]
 ) -> tuple[list[Float[np.ndarray, "8 2"]], list[Float[np.ndarray, "4 2"]]]:
-    """Return corners of what each vehicle shades from the sun (to be made convex), and of the dark below it."""
+    """Return points whose convex hull is the cast shadow of each vehicle, and corners of the dark area below it."""
     cast, below = [], []
     for xy, yaw, size in zip(traffic.xy, traffic.yaw, traffic.size, strict=True):
         corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1.0]]) * size[:2]

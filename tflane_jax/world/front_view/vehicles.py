@@ -1,4 +1,4 @@
-"""Cars, trucks, buses and motorcycles of a front view, as polygons."""
+"""Polygon models of cars, trucks, buses and motorcycles of a front view."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _solid(traffic: FrontTraffic, number: int, night: float) -> Solid:
 
 
 def _tyres(solid: Solid, places: tuple[float, ...], half: float, radius: float, width: float) -> None:
-    """Add what is seen of the wheels from behind and before."""
+    """Add the tyres as seen from behind and from the front."""
     for x, rear in ((min(places) - radius, True), (max(places) + radius, False)):
         for low, high in ((-half, width - half), (half - width, half)):
             panel(solid, x, (low, high), (0.0, radius), rear, RUBBER)

@@ -1,7 +1,7 @@
-"""Front views of the built-in world: one integer, one picture of a road from a moving car, and its lane lines.
+"""Front views of the built-in world: an image of a highway and its lane lines for every scene number.
 
-A scene is drawn from streams `np.random.default_rng([ROOT, scene id, stream])`: camera, road, traffic, roadside,
-weather and the picture's own texture and noise each have one, so that a change of one leaves the others as they were.
+Random draws come from streams `np.random.default_rng([ROOT, scene id, stream])`, one each for camera, road, traffic,
+roadside, weather, texture and noise, so that a change of one part does not change the others.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ROOT = 20_250_713
 
 
 class Stream(enum.IntEnum):
-    """What is drawn from which stream of a scene."""
+    """The random streams of a scene."""
 
     CAMERA = 0
     ROAD = 1
@@ -49,8 +49,8 @@ class FrontWorldConfig:
 
     Attributes:
         camera, road, traffic, weather: its parts.
-        severity: 0 (clear sky, fresh paint, clean asphalt, a perfect camera) to 1 (all that can go wrong).
-        reach: lane lines are marked up to this distance along the road, metres.
+        severity: 0 (clear sky, fresh paint, clean asphalt, a perfect camera) to 1 (all degradations at full strength).
+        reach: lane lines are annotated up to this distance along the road, metres.
     """
 
     camera: FrontCameraConfig = FrontCameraConfig()
@@ -63,7 +63,7 @@ class FrontWorldConfig:
 
 @dataclass(frozen=True)
 class FrontScene:
-    """What stands before the camera at one moment, in the ego frame."""
+    """The content of one image, in the ego frame."""
 
     camera: FrontCamera
     road: Highway
@@ -75,7 +75,7 @@ class FrontScene:
 def draw_front_scene(scene_id: int, config: FrontWorldConfig = FrontWorldConfig()) -> FrontScene:
     """Return the scene with this number (not negative).
 
-    Raises UserError where the severity is not between 0 and 1.
+    Raises UserError if the severity is not between 0 and 1.
     """
     if not 0.0 <= config.severity <= 1.0:
         raise UserError(f"severity must be between 0 and 1, not {config.severity}")

@@ -13,20 +13,20 @@ from tflane_jax.world.render.weather import Weather
 
 @functools.cache
 def _grain() -> Float[np.ndarray, " n"]:
-    """Return standard normal noise, the same in every process: drawing it anew for every picture takes longer."""
+    """Return standard normal noise, the same in every process; drawing it anew for every image would be slower."""
     return np.random.default_rng(20_250_714).standard_normal(1 << 21, np.float32)
 
 
 def develop(
     rng: np.random.Generator, image: UInt8[np.ndarray, "h w 3"], weather: Weather, scale: float = 1.0
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture that the camera makes: rain, blur, exposure, contrast, tint, noise.
+    """Return the delivered image after rain streaks, blur, exposure, contrast, tint and noise.
 
     Args:
         rng: stream of rain and noise.
-        image: what falls on the lens; rain is added to it in place.
+        image: light at the lens; rain streaks are added to it in place.
         weather: with the camera's tone.
-        scale: size of the raindrops' streaks; 1 suits images of 640 x 360.
+        scale: length of the rain streaks; 1 for images of 640 x 360.
     """
     import cv2
 

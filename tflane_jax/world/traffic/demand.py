@@ -1,4 +1,4 @@
-"""Who wants to drive where, and when: trips of vehicles and bicycles over the lanes of a network."""
+"""Traffic demand: routes and entry times of vehicles and bicycles on a lane network."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from tflane_jax.scene import RoadUser
 from tflane_jax.world.traffic.lane_table import LaneTable
 from tflane_jax.world.traffic.vehicles import Drivers, draw_drivers
 
-# Shortest time between two vehicles that enter by one lane, seconds, and the most that a lane can take, 1/s.
+# Shortest time between two vehicles that enter on one lane, seconds, and the largest inflow of a lane, 1/s.
 _SHORTEST_HEADWAY, _LANE_CAPACITY = 1.9, 0.4
-# The most that enters over all lanes towards junctions without and with signals, 1/s: more would only make queues grow.
+# Largest total inflow towards junctions without and with signals, 1/s: more would only make queues grow.
 _JUNCTION_CAPACITY, _SIGNAL_CAPACITY = 0.45, 0.7
-# Ways that turn by more than this are chosen a third as often, radians.
+# Branches that turn by more than this are chosen a third as often, radians.
 _STRAIGHT = np.deg2rad(35.0)
 # Bicycles share the lane where traffic is not faster than this, m/s.
 _SHARED_LANE_SPEED = 15.0
@@ -24,13 +24,13 @@ _LONGEST_ROUTE = 24
 
 @dataclass(frozen=True)
 class Routes:
-    """Ways of N trips through S segments; distances along a way start at 0 where its first segment starts.
+    """Routes of N trips through S segments; distances along a route start at 0 at its first segment.
 
     Attributes:
         segment: (N, L) segment indices; arbitrary beyond the end.
         start: (N, L) distance at which each begins; inf beyond the end.
-        length: (N,) of the whole way, metres.
-        distance: (N, S) distance at which a segment begins on the way; inf where the way does not use it.
+        length: (N,) of the whole route, metres.
+        distance: (N, S) distance at which a segment begins on the route; inf for segments not on it.
     """
 
     segment: Int[np.ndarray, "n l"]
@@ -39,11 +39,11 @@ class Routes:
     distance: Float[np.ndarray, "n s"]
 
     def take(self, rows: Int[np.ndarray, " m"]) -> Routes:
-        """Return the ways of some trips."""
+        """Return the routes of some trips."""
         return Routes(self.segment[rows], self.start[rows], self.length[rows], self.distance[rows])
 
     def place(self, distance: Float[np.ndarray, "n *b"]) -> tuple[Int[np.ndarray, "n *b"], Float[np.ndarray, "n *b"]]:
-        """Return the segments and the stations on them of distances along each way."""
+        """Return segments and stations at distances along each route."""
         n = len(self.start)
         extra = (1,) * (distance.ndim - 1)
         leg = (self.start.reshape(n, *extra, self.start.shape[1]) <= distance[..., None]).sum(-1) - 1
@@ -57,9 +57,10 @@ class Trips:
     """N trips. The first is the ego vehicle's.
 
     Attributes:
-        routes: their ways.
-        drivers: who drives.
-        enters: (N,) time at which each passes the start of its way, seconds; inf for the ego vehicle, which is put in.
+        routes: of the trips.
+        drivers: of the trips.
+        enters: (N,) time at which each passes the start of its route, seconds; inf for the ego vehicle, which is placed
+            separately.
     """
 
     routes: Routes
@@ -85,8 +86,8 @@ def draw_trips(
         table: lanes.
         ego_way: segment indices that the ego vehicle must drive first.
         start, stop: seconds.
-        vehicles_per_metre: mean density wanted on a lane in free flow.
-        bicycles_per_metre: the same for bicycles on bike lanes, and at the edge of outer lanes where there are none.
+        vehicles_per_metre: target density on a lane in free flow.
+        bicycles_per_metre: the same for bicycles on bike lanes; at half the fraction, at the edge of slow outer lanes.
         category_share: motor vehicles by category.
     """
     categories, shares = zip(*category_share, strict=True)
@@ -118,13 +119,13 @@ def draw_trips(
         ways += [_continue(rng, table, (lane,)) for _ in times]
     when = np.concatenate([[np.inf], *enters])
     drivers = draw_drivers(rng, np.concatenate([[int(RoadUser.CAR)], *category]).astype(np.int32))
-    # Cyclists without a lane of their own keep to the right edge.
+    # Cyclists without a bike lane keep to the right edge.
     drivers.offset[np.concatenate([[False], *edge])] -= 0.85
     return Trips(_routes(ways, table), drivers, when)
 
 
 def _lane_capacity(table: LaneTable, lanes: int) -> float:
-    """Return the flow that each of the lanes into the network can take, 1/s."""
+    """Return the inflow of each lane into the network, 1/s."""
     if not table.is_gate.any():
         return _LANE_CAPACITY
     junction = _SIGNAL_CAPACITY if (table.intersection >= 0).any() else _JUNCTION_CAPACITY
@@ -138,14 +139,14 @@ def _arrivals(rng: np.random.Generator, start: float, stop: float, flow: float) 
     mean = 1.0 / flow
     count = int((stop - start) / _SHORTEST_HEADWAY) + 1
     gaps = _SHORTEST_HEADWAY + rng.exponential(mean - _SHORTEST_HEADWAY, count)
-    # The first gap is a random part of one, so that lanes are not in step.
+    # The first gap is a random part of a gap, so that lanes are not synchronised.
     gaps[0] *= rng.random()
     times = start + np.cumsum(gaps)
     return times[times < stop]
 
 
 def _continue(rng: np.random.Generator, table: LaneTable, way: tuple[int, ...]) -> tuple[int, ...]:
-    """Return a way continued by random choices to the border of the map; no segment comes twice."""
+    """Return a route continued by random choices to the border of the map, without repeating a segment."""
     out = list(way)
     choices = rng.random(_LONGEST_ROUTE)
     for choice in choices[: max(_LONGEST_ROUTE - len(out), 0)]:

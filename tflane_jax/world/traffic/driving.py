@@ -1,4 +1,4 @@
-"""One time step of driving: what drivers follow, stop for and let pass, and how hard they brake for it.
+"""Accelerations of drivers in one time step: car-following, merging, stop lines, priority and crossings.
 
 Car-following is the Intelligent Driver Model (Treiber, Hennecke, Helbing 2000, Eqs. 3-5): acceleration
 a [1 - (v / v0)^4 - (s* / s)^2] with the desired gap s* = s0 + v T + v dv / (2 sqrt(a b)).
@@ -17,25 +17,25 @@ from tflane_jax.world.traffic.pedestrians import CrossingPlaces
 
 # IDM: gap kept at rest (metres), comfortable braking (m/s^2); and the hardest braking of all.
 _REST_GAP, _BRAKING, _HARDEST = 2.0, 2.0, 7.0
-# A driver stops for a light that turns red, or for someone who steps out, if this braking suffices, m/s^2.
+# A driver stops for a red light or a pedestrian if this braking suffices, m/s^2.
 _STOPS_IF = 3.5
-# Gap in priority traffic that is accepted, seconds, and what counts as there already, metres.
+# Accepted gap in priority traffic, seconds, and distance below which priority traffic always blocks, metres.
 _ACCEPTED_GAP, _AT_HAND = 3.2, 3.0
-# Hardest braking to fit into a gap on a lane that runs beside, where there is still room, m/s^2.
+# Hardest braking for merging into a gap on a parallel lane, m/s^2.
 _FITTING_IN = 2.5
-# People start to cross if no vehicle arrives within this time, seconds.
+# Pedestrians start to cross if no vehicle arrives within this time, seconds.
 _CROSSING_GAP = 3.5
 
 
 @dataclass
 class Convoy:
-    """A vehicles on the road, with what stays constant while they drive.
+    """A vehicles on the road: constant properties, positions and speeds.
 
     Attributes:
-        routes: their ways.
+        routes: of the vehicles.
         half: (A,) half their lengths, metres.
         eagerness, top_speed, acceleration, headway: (A,) see `vehicles.Profile`.
-        position: (A,) distance of their middles along their ways, metres.
+        position: (A,) distance of their middles along their routes, metres.
         speed: (A,) m/s.
     """
 
@@ -51,11 +51,11 @@ class Convoy:
 
 @dataclass(frozen=True)
 class Footing:
-    """Where tail, middle and front of A vehicles are.
+    """Places of the rear, middle and front of A vehicles.
 
     Attributes:
-        segment, station: (A, 3) place of tail, middle and front.
-        front: (A,) distance of the front along the way.
+        segment, station: (A, 3) place of rear, middle and front.
+        front: (A,) distance of the front along the route.
     """
 
     segment: Int[np.ndarray, "a 3"]
@@ -64,7 +64,7 @@ class Footing:
 
 
 def footing(convoy: Convoy) -> Footing:
-    """Find the places of tails, middles and fronts."""
+    """Return the places of rears, middles and fronts."""
     reach = convoy.half[:, None] * np.array([-1.0, 0.0, 1.0])
     segment, station = convoy.routes.place(convoy.position[:, None] + reach)
     return Footing(segment, station, convoy.position + convoy.half)
@@ -83,8 +83,8 @@ def acceleration(
         convoy: the vehicles.
         at: where they are.
         table: lanes.
-        red: (S,) segments that a light bars.
-        walked_over: segments and stations at which someone crosses the lane.
+        red: (S,) segments that must not be entered at a red light.
+        walked_over: segments and stations at which a pedestrian crosses the lane.
     """
     v, a = convoy.speed, convoy.acceleration
     wanted = np.maximum(np.minimum(_speed_ahead(convoy, at, table) * convoy.eagerness, convoy.top_speed), 0.3)
@@ -99,7 +99,7 @@ def acceleration(
 
 
 def crossings_busy(convoy: Convoy, at: Footing, places: CrossingPlaces, crossings: int) -> Bool[np.ndarray, " c"]:
-    """Return the crossings that a vehicle stands on or reaches too soon for someone to start walking."""
+    """Return the crossings that a vehicle occupies or reaches too soon for a pedestrian to start."""
     gap = convoy.routes.distance[:, places.segment] + places.station - at.front[:, None]
     length = 2.0 * convoy.half[:, None]
     soon = (gap < convoy.speed[:, None] * _CROSSING_GAP) & (gap > -length - 1.0)
@@ -122,7 +122,7 @@ def _interaction(
 
 
 def _speed_ahead(convoy: Convoy, at: Footing, table: LaneTable) -> Float[np.ndarray, " a"]:
-    """Return the speed at which the lane may be driven here, with the curves of later segments in mind."""
+    """Return the comfortable speed at each vehicle, which allows braking for curves of later segments."""
     here = table.speed[table.vertex(at.segment[:, 1], at.station[:, 1])]
     ahead = convoy.routes.start - convoy.position[:, None]
     entry = table.speed_at_start[convoy.routes.segment]
@@ -131,10 +131,10 @@ def _speed_ahead(convoy: Convoy, at: Footing, table: LaneTable) -> Float[np.ndar
 
 
 def _leader(convoy: Convoy, at: Footing, table: LaneTable) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
-    """Return gap to and speed of the nearest vehicle in each one's way.
+    """Return gap to and speed of the leader of each vehicle.
 
-    A vehicle is in the way if its tail, middle or front lies on a segment ahead, or on one that runs so closely beside
-    a segment ahead that there is no room for two.
+    The leader is the nearest vehicle whose rear, middle or front lies on a segment ahead, or on one so close beside a
+    segment ahead that there is no room for two.
     """
     vehicle = np.broadcast_to(np.arange(len(at.front))[:, None], at.segment.shape)
     tail = at.station - convoy.half[:, None] * np.array([0.0, 1.0, 2.0])
@@ -157,7 +157,7 @@ def _leader(convoy: Convoy, at: Footing, table: LaneTable) -> tuple[Float[np.nda
 def _merging_leader(
     convoy: Convoy, at: Footing, table: LaneTable
 ) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
-    """Return gap and speed of the vehicle on the lane into which each one's lane merges that is next ahead."""
+    """Return gap and speed of the next vehicle ahead on the lane into which each vehicle's lane merges."""
     merging = np.flatnonzero(table.merges_into >= 0)
     main = table.merges_into[merging]
     middle, station = at.segment[:, 1], at.station[:, 1]
@@ -173,12 +173,12 @@ def _nearest(
     segment: Int[np.ndarray, " m"],
     tail: Float[np.ndarray, " m"],
 ) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " a"]]:
-    """Return gap and speed of the nearest of M tails ahead (inf and 0 where there is none)."""
+    """Return gap and speed of the nearest of M vehicle rears ahead (inf and 0 where there is none)."""
     count = len(at.front)
     if not len(vehicle):
         return np.full(count, np.inf), np.zeros(count)
     gap = convoy.routes.distance[:, segment] + tail - at.front[:, None]
-    # Who is ahead is decided by the middles, and between two side by side by their numbers.
+    # The middles decide which vehicle is ahead; the index decides for two side by side.
     lead = gap + convoy.half[:, None] + convoy.half[vehicle]
     me = np.arange(count)[:, None]
     ahead = (lead > 0.05) | ((np.abs(lead) <= 0.05) & (vehicle < me))
@@ -190,7 +190,7 @@ def _nearest(
 def _occupied_crossing(
     convoy: Convoy, at: Footing, walked_over: tuple[Int[np.ndarray, " o"], Float[np.ndarray, " o"]]
 ) -> Float[np.ndarray, " a"]:
-    """Return the distance to the next crossing on which someone is in the way; inf if it is too late to stop."""
+    """Return the distance to the next occupied crossing; inf without one or if it is too late to stop."""
     segment, station = walked_over
     gap = convoy.routes.distance[:, segment] + station - 1.2 - at.front[:, None]
     stoppable = (gap > -0.8) & (gap > convoy.speed[:, None] ** 2 / (2.0 * 2.0 * _STOPS_IF))
@@ -198,10 +198,10 @@ def _occupied_crossing(
 
 
 def _stop_line(convoy: Convoy, at: Footing, table: LaneTable, red: Bool[np.ndarray, " s"]) -> Float[np.ndarray, " a"]:
-    """Return the distance to the line before which each driver must wait; inf where they may go.
+    """Return the distance to the stop line at which each driver must wait; inf for drivers who may go.
 
-    They wait for a red light, for priority traffic that is near, for the junction to be cleared of crossing traffic,
-    and for another one who is nearer to the own line and equally allowed to go.
+    Drivers wait for a red light, for priority traffic nearby, for crossing traffic inside the junction, and for a
+    conflicting driver with equal right of way who is nearer to the stop line.
     """
     routes = convoy.routes
     count = len(at.front)
@@ -223,7 +223,7 @@ def _stop_line(convoy: Convoy, at: Footing, table: LaneTable, red: Bool[np.ndarr
     others_come = soon.sum(0) > soon
     must_yield = (table.yields[gate] & others_come).any(1)
 
-    # Crossing traffic inside the junction, until its tail is clear.
+    # Crossing traffic inside the junction, until its rear is clear.
     tail, tail_station = at.segment[:, 0], at.station[:, 0]
     middle, front = at.segment[:, 1], at.segment[:, 2]
     blocked = table.crosses[gate[:, None], tail] & (tail_station < table.clear_after[gate[:, None], tail])

@@ -13,19 +13,19 @@ from tflane_jax.world.roads.networks import RoadNetwork
 
 # Distance between samples of a centerline, metres.
 _SPACING = 2.0
-# Vehicles on two lanes nearer to each other than this are in each other's way, metres; bicycles need less room.
+# Vehicles on two lanes nearer to each other than this obstruct each other, metres; bicycles need less room.
 _REACH, _BIKE_REACH = 2.5, 1.5
-# Lanes whose directions differ by less than acos of this run together (fork or merge); others cross.
+# Nearby lanes whose directions differ by less than acos of this fork or merge; others cross.
 _TOGETHER = 0.75
 # Comfortable lateral acceleration in curves and braking before them, m/s^2.
 _COMFORTABLE_LATERAL, COMFORTABLE_BRAKING = 2.2, 1.6
-# Lanes that may run together at one vertex.
+# Most lanes that may lie beside one vertex.
 _PARTNERS = 4
 
 
 @dataclass(frozen=True)
 class LaneTable:
-    """S lane segments sampled at V vertices; a place is (segment index, station along its centerline in metres).
+    """S lane segments sampled at V vertices; a place is (segment index, station along the centerline in metres).
 
     Attributes:
         ids: (S,) segment ids; everything else refers to segments by their index here.
@@ -34,19 +34,18 @@ class LaneTable:
         length: (S,) metres.
         speed_at_start: (S,) speed with which a segment may be entered, m/s.
         turn: (S,) absolute change of heading, radians.
-        station: (S,) place of each segment's start on the axis on which `axis` lies.
-        axis: (V,) increasing; the segments lie on it one after another with gaps.
+        station: (S,) position of each segment's start on the common axis.
+        axis: (V,) position of each vertex on the common axis: segments one after another, with gaps; increasing.
         xy, heading, speed: (V, ...) metres, radians (unwrapped in a segment), and the speed at which a driver may pass
             so that all curves ahead in the segment are reached at a comfortable speed, m/s.
         first_vertex: (S,) index of a segment's first vertex.
         step: (S,) distance between its vertices.
-        beside: (V, Q) segment that runs together with the vertex's own so closely that traffic there is in the way; -1
-            pads.
+        beside: (V, Q) segments so close beside the vertex's own that their traffic obstructs it; -1 pads.
         beside_station: (V, Q) the nearest station on it.
-        crosses: (S, S) traffic on [i] must not enter while there is traffic on [j].
-        clear_after: (S, S) ... until that traffic's tail has passed this station of j.
-        yields: (S, S) traffic entering [i] lets traffic that comes along [j] go first.
-        merges_into: (S,) parallel segment whose traffic a merging lane must fit in with; -1 for none.
+        crosses: (S, S) [i, j] traffic must not enter i while there is traffic on j.
+        clear_after: (S, S) [i, j] station of j beyond which the rear of that traffic leaves i free.
+        yields: (S, S) [i, j] traffic entering i yields to traffic approaching on j.
+        merges_into: (S,) parallel segment into which a lane merges; -1 for none.
         intersection, phase: (S,) of the signal that governs the entry; -1 for none.
     """
 
@@ -74,7 +73,7 @@ class LaneTable:
 
     @property
     def is_gate(self) -> Bool[np.ndarray, " s"]:
-        """(S,) a driver must look before entering."""
+        """(S,) segments before which a driver must check signals or priority."""
         return (self.intersection >= 0) | self.yields.any(1) | self.crosses.any(1)
 
     def vertex(self, segment: Int[np.ndarray, "*b"], s: Float[np.ndarray, "*b"]) -> Int[np.ndarray, "*b"]:
@@ -85,7 +84,7 @@ class LaneTable:
     def locate(
         self, segment: Int[np.ndarray, "*b"], s: Float[np.ndarray, "*b"]
     ) -> tuple[Float[np.ndarray, "*b 2"], Float[np.ndarray, "*b"]]:
-        """Return position and heading of a place; beyond the ends the segment runs on straight."""
+        """Return position and heading of a place; the segment is extended straight beyond its ends."""
         inside = np.clip(s, 0.0, self.length[segment])
         at = self.station[segment] + inside
         heading = np.interp(at, self.axis, self.heading)
@@ -105,7 +104,7 @@ def build_lane_table(network: RoadNetwork) -> LaneTable:
     first = np.cumsum(count) - count
     step = length / (count - 1)
     own_station = (np.arange(len(owner)) - first[owner]) * step[owner]
-    # The gap keeps the end of a segment and the start of the next apart on the axis.
+    # The gap separates the end of a segment from the start of the next on the axis.
     station = np.cumsum(length + 1.0) - length - 1.0
     heading = _headings(xy, owner, first, count)
     limit = np.array([network.speed_limit[segment.id] for segment in segments])
@@ -200,8 +199,8 @@ def _comfortable_speed(
     turn = np.abs(np.diff(heading)) * (owner[1:] == owner[:-1])
     sharpest = np.maximum(np.concatenate([[0.0], turn]), np.concatenate([turn, [0.0]])) / step[owner]
     square = np.minimum(limit[owner] ** 2, _COMFORTABLE_LATERAL / np.maximum(sharpest, 1e-6))
-    # v(s)^2 <= v(s')^2 + 2 b (s' - s) for all s' ahead; each segment is lifted above the one before it, so that the
-    # running minimum from the back never carries over.
+    # v(s)^2 <= v(s')^2 + 2 b (s' - s) for all s' ahead. An offset per segment keeps the running minimum from the back
+    # within each segment.
     lift = 1e6 * owner
     braking = 2.0 * COMFORTABLE_BRAKING * s
     ahead = np.minimum.accumulate((square + braking + lift)[::-1])[::-1]
@@ -256,7 +255,7 @@ def _conflicts(
 def _priorities(
     network: RoadNetwork, segments: list[LaneSegment], index: dict[int, int]
 ) -> tuple[Bool[np.ndarray, "s s"], Int[np.ndarray, " s"]]:
-    """Return `yields` and `merges_into`: giving way means waiting at an intersection and fitting in elsewhere."""
+    """Return `yields` and `merges_into`: yielding means waiting at an intersection and merging elsewhere."""
     yields = np.zeros((len(segments), len(segments)), bool)
     merges_into = np.full(len(segments), -1)
     for segment, others in network.yield_to.items():
@@ -276,7 +275,7 @@ def _share_exits(
     crosses: Bool[np.ndarray, "s s"],
     clear_after: Float[np.ndarray, "s s"],
 ) -> None:
-    """Let connectors that lead into one lane exclude each other, except that priority traffic does not stop."""
+    """Make connectors into one lane exclude each other, except that priority traffic does not stop."""
     into: dict[int, list[int]] = {}
     for i, following in enumerate(successors):
         if segments[i].is_intersection:

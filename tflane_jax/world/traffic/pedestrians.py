@@ -1,4 +1,4 @@
-"""Pedestrians: along the sidewalks, and over the crossings when traffic lets them."""
+"""Pedestrians on sidewalks, and on crossings when traffic permits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.world.traffic.lane_table import LaneTable
 
-# How far from the kerb those who cross appear and vanish, metres.
+# Distance from the kerb at which crossing pedestrians appear and vanish, metres.
 _APPROACH = 4.0
 
 
@@ -28,7 +28,9 @@ def walk_sidewalks(
     times: Float[np.ndarray, " f"],
     per_metre: float,
 ) -> Walkers:
-    """Let people walk along the lines at constant speed, one in eight standing; they exist between the line's ends."""
+    """Draw pedestrians who walk along the lines at constant speed, one in eight standing still.
+
+    A pedestrian is present while between the ends of its line."""
     parts = []
     for line in sidewalks:
         step = np.diff(line, axis=0)
@@ -90,7 +92,7 @@ def crossing_places(walks: tuple[Float[np.ndarray, "2 2"], ...], table: LaneTabl
 
 @dataclass
 class Crossers:
-    """P people who come to a crossing, wait until it is free, and walk over it.
+    """P pedestrians who approach a crossing, wait until it is free, and cross.
 
     Attributes:
         start, ahead: (P, 2) where the walk starts and its direction.
@@ -113,13 +115,13 @@ class Crossers:
     history: list[Float[np.ndarray, " p"]] = field(default_factory=list)
 
     def advance(self, dt: float, busy: Bool[np.ndarray, " c"]) -> None:
-        """Walk on for `dt` seconds; who stands at the kerb of a busy crossing waits."""
+        """Advance by `dt` seconds; pedestrians at the kerb of a busy crossing wait."""
         onward = self.progress + self.pace * dt
         waits = (self.progress <= 0.0) & (onward > 0.0) & busy[self.crossing]
         self.progress = np.where(waits, self.progress, onward)
 
     def in_the_way(self, places: CrossingPlaces) -> Bool[np.ndarray, " o"]:
-        """Return the places on the lanes that someone walks over or is about to reach."""
+        """Return the places on the lanes that a pedestrian occupies or is about to reach."""
         walked = np.where(self.forward, self.progress, self.length - self.progress)
         sign = np.where(self.forward, 1.0, -1.0)
         ahead = (places.along[:, None] - walked) * sign
@@ -128,7 +130,7 @@ class Crossers:
         return (same & walking & (ahead > -2.2) & (ahead < 4.5)).any(1)
 
     def paths(self, progress: Float[np.ndarray, "f p"]) -> Walkers:
-        """Return where everyone is for given progress."""
+        """Return positions and headings for given progress."""
         left = np.stack([-self.ahead[:, 1], self.ahead[:, 0]], -1)
         xy = self.start + progress[..., None] * self.ahead + (self.side[:, None] * left)
         yaw = np.broadcast_to(np.arctan2(self.ahead[:, 1], self.ahead[:, 0]), progress.shape)
@@ -143,7 +145,7 @@ def draw_crossers(
     stop: float,
     per_minute: float,
 ) -> Crossers:
-    """Draw who comes to each crossing between two times (seconds), `per_minute` for each crossing."""
+    """Draw the pedestrians who come to each crossing between two times (seconds), `per_minute` for each crossing."""
     count = rng.poisson(per_minute * (stop - start) / 60.0, len(walks))
     crossing = np.repeat(np.arange(len(walks)), count)
     when, pace, forward, side = rng.random((4, len(crossing)))

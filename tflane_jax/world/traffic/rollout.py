@@ -1,4 +1,4 @@
-"""Traffic in motion: who is on the road, one step after another."""
+"""Rolling out the traffic in time: entering, driving and leaving vehicles, crossing pedestrians."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from tflane_jax.world.traffic.lane_table import COMFORTABLE_BRAKING, LaneTable
 from tflane_jax.world.traffic.pedestrians import Crossers, CrossingPlaces
 from tflane_jax.world.traffic.signals import Signals
 
-# Vehicles come from this far before the border of the map and drive on this far behind it, metres.
+# Vehicles start this far outside the map and drive on this far beyond it, metres.
 _BEYOND = 40.0
-# Vehicles already there when the simulation starts have come along at this share of their wanted speed.
+# Vehicles present at the start have driven at this fraction of their desired speed.
 _PACE = 0.45
-# The ego vehicle takes the place of a vehicle within the first distance; else whoever is nearer than the second is
-# removed, metres. Traffic flows above this speed, m/s.
+# The ego vehicle replaces a vehicle within the first distance; else vehicles nearer than the second are removed,
+# metres. Traffic counts as flowing above the third value, m/s.
 _TAKES_PLACE, _CLEARED, _FLOWING = 25.0, 12.0, 3.5
-# Who is on the road is looked up this often, seconds.
+# The set of active vehicles is updated at this interval, seconds.
 _ROLL_CALL = 1.2
 
 
 class Rollout:
-    """Positions and speeds of all trips and the pedestrians who cross, from one time to the next.
+    """State of the simulation: positions and speeds of all trips, and the crossing pedestrians.
 
     Attributes:
-        position: (N,) distance of each vehicle's middle along its way, metres; -inf before it comes, inf after.
+        position: (N,) distance of each vehicle's middle along its route, metres; -inf before it enters, inf after.
         speed: (N,) m/s.
-        active: (N,) takes part.
+        active: (N,) is simulated.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Rollout:
         self.active = np.zeros(count, bool)
 
     def place_early_trips(self, time: float) -> None:
-        """Put those who entered before `time` where an undisturbed drive would have taken them, well apart."""
+        """Place the trips that entered before `time` at the positions of an undisturbed drive, without overlaps."""
         trips, routes = self.trips, self.trips.routes
         early = np.flatnonzero(trips.enters < time)
         entry = routes.segment[early, 0]
@@ -61,7 +61,7 @@ class Rollout:
         xy, _ = self.table.locate(segment, station)
         room = 0.5 * trips.drivers.size[early, 0] + 1.5
         near = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) < room[:, None] + room
-        # Of two that stand in each other's place the later number goes, and so do those inside junctions.
+        # Of two overlapping vehicles the one with the larger index is dropped, and so are vehicles inside junctions.
         keep = (at < routes.length[early]) & ~np.tril(near, -1).any(1) & ~self.table.is_gate[segment]
         self.position[early] = np.where(keep, at, np.inf)
         self.speed[early] = speed
@@ -108,7 +108,7 @@ class Rollout:
             chosen = acceleration(convoy, at, self.table, red, walked_over)
             busy = crossings_busy(convoy, at, self.places, self.crossings)
             speed = np.maximum(convoy.speed + chosen * dt, 0.0)
-            # Who comes to rest within the step brakes evenly until its end.
+            # A vehicle that stops within the step brakes evenly until the end of the step.
             chosen = (speed - convoy.speed) / dt
             now = convoy.position + convoy.speed * tau[:, None] + 0.5 * chosen * tau[:, None] ** 2
             for k in range(substeps):
@@ -135,10 +135,10 @@ class Rollout:
         self.position[comes], self.speed[comes], self.active[comes] = at[comes], speed[comes], True
 
     def put_ego(self, starts: Float[np.ndarray, " c"]) -> None:
-        """Make the ego vehicle join its way where traffic flows, in the place of a vehicle there if there is one.
+        """Place the ego vehicle on its route where traffic flows, instead of a vehicle that is there.
 
         Args:
-            starts: distances along its way; the first one whose surroundings move is taken, else the first one.
+            starts: candidate distances along its route; the first one in flowing traffic is taken, else the first one.
         """
         rows = np.flatnonzero(self.active)
         routes, table = self.trips.routes, self.table

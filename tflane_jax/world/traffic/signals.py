@@ -1,4 +1,4 @@
-"""Traffic lights over time, and the state that the map's elements show."""
+"""Fixed-time traffic signals, and the states of the map's traffic elements over time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Signals:
         return np.where(left > _CLEARANCE, phase, -1)
 
     def shown(self, time: float) -> Int[np.ndarray, "i p"]:
-        """Return what the lights of each phase show at each intersection: red, green, or yellow after green."""
+        """Return the light state of each phase at each intersection: red, green, or yellow after green."""
         phase, left = self._phase(time)
         state = np.full(self.green.shape, RED)
         now = np.where(left > _CLEARANCE, GREEN, np.where(left > _CLEARANCE - _YELLOW, YELLOW, RED))
@@ -44,7 +44,7 @@ class Signals:
         return state
 
     def _phase(self, time: float) -> tuple[Int[np.ndarray, " i"], Float[np.ndarray, " i"]]:
-        """Return the phase whose turn it is at each intersection, and for how long (seconds, clearance included)."""
+        """Return the current phase of each intersection and its remaining time (seconds, clearance included)."""
         slot = np.where(self.green > 0.0, self.green + _CLEARANCE, 0.0)
         ends = np.cumsum(slot, 1)
         at = (time + self.offset) % np.maximum(ends[:, -1], 1e-9)
@@ -81,8 +81,8 @@ def turn_green(signals: Signals, intersection: int, phase: int, time: float) -> 
 
 
 def element_states(network: RoadNetwork, signals: Signals, times: Float[np.ndarray, " f"]) -> Int[np.ndarray, "f e"]:
-    """Return the attribute of each of the map's elements at each time: a light shows red, yellow or green as its
-    signals are, every other element what it always shows."""
+    """Return the attribute of each map element at each time: a light follows its
+    signals, every other element keeps its attribute."""
     state = np.tile(np.array([element.attribute for element in network.map.elements], int), (len(times), 1))
     shown = np.stack([signals.shown(float(time)) for time in times])
     for number, element in enumerate(network.map.elements):

@@ -1,4 +1,4 @@
-"""Simulated traffic: every road user of a scene over time, the ego vehicle among them."""
+"""Traffic simulation of a scene: positions of the ego vehicle and all road users over time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from tflane_jax.world.traffic.rollout import Rollout
 from tflane_jax.world.traffic.signals import Signals, draw_signals, turn_green
 from tflane_jax.world.traffic.vehicles import draw_drivers
 
-# Traffic settles for so long before the log begins, in steps of so long; the ego vehicle joins near the end, seconds.
+# Warm-up before the log begins, its time step, and how long before its end the ego vehicle joins, seconds.
 _WARM_UP, _WARM_UP_STEP, _EGO_JOINS = 20.0, 0.4, 3.2
-# Steps while logging are at most this long, seconds; frames in between follow the constant acceleration of the step.
+# Largest time step while logging, seconds; frames in between assume constant acceleration within the step.
 _LONGEST_STEP = 0.2
 # Places tried for the ego vehicle.
 _EGO_CHOICES = 6
@@ -26,18 +26,18 @@ _EGO_CHOICES = 6
 
 @dataclass(frozen=True)
 class TrafficConfig:
-    """How much traffic, and of what kind.
+    """Amount and composition of the traffic.
 
     Attributes:
         vehicles_per_metre: mean density on a lane in free flow; 0 leaves the ego vehicle alone.
         category_share: moving motor vehicles by category.
-        bicycles_per_metre: on bike lanes; at the edge of outer lanes half of their share of the traffic.
-        parked_share: of the kerb-side slots.
+        bicycles_per_metre: on bike lanes; slow outer lanes get half of the corresponding fraction of their traffic.
+        parked_share: fraction of the parking slots that are occupied.
         pedestrians_per_metre: on sidewalks.
-        crossers_per_minute: people who cross, for each crossing.
+        crossers_per_minute: crossing pedestrians, for each crossing.
         ego_top_speed: m/s.
         green_wave: probability that the first light on the ego vehicle's way turns green about when the log begins.
-        range: distance from the ego vehicle up to which road users are told, metres.
+        range: distance from the ego vehicle up to which road users are reported, metres.
     """
 
     vehicles_per_metre: float = 0.032
@@ -91,7 +91,7 @@ def simulate_traffic(
     index = {int(segment): i for i, segment in enumerate(table.ids)}
     way = tuple(index[i] for i in network.ego_routes[rng.integers(len(network.ego_routes))])
     signals = _signals_for_ego(rng, table, way, config.green_wave)
-    # The oldest trips still on the road when the simulation starts entered as long ago as a slow drive takes.
+    # Look back by the duration of a slow drive through the map: older trips have left it by now.
     trips = draw_trips(
         rng,
         table,
@@ -122,7 +122,7 @@ def simulate_traffic(
 
 
 def _signals_for_ego(rng: np.random.Generator, table: LaneTable, way: tuple[int, ...], green_wave: float) -> Signals:
-    """Draw signals of which, with probability `green_wave`, the first on the ego vehicle's way lets it drive on."""
+    """Draw signals; with probability `green_wave` the ego route's first one turns green about when the log begins."""
     signals = draw_signals(rng, table)
     favoured, when = rng.random() < green_wave, rng.uniform(-5.0, 1.0)
     governed = [i for i in way if table.intersection[i] >= 0]
@@ -132,11 +132,11 @@ def _signals_for_ego(rng: np.random.Generator, table: LaneTable, way: tuple[int,
 
 
 def _ego_starts(rng: np.random.Generator, road: Rollout, duration: float) -> Float[np.ndarray, " c"]:
-    """Draw where on its way the ego vehicle may join: early enough to stay on it, and not inside a junction."""
+    """Draw candidate start positions on the ego route: early enough to stay on it, and not inside a junction."""
     routes, table = road.trips.routes, road.table
     way = routes.segment[0, np.isfinite(routes.start[0])]
     speed = min(float(np.median(table.speed_at_start[way])), road.trips.drivers.top_speed[0])
-    # What continues the way to the border of the map is not to be driven: 50 m is more than half of it.
+    # The continuation of the route to the border of the map must not be driven; 50 m is more than half of it.
     starts = rng.uniform(5.0, max(routes.length[0] - 50.0 - speed * duration, 10.0), _EGO_CHOICES)
     for i, at in enumerate(starts):
         leg = int((routes.start[0] <= at).sum()) - 1
@@ -157,7 +157,7 @@ def _driven(
     axles = at[..., None] + wheelbase[:, None] * np.array([-0.5, 0.5])
     segment, station = routes.place(axles.transpose(1, 0, 2))
     xy, heading = table.locate(segment, station)
-    # A slow sway about a habitual offset, by distance, so that who stands does not slide.
+    # The lateral oscillation is a function of distance, so that a standing vehicle does not slide.
     sway = drivers.offset[:, None, None] + drivers.wander[:, None, None] * np.sin(
         axles.transpose(1, 0, 2) / 11.0 + drivers.phase[:, None, None]
     )
@@ -174,13 +174,13 @@ def _assemble(
     driven: tuple[np.ndarray, np.ndarray, np.ndarray],
     walking: list[Walkers],
 ) -> Traffic:
-    """Join vehicles, parked vehicles and pedestrians, and leave out whoever never comes near the ego vehicle."""
+    """Join vehicles, parked vehicles and pedestrians; drop those that never come near the ego vehicle."""
     xy, yaw, present = driven
     frames = len(xy)
     slots = network.parking[rng.random(len(network.parking)) < config.parked_share]
     lorry = rng.random(len(slots)) < 0.06
     parked = draw_drivers(rng, np.where(lorry, RoadUser.TRUCK, RoadUser.CAR))
-    # Slots are 6.5 m long: of trucks only vans and light ones park there.
+    # Slots are 6.5 m long, so only vans and light trucks park there.
     parked.size[:, 0] = np.minimum(parked.size[:, 0], 6.0)
     slots = slots + np.stack([0.3 * parked.offset, parked.wander * 0.3, 0.05 * parked.wander], -1)
     people = draw_drivers(rng, np.full(sum(w.xy.shape[1] for w in walking), int(RoadUser.PEDESTRIAN)))

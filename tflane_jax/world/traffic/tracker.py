@@ -1,8 +1,8 @@
-"""Between the truth and the traffic flow: what a 3-D detector and tracker on the ego vehicle would report.
+"""Simulated 3-D detector and tracker of the ego vehicle: true actors in, noisy tracks out.
 
-An actor is detected with a probability that falls with distance and with the share of it that is in line of sight;
-boxes are noisy, more so far away; a track that loses its actor coasts on at constant velocity (`occluded`), then ends,
-and the actor comes back under a new identity; close neighbours now and then swap identities.
+The detection probability falls with distance and with occlusion. Box noise grows with distance. A track that loses its
+actor coasts at constant velocity (`occluded`) and then ends; the actor returns under a new identity. Close neighbours
+sometimes swap identities.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
 from tflane_jax.scene.logs import Tracks
 from tflane_jax.world.bev.line_of_sight import hidden_points
 
-# Points of a box that are asked for line of sight, in half lengths and half widths: middle and near the corners.
+# Points of a box tested for line of sight, in half lengths and half widths: middle and near the corners.
 _PROBES = 0.9 * np.array([[0.0, 0.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 # Line of sight is computed this often and interpolated, seconds.
 _LOOK_EVERY = 0.3
@@ -28,15 +28,15 @@ class TrackerConfig:
     """Quality of the tracker.
 
     Attributes:
-        range: distance up to which detection is certain for what is in full view, metres.
+        range: distance up to which a fully visible actor is always detected, metres.
         falloff: distance beyond `range` over which the probability falls to 0, metres.
-        view_needed: share of a box that must be in line of sight for certain detection; 0 looks through everything.
+        view_needed: visible fraction of a box from which detection is certain; 0 ignores occlusion.
         drop: probability of missing an actor in a frame.
-        position_noise: standard deviation per axis close by, metres.
+        position_noise: standard deviation per axis at distance 0, metres.
         position_noise_growth: its growth with distance, metres per metre.
         yaw_noise: standard deviation, radians.
         size_noise: relative standard deviation, constant for a track.
-        velocity_noise: standard deviation of the velocity per axis with which a track coasts, m/s.
+        velocity_noise: standard deviation per axis of a coasting track's velocity, m/s.
         correlation: of the noise from frame to frame, 0 to 1.
         coast: frames for which a lost track is continued.
         switch_rate: identity switches per second between two neighbours nearer than `switch_distance`.
@@ -79,7 +79,7 @@ def track(
     *,
     rate_hz: float,
 ) -> Tracks:
-    """Return what the tracker reports of the actors, one row for each identity in order of first appearance.
+    """Return the tracks of the actors, one row for each identity in order of first appearance.
 
     Args:
         rng: stream.
@@ -117,7 +117,7 @@ def track(
 def visible_share(
     actors: Tracks, global_from_ego: Float[np.ndarray, "f 4 4"], buildings: Float[np.ndarray, "b 5"], stride: int
 ) -> Float[np.ndarray, "f k"]:
-    """Return the share of each box's probes in line of sight, computed every `stride` frames; 0 where not valid."""
+    """Return the visible fraction of each box's probe points, computed every `stride` frames; 0 where not valid."""
     frames, count = actors.valid.shape
     looks = np.unique(np.append(np.arange(0, frames, stride), frames - 1)) if frames else np.zeros(0, int)
     share = np.zeros((len(looks), count))
@@ -150,7 +150,7 @@ def visible_share(
     nearest = np.searchsorted(looks, np.arange(frames), side="right") - 1
     following = np.minimum(nearest + 1, len(looks) - 1)
     weight = (np.arange(frames) - looks[nearest]) / np.maximum(looks[following] - looks[nearest], 1)
-    # An actor that is not there at one of the two moments has no share to interpolate with.
+    # An actor that is absent at one of the two frames has no value there to interpolate with.
     before = np.where(actors.valid[looks[nearest]], share[nearest], share[following])
     after = np.where(actors.valid[looks[following]], share[following], share[nearest])
     return np.where(actors.valid, before + weight[:, None] * (after - before), 0.0)
@@ -189,7 +189,7 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], correlation: float)
 def _velocity(actors: Tracks, global_from_ego: Float[np.ndarray, "f 4 4"]) -> Float[np.ndarray, "f k 2"]:
     """Return each actor's true motion since the frame before, metres per frame along the global axes.
 
-    It is 0 in the first frame of an actor: one detection tells no velocity.
+    It is 0 in the first frame of an actor, because one detection gives no velocity.
     """
     xy = transform_points(global_from_ego, actors.position)[..., :2]
     step = np.zeros_like(xy)
@@ -207,7 +207,7 @@ def _coast(
     k: Int[np.ndarray, " m"],
     global_from_ego: Float[np.ndarray, "f 4 4"],
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
-    """Return boxes at M (frame, actor) pairs that go on from the frame `origin` at constant velocity and heading."""
+    """Return boxes at M (frame, actor) pairs, extrapolated from the frame `origin` at constant velocity and heading."""
     start = transform_points(global_from_ego[origin], seen[origin, k][:, None])[:, 0]
     start[:, :2] += velocity[origin, k] * (frame - origin)[:, None]
     position = transform_points(invert_pose(global_from_ego[frame]), start[:, None])[:, 0]
@@ -227,7 +227,7 @@ def _identities(reported: Bool[np.ndarray, "f k"]) -> Int[np.ndarray, "f k"]:
 def _switch(
     rng: np.random.Generator, identity: Int[np.ndarray, "f k"], actors: Tracks, config: TrackerConfig, rate_hz: float
 ) -> Int[np.ndarray, "f k"]:
-    """Swap the identities of random close neighbours from some frame on."""
+    """Swap the identities of random close neighbours from a random frame on."""
     if config.switch_rate <= 0.0 or identity.shape[1] < 2:
         return identity
     identity = identity.copy()
@@ -282,6 +282,6 @@ def _table(
 
 
 def wrap_angle(angle: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Return angles in (-pi, pi]; those already there keep their bits."""
+    """Return angles in (-pi, pi]; those already inside keep their bits."""
     inside = (angle > -np.pi) & (angle <= np.pi)
     return np.where(inside, angle, np.pi - (np.pi - angle) % (2.0 * np.pi))

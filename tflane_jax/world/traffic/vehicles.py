@@ -14,11 +14,11 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Profile:
-    """What the members of one category have in common; every member draws its own values from the ranges.
+    """Ranges of one road-user category, from which every road user draws its values.
 
     Attributes:
         length, width, height: metres.
-        eagerness: desired speed as a share of the speed limit.
+        eagerness: desired speed as a fraction of the speed limit.
         top_speed: m/s, whatever the limit.
         acceleration: largest, m/s^2 (IDM a).
         headway: desired time gap to the leader, seconds (IDM T).
@@ -53,9 +53,9 @@ class Drivers:
         category: (N,) `RoadUser`.
         size: (N, 3) length, width, height, metres.
         eagerness, top_speed, acceleration, headway: (N,).
-        wander: (N,) signed amplitude of the sway about the middle of the lane, metres.
+        wander: (N,) signed amplitude of the lateral oscillation in the lane, metres.
         offset: (N,) mean distance to the left of the middle of the lane, metres.
-        phase: (N,) where in its sway each one starts, radians.
+        phase: (N,) initial phase of that oscillation, radians.
     """
 
     category: Int[np.ndarray, " n"]
@@ -70,7 +70,7 @@ class Drivers:
 
 
 def draw_drivers(rng: np.random.Generator, category: Int[np.ndarray, " n"]) -> Drivers:
-    """Draw one member for each given category. The amount drawn from `rng` depends on N alone."""
+    """Draw one road user for each given category. The number of draws from `rng` depends on N alone."""
     n = len(category)
     profiles = [PROFILES[RoadUser(c)] for c in category]
     share = rng.random((9, n))
@@ -94,7 +94,7 @@ def draw_drivers(rng: np.random.Generator, category: Int[np.ndarray, " n"]) -> D
         top_speed=np.array([p.top_speed for p in profiles]) * (1.0 - 0.3 * share[3] * (category >= RoadUser.BICYCLE)),
         acceleration=draw(4, [p.acceleration for p in profiles]),
         headway=draw(5, [p.headway for p in profiles]),
-        # Half of the room is a habit, half is sway.
+        # Half of the lateral range is a constant offset, half is oscillation.
         wander=0.5 * limit * (2.0 * share[6] - 1.0),
         offset=0.5 * limit * (2.0 * share[7] - 1.0),
         phase=2.0 * np.pi * share[8],

@@ -1,0 +1,148 @@
+"""Training evaluates with every protocol that a prediction has parts for."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.fakes import fake_elements, fake_example
+from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, evaluate_lanes
+from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.scene import (
+    AreaType,
+    CenterlinePrediction,
+    ElementPrediction,
+    LineClass,
+    LinePrediction,
+    MapLines,
+    Prediction,
+    SegmentPrediction,
+    stack_examples,
+)
+
+BOTH = EvaluationConfig(batch_size=2, versions=("v2.1", "v1.0"))
+
+
+def sure(flags):
+    """Return logits of near certainty."""
+    return np.where(flags, 9.0, -9.0).astype(np.float32)
+
+
+def labelled(seed=0):
+    """Return an example with map lines of every class, one of them padding."""
+    example = fake_example(seed)
+    rng = np.random.default_rng(seed)
+    lines = MapLines.empty(6, 5)
+    lines.points[:5] = np.cumsum(rng.uniform(0.5, 2.0, (5, 5, 3)), 1).astype(np.float32)
+    lines.points[5] = np.nan
+    lines.category[:5] = [0, 1, 2, LineClass.CENTERLINE, 2]
+    lines.valid[:5] = True
+    lanes, across = example.lanes, np.array([0.0, 1.5, 0.0], np.float32)
+    segments = lanes.replace(left=lanes.points + across, right=lanes.points - across)
+    elements = example.traffic_elements
+    attribute = np.full_like(elements.attribute, elements.attribute[0])
+    box = np.broadcast_to(np.array([[10.0, 10.0], [30.0, 40.0]], np.float32), elements.box.shape)
+    return example.replace(
+        map_lines=lines, segments=segments, traffic_elements=elements.replace(attribute=attribute, box=box)
+    )
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Predicts the truth of the parts that it is asked for, or everything moved by `shift` metres."""
+
+    parts: tuple[str, ...]
+    shift: float = 0.0
+    streams: bool = False
+
+    def predict(self, params, example):
+        example = jax.tree.map(jnp.asarray, example)
+        found = {}
+        lanes, segments, lines = example.lanes, example.segments, example.map_lines
+        if "centerlines" in self.parts:
+            points = lanes.points + self.shift
+            edges = jnp.where(lanes.successor, 9.0, -9.0)
+            found["centerlines"] = CenterlinePrediction(points, jnp.where(lanes.valid[:, None], 9.0, -9.0), edges)
+        if "segments" in self.parts:
+            kind = jnp.stack([segments.valid, jnp.zeros_like(segments.valid)], -1)
+            edges = jnp.where(segments.successor, 9.0, -9.0)
+            points, left, right = (x + self.shift for x in (segments.points, segments.left, segments.right))
+            logits = jnp.where(kind, 9.0, -9.0)
+            found["segments"] = SegmentPrediction(points, left, right, logits, successor_logits=edges)
+        if "lines" in self.parts:
+            kind = jax.nn.one_hot(lines.category, 4) * lines.valid[:, None]
+            points = jnp.nan_to_num(lines.points) + self.shift
+            found["lines"] = LinePrediction(points, jnp.where(kind > 0, 9.0, -9.0))
+        if "elements" in self.parts:
+            elements = example.traffic_elements
+            kind = jax.nn.one_hot(elements.attribute, 13)  # padding repeats the first attribute, with a low score
+            logits = jnp.where(kind > 0, jnp.where(elements.valid[:, None], 9.0, -5.0), -9.0)
+            found["elements"] = ElementPrediction(elements.box, logits, jnp.where(elements.lane, 9.0, -9.0))
+        return Prediction(**found)
+
+
+def measured(parts, shift=0.0, config=BOTH):
+    return evaluate_lanes(Oracle(parts, shift), {}, stack_examples([labelled(i) for i in range(3)]), config)
+
+
+def test_an_oracle_has_full_marks_in_every_protocol():
+    metrics = measured(("centerlines", "segments", "lines", "elements"))
+    found = metrics.compute()
+    assert {"all", "occluded", "clear", "segments", "lanesegnet", "lines"} <= set(found)
+    assert found["all"]["DET_l"] == found["all"]["TOP_ll"] == found["all"]["DET_t"] == found["all"]["OLS"] == 1.0
+    assert found["all"]["OLS_v1.0"] > 0
+    assert found["segments"]["DET_l"] == found["segments"]["TOP_ll"] == found["segments"]["DET_t"] == 1.0
+    assert found["lanesegnet"]["AP_ls"] == 1.0
+    assert found["lines"]["mAP"] == 1.0
+    for name in ("OpenLane-V2 centerline", "lane segments", "MapTR"):
+        assert name in metrics.protocol
+
+
+@pytest.mark.parametrize("part", ["centerlines", "segments", "lines"])
+def test_only_what_is_predicted_is_measured_and_errors_cost(part):
+    near, far = measured((part,)).compute(), measured((part,), shift=30.0).compute()
+    names = {"centerlines": ("all", "DET_l"), "segments": ("lanesegnet", "AP_ls"), "lines": ("lines", "mAP")}
+    group, name = names[part]
+    assert near[group][name] == 1.0
+    assert far[group][name] < 0.2
+    assert ("lines" in near) == (part == "lines")
+    assert ("segments" in near) == (part == "segments")
+    assert ("all" in near) == (part == "centerlines")
+
+
+def test_a_second_version_adds_columns_and_changes_none():
+    one = measured(("centerlines", "elements"), 0.7, EvaluationConfig(batch_size=2)).compute()["all"]
+    two = measured(("centerlines", "elements"), 0.7).compute()["all"]
+    assert set(two) - set(one) == {"OLS_v1.0", "TOP_ll_v1.0", "TOP_lt_v1.0"}
+    assert {name: two[name] for name in one} == one
+
+
+def test_lines_without_labels_of_their_own_follow_from_segments_and_areas():
+    example = labelled().replace(map_lines=None)
+    crossings = np.asarray(example.areas.category) == AreaType.PEDESTRIAN_CROSSING
+    points = np.asarray(example.areas.points)[crossings & example.areas.valid]
+    logits = sure(np.eye(4)[np.full(len(points), LineClass.CROSSING)])
+    metrics = LaneGraphMetrics()
+    metrics.update(Prediction(lines=LinePrediction(points, logits)), example)
+    assert metrics.compute()["lines"]["AP_ped_crossing"] == (1.0 if len(points) else 0.0)
+
+
+def test_a_prediction_without_topology_is_measured_without_it():
+    example = fake_example(1)
+    lanes = example.lanes
+    found = []
+    for successor in (None, sure(lanes.successor)):
+        metrics = LaneGraphMetrics()
+        prediction = CenterlinePrediction(lanes.points, sure(lanes.valid[:, None]), successor)
+        metrics.update(Prediction(centerlines=prediction), example)
+        found.append(metrics.compute()["all"])
+    without, with_topology = found
+    assert without["DET_l"] == with_topology["DET_l"] == with_topology["TOP_ll"] == 1.0
+    assert without["TOP_ll"] < 1.0
+
+
+def test_nothing_to_measure_is_an_error():
+    with pytest.raises(ValueError, match="nothing to measure"):
+        LaneGraphMetrics().update(Prediction(elements=fake_elements()), fake_example())

@@ -1,0 +1,130 @@
+"""Priors plug into any host: a toy prior in one file and one line of the list; absent priors change no bit."""
+
+from dataclasses import dataclass, replace
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from tests.models.cases import BASELINE, CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
+from tests.models.toy_prior import CrossingsConfig, with_crossings
+from tests.parameters import random_params
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.prior import HostQueries, HostSpec
+from tflane_jax.models.priors import PriorsConfig, encode, fuse_into_queries, observe, observe_clip
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+
+@dataclass(frozen=True)
+class WithToy(PriorsConfig):
+    """The list of priors with one more line."""
+
+    crossings: CrossingsConfig | None = None
+
+
+FLOW = TrafficFlowConfig(
+    prior=TrafficFlowPriorConfig(max_instances=5), module=TrafficFlowModuleConfig(width=8, heads=2, bands=3)
+)
+HOSTS = {
+    "toponet": (BASELINE, make_example),
+    "detr": (
+        BevFormerDetrConfig(encoder=BASELINE.encoder, decoder=replace(BASELINE.decoder, refine="fixed"), elements=None),
+        make_example,
+    ),
+    "camera toponet": (CAMERA_TOPONET, make_camera_example),
+    "camera detr": (CAMERA_DETR, make_camera_example),
+}
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.mark.parametrize("name", HOSTS)
+def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
+    host, make = HOSTS[name]
+    task = LaneGraphTask(replace(host, priors=WithToy(traffic_flow=FLOW, crossings=CrossingsConfig())))
+    example = make(0)
+    params = random_params(task.init, with_crossings(example, 2), spread=0.2)
+    into_queries = {path for path in params if path.startswith("crossings_to_queries")}
+    assert len(into_queries) == host.decoder.layers
+    assert "crossings_0" in str(jax.tree.structure(params["encoder"]))
+    predict = jax.jit(task.predict)
+    absent = predict(params, with_crossings(example, 0))
+    same(absent, predict(params, with_crossings(example, 0, filler=np.nan)))
+    one, two = (predict(params, with_crossings(example, count)) for count in (1, 2))
+    same(one, predict(params, with_crossings(example, 1, filler=np.nan)))
+    for a, b in ((absent, one), (one, two)):
+        assert not np.array_equal(a.centerlines.points, b.centerlines.points)
+
+    # Without crossings, the host computes what it computes without the prior.
+    plain = LaneGraphTask(replace(host, priors=PriorsConfig(traffic_flow=FLOW)))
+    shapes = jax.eval_shape(plain.init, jax.random.key(0), example)
+    rest = jax.tree_util.tree_map_with_path(lambda path, _: _at(params, path), shapes)
+    without = jax.jit(plain.predict)(rest, example)
+    same(without, absent)
+
+
+def _at(tree, path):
+    for key in path:
+        tree = tree[key.key]
+    return tree
+
+
+def test_training_reaches_the_parameters_of_a_new_prior():
+    task = LaneGraphTask(replace(BASELINE, priors=WithToy(crossings=CrossingsConfig())))
+    batch = jax.tree.map(jnp.asarray, stack_examples([with_crossings(make_example(i), 2, i) for i in range(2)]))
+    params = random_params(task.init, with_crossings(make_example(0), 2), spread=0.2)
+    gradient, terms = jax.jit(jax.grad(task.loss, has_aux=True))(params, batch, jax.random.key(0))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((gradient, terms)))
+    assert np.abs(gradient["crossing_tokens"]["kernel"]).max() > 0
+    assert "areas" in task.parts  # what a prior reads is loaded
+
+
+def test_memories_go_from_frame_to_frame_of_a_clip_and_of_a_stream():
+    spec = BASELINE.spec
+    priors = WithToy(traffic_flow=FLOW, crossings=CrossingsConfig()).build(spec)
+    frames = [with_crossings(make_example(i), count) for i, count in enumerate((1, 0, 2))]
+    frames = [frame.replace(has_previous=np.array(i > 0)) for i, frame in enumerate(frames)]
+    clip = jax.tree.map(jnp.asarray, stack_examples(frames))
+    together = observe_clip(priors, clip)
+    np.testing.assert_array_equal(together["crossings"][0][:, 0, -1], [0.0, 1.0, 1.0])
+    task = LaneGraphTask(replace(BASELINE, priors=WithToy(crossings=CrossingsConfig())), clip=3)
+    memories = task.start().priors
+    for i, frame in enumerate(frames):
+        found, memories = observe(task.model.build_priors(), frame, memories)
+        same(found["crossings"], jax.tree.map(lambda leaf, i=i: leaf[i], together["crossings"]))
+    params = random_params(task.init, clip, spread=0.2)
+    _, answers = jax.jit(lambda p, c: lax.scan(lambda m, e: task.step(p, m, e), task.start(), c))(params, clip)
+    alone = jax.jit(task.predict)(params, frames[2])
+    assert not np.array_equal(answers.centerlines.points[2], alone.centerlines.points)
+
+
+def test_the_hosts_own_mask_keeps_groups_of_queries_apart():
+    """MapTRv2's one-to-many queries must not change its one-to-one queries, also through the traffic-flow module."""
+    spec = HostSpec(16, BASELINE.range, BASELINE.spec.bev_range, "point")
+    priors = PriorsConfig(traffic_flow=FLOW).build(spec)
+    observation = observe(priors, make_example(0), {})[0]
+    group = jnp.arange(6) < 3
+    mask = group[:, None] == group[None, :]
+
+    class Host(nn.Module):
+        @nn.compact
+        def __call__(self, features, mask):
+            bound = PriorsConfig(traffic_flow=FLOW).build(spec)
+            tokens = encode(bound, observation, deterministic=True)
+            return fuse_into_queries(bound, tokens, 0, HostQueries(features, jnp.zeros_like(features), mask))
+
+    features = jax.random.normal(jax.random.key(1), (6, 16))
+    host = Host()
+    params = random_params(host.init, features, mask)
+    out = host.apply(params, features, mask)
+    changed = features.at[4].add(3.0)
+    np.testing.assert_array_equal(host.apply(params, changed, mask)[:3], out[:3])
+    assert not np.array_equal(host.apply(params, changed, None)[:3], out[:3])

@@ -26,7 +26,7 @@ class EvidenceEncoderConfig:
         cell: raster cells a side that become one feature cell.
         dilations: one residual block for each.
         cells: see `CameraEncoderConfig.cells`.
-        range: the box that the raster covers, metres; that of `BevSensorConfig.grid`.
+        range: the box that the raster covers, metres; that of `BevSensorConfig.grid`, which training checks.
     """
 
     dim: int = 32

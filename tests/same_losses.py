@@ -104,13 +104,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", type=Path, help="checkout of the state before the change")
     parser.add_argument("names", nargs="*", help="beginnings of names, as in tests/golden_configs; default all")
+    parser.add_argument("--exact", action="store_true", help="take names as they are, not as beginnings")
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "same_losses")
     parser.add_argument("--only", choices=("before", "after"), help="make the runs of one side, compare nothing")
     options = parser.parse_intermixed_args()
     wrong = 0
     for name, reference in shipped().items():
-        if not reference or (options.names and not name.startswith(tuple(options.names))):
+        chosen = name in options.names if options.exact else name.startswith(tuple(options.names))
+        if not reference or (options.names and not chosen):
             continue
         sides = {}
         for side, checkout in (("before", options.before.resolve()), ("after", ROOT)):

@@ -63,6 +63,6 @@ def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoder
         )
     if elements.layers != layers:
         raise UserError(
-            f"the element decoder has {elements.layers} layers and the lane decoder {layers}, but each lane layer "
-            "reads the element layer of its index: set elements.layers and decoder.layers to one number"
+            "each lane layer reads the element layer of its index, but the decoders of elements and lanes have "
+            f"{elements.layers} and {layers}: set elements.layers and decoder.layers to one number"
         )

@@ -44,7 +44,8 @@ class HostSpec:
 
 BevHook = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
 """Fusion of all priors into the BEV features of an encoder layer: (layer, cell centers (q, 2) in [0, 1], features
-(q, c), position encodings (q, c)) -> features. It creates its modules when called, so their parameters belong to the layer."""
+(q, c), position encodings (q, c)) -> features. The hook creates its modules when called, so their parameters belong to
+the layer."""
 
 
 class BevCells(NamedTuple):

@@ -31,7 +31,7 @@ class LaneShapeLossConfig:
         shared_horizon: the target of every lane begins at the highest row of all lanes in the image, as in LSTR.
         least_depth: smallest distance of a row below the predicted horizon, as a fraction of the image height; smaller
             ones are clamped. The curve has a pole at the horizon; with LSTR's 1e-6, training rarely recovers from a
-            predicted horizon beside a point's row.
+            predicted horizon close to a point's row.
         matcher: backend of `matching.match`.
     """
 

@@ -70,7 +70,7 @@ class MarkerMemory:
     @classmethod
     def empty(cls, frames: int, lanes: int, points: int) -> MarkerMemory:
         """Return an empty bank of T frames for L lanes of K points per frame."""
-        zeros: Any = np.zeros  # the type says JAX array, numpy serves as well
+        zeros: Any = np.zeros  # typed as JAX arrays; numpy arrays work as well
         return cls(
             points=zeros((frames, lanes, points, 2), np.float32),
             confidence=zeros((frames, lanes), np.float32),

@@ -151,7 +151,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         return draw
 
     def draw_comparison(self, models: Mapping[str, Model], source: Any, data: LabelledImages, path: Path) -> Path:
-        """Draw a few test images, every model beside the truth."""
+        """Draw a few test images, every model beside the ground truth."""
         from tflane_jax.plots.images import save_road_images
 
         images = data.images

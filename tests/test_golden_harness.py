@@ -152,12 +152,12 @@ def test_a_map_encoder_without_categories():
     width = weight.shape[1] - case.inputs["onehot.0"].shape[1]
     silenced = case.params | {"map_embedding.weight": np.where(np.arange(weight.shape[1]) < width, weight, 0.0)}
     found = {}
-    config = test_sd_map_golden.encoder_config(case)
+    config, limits = test_sd_map_golden.encoder_config(case)
     variables = {"params": test_sd_map_golden.convert_sd_map_encoder(silenced).variables["params"]}
     for name in names:
         lines = case.inputs[name]
         sd_map = test_sd_map_golden.SdMap(lines, np.zeros(len(lines), np.int32), np.ones(len(lines), bool))
-        encode = jax.jit(lambda sd_map: SdMapEncoder(config).apply(variables, sd_map)[0])
+        encode = jax.jit(lambda sd_map: SdMapEncoder(config, limits).apply(variables, sd_map)[0])
         found[name.replace("poly", "feat")] = np.asarray(encode(jax.tree.map(jnp.asarray, sd_map)))
     inputs = {n: v[:, :0] if n.startswith("onehot") else v for n, v in case.inputs.items()}
     bare = replace(

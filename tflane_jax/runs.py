@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,12 +104,22 @@ def build_data(source: Any) -> None:
 
 def load_test_data(config: RunConfig) -> Any:
     """Return the examples of a configuration's test split; the latest result is cached in memory."""
-    return _loaded(config.data.source("test"), config.task)
+    return _loaded(_TestData(config.data.source("test"), type(config.task), config.task.parts, config.task))
+
+
+@dataclass(frozen=True)
+class _TestData:
+    """Key of the cache: equal for all tasks of one class that read the same parts of an example."""
+
+    source: Any
+    kind: type
+    parts: tuple[str, ...]
+    task: Any = field(compare=False)
 
 
 @functools.lru_cache(maxsize=1)
-def _loaded(source: Any, task: Any) -> Any:
-    return task.load(source)
+def _loaded(data: _TestData) -> Any:
+    return data.task.load(data.source)
 
 
 def resumable_config(folder: Path) -> RunConfig:

@@ -112,18 +112,18 @@ def test_test_sets_have_tables_of_their_own(tiny, tmp_path, capsys):
 @pytest.mark.parametrize("best", ["2", "4"])
 def test_every_table_has_the_last_and_the_best_checkpoint(tiny, tmp_path, monkeypatch, best):
     """Which one is best is decided on the validation split."""
-    from tflane_jax.tasks.lane_graph import LaneGraphSystem
+    from tflane_jax.tasks.lane_graph import LaneGraphTask
 
-    evaluate, counted = LaneGraphSystem.evaluate, []
+    evaluate, counted = LaneGraphTask.evaluate, []
 
-    def scored(self, task, params, data, batch_size):
-        evaluation = evaluate(self, task, params, data, batch_size)
+    def scored(task, params, data, config):
+        evaluation = evaluate(task, params, data, config)
         counted.append(None)
         evaluation.groups["all"]["DET_l"] = 0.9 if str(2 * len(counted)) == best else 0.1
         return evaluation
 
     with monkeypatch.context() as patch:
-        patch.setattr(LaneGraphSystem, "evaluate", scored)
+        patch.setattr(LaneGraphTask, "evaluate", scored)
         command = ["compare", f"base={tiny}:baseline", "--seeds", "0", "--out", str(tmp_path), *QUICK]
         assert main([*command, "--training.eval-every", "2"]) == 0
     found = [(row["model"], row["checkpoint"]) for row in rows(tmp_path / "table.md")]
@@ -133,11 +133,11 @@ def test_every_table_has_the_last_and_the_best_checkpoint(tiny, tmp_path, monkey
 
 
 def test_data_are_loaded_when_they_are_needed(tiny, tmp_path, monkeypatch):
-    from tflane_jax.tasks.lane_graph import LaneGraphSystem
+    from tflane_jax.tasks.lane_graph import LaneGraphTask
 
-    load, train_run, events = LaneGraphSystem.load, workers.train_run, []
+    load, train_run, events = LaneGraphTask.load, workers.train_run, []
     monkeypatch.setattr(
-        LaneGraphSystem, "load", lambda self, source, **options: events.append(source.split) or load(self, source)
+        LaneGraphTask, "load", lambda self, source, **options: events.append(source.split) or load(self, source)
     )
 
     def train(config, folder, **options):

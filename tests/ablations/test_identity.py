@@ -108,7 +108,9 @@ def test_names_that_would_share_a_folder_get_one_each(tiny, tmp_path):
     assert main([*command, *QUICK]) == 0
     runs = {path.parent for path in tmp_path.glob("*/seed_0/config.json")}
     assert len(runs) == 2
-    models = {json.loads((run / "config.json").read_text())["task"]["model"]["traffic_flow"] is None for run in runs}
+    models = {
+        json.loads((run / "config.json").read_text())["task"]["model"]["priors"]["traffic_flow"] is None for run in runs
+    }
     assert models == {True, False}
 
 

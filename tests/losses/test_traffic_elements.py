@@ -47,7 +47,7 @@ def make_elements(seed, counts, related):
         lane_logits=rng.normal(size=(BATCH, related, QUERIES, FOUND)).astype(np.float32),
     )
     lanes = lanes.replace(successor_logits=lanes.successor_logits[:, LAYERS - related :])
-    return Prediction(lanes, jax.tree.map(jnp.asarray, found)), truth, stack_examples(elements)
+    return Prediction(centerlines=lanes, elements=jax.tree.map(jnp.asarray, found)), truth, stack_examples(elements)
 
 
 def overlap(a, b):
@@ -142,8 +142,8 @@ def test_padding_changes_nothing():
 def test_control_points_are_compared_where_asked_for():
     prediction, lanes, _ = make_elements(4, (0, 0, 0), related=LAYERS)
     one = jax.tree.map(lambda leaf: leaf[0], (prediction.centerlines, lanes))
-    config = TopoNetLossConfig(class_weight=0.0, points_weight=1.0, control_points=3)
-    cost = matching_cost(*one, config)
+    config = TopoNetLossConfig(class_weight=0.0, points_weight=1.0)
+    cost = matching_cost(*one, config, control_points=3)
     fit = bezier_fit(one[1].points.shape[1], 3)
     expected = np.abs(fit @ np.asarray(one[0].points[1, 2]) - fit @ one[1].points[4]).sum()
     assert float(cost[1, 2, 4]) == pytest.approx(expected, rel=1e-4)

@@ -6,15 +6,13 @@ import numpy as np
 from tests.golden import numbered, options
 from tests.golden_compare import compare
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import LaneGraph, stack_examples
 
 
 def decoder_config(case):
-    sizes = options(
-        case, "dim", "heads", "layers", "queries", "lane_points", "hidden", "pc_range", points=4, edge_weight=0.6
-    )
-    low_x, low_y, low_z, high_x, high_y, high_z = sizes.pc_range
+    sizes = options(case, "dim", "heads", "layers", "queries", "lane_points", "hidden", points=4, edge_weight=0.6)
     # Channels of a relationship head's sides; the baseline's fixture has no such head.
     hidden = numbered(case.params, r"lclc_branches\.0\.MLP_o1\.layers\.(\d+)\.bias")
     return LaneDecoderConfig(
@@ -28,8 +26,13 @@ def decoder_config(case):
         edge_weight=sizes.edge_weight,
         relation=len(case.params[hidden[-1]]) if hidden else 128,
         refine="fixed",
-        range=PerceptionRange((low_x, high_x), (low_y, high_y), (low_z, high_z)),
     )
+
+
+def encoder_config(case):
+    """Return an encoder whose BEV features cover the fixture's range; nothing else of it is used."""
+    low_x, low_y, low_z, high_x, high_y, high_z = options(case, "pc_range").pc_range
+    return EvidenceEncoderConfig(range=PerceptionRange((low_x, high_x), (low_y, high_y), (low_z, high_z)))
 
 
 def truth(case):

@@ -13,6 +13,7 @@ from tests.models.golden_lanes import (
     check,
     check_matching,
     decoder_config,
+    encoder_config,
     layers_first,
     queries_of,
     truth,
@@ -32,7 +33,7 @@ def test_lane_head_matches_the_reference(path):
 
 def check_head(case):
     decoder, weights = decoder_config(case), TopoNetLossConfig(points_weight=0.0075)
-    module = BevFormerDetr(BevFormerDetrConfig(decoder=decoder))
+    module = BevFormerDetr(BevFormerDetrConfig(encoder=encoder_config(case), decoder=decoder))
     lanes = truth(case)
     # The fixture has no relationship heads; ours get some, which nothing else depends on.
     bev = np.zeros(bev_maps(case, case.inputs["bev_feats"]).shape[1:], np.float32)

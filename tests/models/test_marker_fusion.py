@@ -111,7 +111,8 @@ def test_cameras_may_have_markers_too():
 
 def test_every_layer_of_the_bev_encoder_has_a_fusion_of_its_own():
     encoder = replace(BASELINE.encoder, dilations=(1, 2))
-    host = LaneGraphTask(replace(BASELINE, encoder=encoder, markers=CONFIG, sd_map=SMALL_SD_MAP))
+    priors = replace(BASELINE.priors, markers=CONFIG, sd_map=SMALL_SD_MAP)
+    host = LaneGraphTask(replace(BASELINE, encoder=encoder, priors=priors))
     shapes = jax.eval_shape(host.init, jax.random.key(0), seeing(observed()))
     assert {f"{prior}_{layer}" for prior in ("markers", "sd_map") for layer in (0, 1)} <= shapes["encoder"].keys()
 

@@ -182,7 +182,7 @@ def test_encoders_fuse_the_map_in_every_layer(make, layers):
     assert np.abs(out - absent).max() > 0.05
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
     # A host that never looked at a map, with the parameters that it would have.
-    without = jax.jit(lambda p: plain.apply(p, None, *inputs))(params)
+    without = jax.jit(lambda p: plain.apply(p, NO_MAP, *inputs))(params)
     np.testing.assert_allclose(absent, without, atol=1e-5)
 
 

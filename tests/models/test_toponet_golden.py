@@ -13,6 +13,7 @@ from tests.models.golden_lanes import (
     check,
     check_matching,
     decoder_config,
+    encoder_config,
     layers_first,
     queries_of,
     truth,
@@ -49,7 +50,7 @@ def test_lane_head_matches_the_reference(path):
 
 def check_head(case):
     decoder, weights = decoder_config(case), TopoNetLossConfig()
-    module = TopoNet(TopoNetConfig(decoder=decoder))
+    module = TopoNet(TopoNetConfig(encoder=encoder_config(case), decoder=decoder))
     lanes = truth(case)
     elements, found = element_truth(case, lanes.valid.shape[1])
 

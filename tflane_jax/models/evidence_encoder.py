@@ -26,7 +26,7 @@ class EvidenceEncoderConfig:
         cell: a block of `cell` x `cell` raster cells becomes one feature cell.
         dilations: of the convolutions, one residual block each.
         cells: see `CameraEncoderConfig.cells`.
-        range: the box that the raster covers, metres; equal to that of `BevSensorConfig.grid`.
+        range: the box that the raster covers, metres; equal to that of `BevSensorConfig.grid`, which training checks.
     """
 
     dim: int = 32

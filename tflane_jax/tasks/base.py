@@ -96,6 +96,11 @@ class Task(Generic[ExampleT, DataT]):
     # -----------------------------------------------------------------------------------------------------------------
     # Data
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Fields of an example that training and evaluation read; empty: all fields."""
+        return ()
+
     def load(self, source: Any, *, progress: bool = True) -> DataT:
         """Return a split, in memory or as a `Streamed` that reads examples on demand."""
         raise NotImplementedError

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.base import Dataset, ExampleConfig
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.datasets.data_source import SplitData
@@ -32,6 +32,7 @@ from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.host import HostConfig, HostMemory
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
@@ -196,10 +197,27 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         return shapes_of(keep(sources.sample(data.source("train")), self.parts))
 
     def check(self, data: SplitData, train: Example | Streamed) -> None:
-        """Raise UserError where a camera sees more BEV cells than it can serve."""
+        """Raise UserError if the ranges of model and data differ, or a camera sees more cells than `capacity`."""
+        self._check_ranges(data.source("train").example)
         encoder, cameras = self.model.encoder, first_example(train).cameras
         if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
             check_capacity(encoder.bev, cameras)
+
+    def _check_ranges(self, example: ExampleConfig) -> None:
+        encoder, bev_range = self.model.encoder, self.model.encoder.bev_range
+        if isinstance(encoder, EvidenceEncoderConfig) and example.sensor is not None:
+            raster = example.sensor.grid.range
+            if raster != bev_range:
+                raise UserError(
+                    f"the evidence raster covers x {raster.x}, y {raster.y} (data.example.sensor.grid.range), and the "
+                    f"model takes it for x {bev_range.x}, y {bev_range.y}: set task.model.encoder.range to the same"
+                )
+        low, high = (np.array([getattr(example.range, axis)[end] for axis in "xy"]) for end in (0, 1))
+        if not bev_range.contains(np.stack([low, high])).all():
+            raise UserError(
+                f"lanes are labelled within x {example.range.x}, y {example.range.y} (data.example.range), beyond the "
+                f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
+            )
 
     def prepare(self, data: SplitData) -> Prepare | None:
         """Return the photometric augmentation of the data, or None."""

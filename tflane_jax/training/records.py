@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+from tflane_jax.files.atomic import write_text
 
 Record = dict[str, Any]
 
@@ -40,9 +41,7 @@ class RecordWriter:
 
         path = folder / "metrics.jsonl"
         self.records = [record for record in read_records(path) if record["step"] <= step]
-        rewritten = path.with_suffix(".jsonl.tmp")
-        rewritten.write_text("".join(_line(record) for record in self.records), encoding="utf-8")
-        os.replace(rewritten, path)
+        write_text(path, "".join(_line(record) for record in self.records))
         self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
         purge = step + 1 if self.records else None
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=purge, write_to_disk=True)

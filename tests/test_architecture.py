@@ -47,24 +47,12 @@ FLOORS = (
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms.split()}
 
 LONGEST_FILE = 350
-# Files that are about to be split.
-KNOWN_LONG = {
-    "tests/world/test_roads.py",
-    "tflane_jax/markers/detection.py",
-}
 
 # About a second each: imported in functions, by the commands that need them.
 SLOW_MODULES = {"orbax", "matplotlib", "grain", "cv2", "pyarrow", "shapely", "tyro", "tensorboardX"}
 
 # Files that name the reference data outside the repository, to find it.
 FINDING_SHARED_DATA = {"tests/shared.py", "tests/golden.py", "tests/same_losses.py", "tests/test_architecture.py"}
-# Citations that are about to be replaced, in every file below these folders.
-KNOWN_CITING = (
-    "tflane_jax/convert/",
-    "tflane_jax/layers/",
-    "tflane_jax/markers/",
-    "tflane_jax/models/",
-)
 
 WIDEST_LINE = 120
 
@@ -133,7 +121,7 @@ def test_upward_imports_would_be_found():
 
 def test_no_python_file_is_too_long():
     long = {path: text.count("\n") for path, text in python_files().items() if text.count("\n") > LONGEST_FILE}
-    assert {path: lines for path, lines in long.items() if path not in KNOWN_LONG} == {}
+    assert long == {}
 
 
 def test_only_layers_and_models_use_linen():
@@ -185,8 +173,7 @@ def test_no_file_cites_files_outside_the_repository():
     texts = python_files() | pages() | {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in others}
     citing = {path: found for path, text in texts.items() if (found := citations(text))}
     assert "tests/test_architecture.py" in citing, "nothing found: has the pattern changed?"
-    allowed = {path for path in citing if path in FINDING_SHARED_DATA or path.startswith(KNOWN_CITING)}
-    assert {path: found for path, found in citing.items() if path not in allowed} == {}
+    assert {path: found for path, found in citing.items() if path not in FINDING_SHARED_DATA} == {}
 
 
 def citations(text: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""A run's configuration: what the parts' own configurations are assembled into, where files and overrides enter.
+"""A run's configuration, assembled from those of its parts; configuration files and overrides.
 
 A config file is Python with `get_config() -> RunConfig` and optionally `ablations() -> dict[str, RunConfig]`.
 """
@@ -35,9 +35,9 @@ from tflane_jax.training.schedule import OptimConfig
 if TYPE_CHECKING:
     from tflane_jax.datasets.data_source import SplitData as Data
 else:
-    Data = data_classes()  # JSON and overrides take the classes of `datasets.sources`
+    Data = data_classes()  # at runtime, the union of all data classes, for JSON and overrides
 T = TypeVar("T")
-# Configuration files import the classes of data from here or from their dataset's own file.
+# Configuration files import data classes from here or from their dataset's file.
 __all__ = [
     "EvaluationConfig",
     "FrontViewData",
@@ -55,15 +55,15 @@ __all__ = [
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that decides a run.
+    """Complete configuration of a run.
 
     Attributes:
         task: model, priors and losses.
-        data: examples of each split, of the kind that the task takes; one of the classes of `datasets.sources`.
-        optim: optimiser.
-        training: the program.
+        data: examples of each split, of the task's type; one of the classes of `datasets.sources`.
+        optim: optimizer and schedule.
+        training: the training program.
         evaluation: metrics and pictures.
-        weights: file of published PyTorch weights; `tflane predict` and `eval` take the configuration with them.
+        weights: file of published PyTorch weights, with which `tflane predict` and `eval` can use the configuration.
     """
 
     task: LaneGraphTask | LaneShapeTask = LaneGraphTask()
@@ -97,7 +97,7 @@ def load_ablations(name: str) -> dict[str, RunConfig]:
 
 
 def _called(path: Path, function: str, kind: type[T]) -> T:
-    """Run a config file and return what one of its functions gives."""
+    """Run a config file and return the result of one of its functions."""
     spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise UserError(f"config file {path} is no Python file (.py)")
@@ -126,8 +126,8 @@ def _named_errors(path: Path):
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
 
-    A part that may be absent, or of several classes, is chosen before all else, wherever it stands: `--a.b None`,
-    `--a.b default` or `--a.b NameOfItsClass`, with its defaults.
+    An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
+    `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
 
     Raises:
         UserError: an unknown setting (with the names closest to it), or a value of the wrong type.
@@ -136,12 +136,12 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
 
     config, arguments = _choose_parts(config, arguments)
     _check_names(config, arguments)
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
             return tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
-        raise UserError(_without_boxes(said.getvalue())) from error
+        raise UserError(_without_boxes(output.getvalue())) from error
 
 
 def override_names(config: RunConfig) -> list[str]:
@@ -150,10 +150,10 @@ def override_names(config: RunConfig) -> list[str]:
 
 
 def _choose_parts(config: RunConfig, arguments: Sequence[str]) -> tuple[RunConfig, list[str]]:
-    """Return the configuration with the parts that are chosen, and the other arguments."""
+    """Return the configuration with the chosen parts, and the remaining arguments."""
     left = list(arguments)
     while chosen := [i for i, argument in enumerate(left) if choices(config, _setting(argument))]:
-        # A part before what is inside it.
+        # Outer parts before inner ones.
         at = min(chosen, key=lambda i: _setting(left[i]).count("."))
         name, kinds = _setting(left[at]), choices(config, _setting(left[at]))
         _, equals, value = left.pop(at).partition("=")
@@ -186,7 +186,7 @@ def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
 
 
 def _closest(name: str, known: list[str]) -> list[str]:
-    """Return up to three names like `name`: as a whole, else by the last part alone."""
+    """Return up to three similar names: compared as a whole, else by their last parts."""
     whole = difflib.get_close_matches(name, known, 3, 0.75)
     last = name.rpartition(".")[2]
     parts = difflib.get_close_matches(last, sorted({k.rpartition(".")[2] for k in known}), 3, 0.75)
@@ -194,8 +194,8 @@ def _closest(name: str, known: list[str]) -> list[str]:
 
 
 def _without_boxes(text: str) -> str:
-    """Return what tyro says as one line: no frame, no title, nothing after the message itself."""
-    # A title, a rule (if there is no frame), the message, a rule, hints.
+    """Return tyro's error message as one line, without frame, title and hints."""
+    # tyro prints a title, a rule (unless framed), the message, a rule, hints.
     lines = [re.sub(r"[│─╭╮╰╯]|-{3,}", " ", line).strip() for line in text.splitlines()[1:]]
     paragraphs = re.split(r"\n{2,}", "\n".join(lines).strip())
     return paragraphs[0].replace("\n", " ")

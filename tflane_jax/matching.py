@@ -1,8 +1,8 @@
 """Bipartite (Hungarian) matching of queries to targets.
 
 The default backend is scipy on the host, called once per step for every layer, example and seed together: the callback
-batches under `vmap` by adding axes, and the host loops over all of them. Keep it out of prediction paths: a program
-with a callback can be neither exported nor cached.
+receives `vmap`ped axes as batch axes, and the host loops over them. Do not use it in prediction: a program with a
+host callback can be neither exported nor cached.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Assignment:
     """The query matched with each target.
 
     Attributes:
-        query: (N,) query index of each target; 0 where not matched.
-        matched: (N,) the target is valid and has a query; there may be more targets than queries.
+        query: (N,) query index of each target; 0 for unmatched targets.
+        matched: (N,) the target is valid and has a query. With more targets than queries, some are unmatched.
     """
 
     query: Int[Array, "*b n"]
@@ -36,12 +36,12 @@ class Assignment:
 def match(
     cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"], backend: Literal["scipy", "jax"] = "scipy"
 ) -> Assignment:
-    """Return the assignment of least total cost between queries and valid targets; no gradient flows.
+    """Return the assignment of minimum total cost between queries and valid targets; no gradient flows.
 
     Args:
-        cost: cost of giving target n to query q; ignored at invalid targets. Costs are clipped to +-1e6 and NaN counts
-            as 1e6, so that a diverging model fails at the loss and not here.
-        valid: false for padded targets.
+        cost: cost of matching query q with target n; ignored for invalid targets. Costs are clipped to +-1e6 and NaN
+            counts as 1e6, so that a diverging model fails at the loss and not here.
+        valid: False for padding.
         backend: "scipy" runs on the host, "jax" on the device.
     """
     cost = lax.stop_gradient(cost).astype(jnp.float32)
@@ -71,23 +71,23 @@ def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:
     cost = np.broadcast_to(cost, (*lead, *cost.shape[-2:])).reshape(-1, *cost.shape[-2:])
     valid = np.broadcast_to(valid, (*lead, valid.shape[-1])).reshape(-1, valid.shape[-1])
     query = np.full(valid.shape, -1, np.int32)
-    for problem, exists, answer in zip(cost, valid, query, strict=True):
+    for problem, exists, solution in zip(cost, valid, query, strict=True):
         columns = np.flatnonzero(exists)
         targets, queries = linear_sum_assignment(problem[:, columns].T)
-        answer[columns[targets]] = queries
+        solution[columns[targets]] = queries
     return query.reshape(*lead, -1)
 
 
 def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Solve one problem by successive shortest augmenting paths (Jonker-Volgenant); -1 for targets without a query.
 
-    One path per valid target, so that padding costs nothing. With more targets than queries, spare columns mean "no
-    query"; they cost more than any assignment.
+    One path per valid target, so padding takes no time. If there are more targets than queries, spare columns mean "no
+    query"; they cost more than any query.
     """
     queries, targets = cost.shape
     spare = max(targets - queries, 0)
-    dear = 2.0 * (jnp.max(jnp.where(valid[None], jnp.abs(cost), 0.0)) + 1.0)
-    table = jnp.concatenate([cost, jnp.full((spare, targets), dear)]).T  # (targets, columns)
+    spare_cost = 2.0 * (jnp.max(jnp.where(valid[None], jnp.abs(cost), 0.0)) + 1.0)
+    table = jnp.concatenate([cost, jnp.full((spare, targets), spare_cost)]).T  # (targets, columns)
     columns = queries + spare
     order = jnp.argsort(~valid, stable=True)  # valid targets first
 
@@ -95,24 +95,24 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
         owner, u, v = state  # owner (columns,): target that holds the column, -1 if free
 
         def grow(path):
-            reach, via, done, row, offset, _ = path
+            distance, via, done, row, offset, _ = path
             slack = table[row] - u[row] - v + offset
-            closer = ~done & (slack < reach)
-            reach, via = jnp.where(closer, slack, reach), jnp.where(closer, row, via)
-            column = jnp.argmin(jnp.where(done, jnp.inf, reach))
+            closer = ~done & (slack < distance)
+            distance, via = jnp.where(closer, slack, distance), jnp.where(closer, row, via)
+            column = jnp.argmin(jnp.where(done, jnp.inf, distance))
             done = done.at[column].set(True)
-            return reach, via, done, owner[column], reach[column], column
+            return distance, via, done, owner[column], distance[column], column
 
         def searching(path):
             return path[3] >= 0
 
         start = order[i]
-        reach = jnp.full(columns, jnp.inf)
-        path = (reach, jnp.full(columns, -1), jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
-        reach, via, done, _, shortest, end = lax.while_loop(searching, grow, path)
+        distance = jnp.full(columns, jnp.inf)
+        path = (distance, jnp.full(columns, -1), jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
+        distance, via, done, _, shortest, end = lax.while_loop(searching, grow, path)
 
         # Potentials inside the tree change by the rest of the shortest path.
-        gain = jnp.where(done, shortest - reach, 0.0)
+        gain = jnp.where(done, shortest - distance, 0.0)
         holders = jnp.where(done & (owner >= 0), owner, targets)  # index `targets` is dropped
         u = u.at[holders].add(gain, mode="drop").at[start].add(shortest)
         v = v - gain

@@ -1,6 +1,6 @@
-"""Runs as a whole: train a configuration, open a trained run or published weights, evaluate.
+"""Whole runs: train a configuration, open a trained run or published weights, evaluate.
 
-This is the Python side of `tflane train`, `eval` and `predict`; notebooks and the demo use it too.
+The Python interface behind `tflane train`, `eval` and `predict`, also for notebooks and the demo.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Run:
 
     Attributes:
         name: the run's folder, or the file of published weights.
-        config: resolved configuration, as the checkpoint carries it.
-        step: updates made.
+        config: resolved configuration, as stored in the checkpoint.
+        step: number of optimizer updates.
         params: averaged parameters of each seed, in the order of `config.training.seeds`.
     """
 
@@ -50,11 +50,11 @@ class Run:
 
 
 def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress: bool = True) -> TrainingResult:
-    """Train a configuration into a folder: data, evaluation on the validation split, curves and pictures included.
+    """Train a configuration into a folder, with data, evaluation on the validation split, curves and pictures.
 
-    Raises UserError as `training.loop.train` and the datasets do.
+    Raises UserError like `training.loop.train` and the datasets.
     """
-    check_start(folder, start)  # before data is made, which may take long
+    check_start(folder, start)  # before building data, which may take long
     task = config.task
     _check_metrics(config)
     data: Any = task.load(config.data.source("train"), progress=progress)
@@ -83,7 +83,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
 
 
 def _check_metrics(config: RunConfig) -> None:
-    """Raise UserError where a setting names a score that the evaluation does not give."""
+    """Raise UserError if a setting names a score that the evaluation does not compute."""
     known = config.task.score_names(config.data, config.evaluation)
     adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
     named = {"training.best_metric": config.training.best_metric}
@@ -92,24 +92,24 @@ def _check_metrics(config: RunConfig) -> None:
     for setting, name in named.items():
         if name not in known:
             listed = ", ".join(sorted(score for score in known if "@" not in score))
-            raise UserError(f"{setting} is {name}, which the evaluation does not give: choose one of {listed}")
+            raise UserError(f"{setting} is {name}, which the evaluation does not compute: choose one of {listed}")
 
 
 def build_data(source: Any) -> None:
-    """Make the examples of a source that are not in the cache yet; real data need nothing."""
+    """Generate the examples of a source that are not in the cache yet; no-op for data read from a folder."""
     build = source_of(source).build
     if build is not None:
         build(source, True)
 
 
 def load_test_data(config: RunConfig) -> Any:
-    """Return the examples of a configuration's test split; the last ones asked for stay in memory."""
+    """Return the examples of a configuration's test split; the latest result is cached in memory."""
     return _loaded(_TestData(config.data.source("test"), type(config.task), config.task.parts, config.task))
 
 
 @dataclass(frozen=True)
 class _TestData:
-    """A test split; the same for all models of one kind that read the same parts of an example."""
+    """Key of the cache: equal for all tasks of one class that read the same parts of an example."""
 
     source: Any
     kind: type
@@ -128,7 +128,7 @@ def resumable_config(folder: Path) -> RunConfig:
 
 
 def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return a saved configuration (JSON) as this version writes it, and a line for each change to tell the user.
+    """Return a saved configuration (JSON) in the present format, and a notice for the user for each change.
 
     Raises UserError for a setting that this version cannot read.
     """
@@ -138,14 +138,14 @@ def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
 
 def open_run(folder: Path, which: Which | None = None) -> Run:
-    """Return a run's averaged parameters and configuration from one of its checkpoints, which needs nothing else.
+    """Return a run's averaged parameters and configuration from one of its checkpoints alone.
 
     Args:
-        folder: of the run.
-        which: a step, "last" or "best"; None is the best where there was an evaluation, else the last.
+        folder: the run folder.
+        which: a step, "last" or "best"; None: the best checkpoint, or the last one of a run without evaluations.
 
     Raises:
-        UserError: there is no such checkpoint, it is damaged, or of a version that this one cannot read.
+        UserError: the checkpoint is missing, damaged, or of an unreadable version.
     """
     plain = Checkpoints(folder / "checkpoints")
     migrated, notices = migrate(plain.manifest(plain.find("last")).config)
@@ -163,7 +163,7 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
 def open_weights(config: RunConfig) -> Run:
     """Return a configuration's model with the published PyTorch weights that it names.
 
-    Raises UserError where it names none, or a file that does not hold this very model.
+    Raises UserError if it names none, or if the file does not match the model.
     """
     from tflane_jax.convert.published import load_weights
 
@@ -174,9 +174,9 @@ def open_weights(config: RunConfig) -> Run:
 
 
 def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
-    """Write a run of no steps that holds given parameters, for everything that takes a trained run.
+    """Write a run folder at step 0 with the given parameters, usable like a trained run.
 
-    Raises UserError where the folder holds something already.
+    Raises UserError if the folder is not empty.
     """
     config = replace(config, training=replace(config.training, seeds=(0,)))
     optimizer = make_optimizer(config.optim, config.training.steps)
@@ -192,21 +192,21 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
         add_provenance(folder)
         write_text(folder / "config.txt", to_text(config))
         Checkpoints(folder / "checkpoints").save(state, Manifest(step=0, config=to_json(config)))
-        write_json(folder / "config.json", to_json(config))  # last: from here on the folder holds a run
+        write_json(folder / "config.json", to_json(config))  # last: this file marks a complete run
 
 
 def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = True) -> tuple[str, list[dict[str, Any]]]:
     """Evaluate every seed of a run.
 
     Args:
-        run: see `open_run`.
-        source: the examples.
-        task: another way to use the parameters, such as `limit_instances` gives; None is the run's own.
-        progress: show bars while data is made.
+        run: as from `open_run`.
+        source: configuration of the examples.
+        task: a variant of the run's task, such as from `limit_instances`; None: the run's task.
+        progress: show progress bars while loading data.
 
     Returns:
-        The metric's protocol with its version, and rows for a table: one per group and seed; with several seeds,
-        their means and standard deviations (n - 1) follow.
+        The metric's protocol with its version, and rows of a table, one per group and seed; with several seeds, their
+        means and standard deviations (n - 1) follow.
     """
     task = run.config.task if task is None else task
     arrays = task.load(source, progress=progress)
@@ -225,7 +225,7 @@ def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = Tr
 
 
 def _drawing(config: RunConfig) -> Draw | None:
-    """Return the function that draws curves and a few validation examples, or None where matplotlib is missing."""
+    """Return the function that draws curves and a few validation examples, or None without matplotlib."""
     if importlib.util.find_spec("matplotlib") is None:
         print("no pictures: matplotlib is missing (pip install 'tflane_jax[plot]')", file=sys.stderr)
         return None

@@ -1,1 +1,1 @@
-"""What the commands of `tflane` do, one file each; `tflane_jax.cli` says what they take."""
+"""The commands of `tflane`, one file each; `arguments` defines their options."""

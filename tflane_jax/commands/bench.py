@@ -1,4 +1,4 @@
-"""`tflane bench`: the benchmarks live beside the package in a source checkout, not in it."""
+"""`tflane bench`. The benchmarks are part of a source checkout, beside the package, and are not installed."""
 
 from __future__ import annotations
 

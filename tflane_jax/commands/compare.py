@@ -38,7 +38,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 
 
 def _test_sets(arguments: Sequence[str]) -> dict[str, list[str]]:
-    """Return the settings of each NAME=SETTINGS."""
+    """Return the settings by test set, from arguments NAME=SETTINGS."""
     tests: dict[str, list[str]] = {}
     for argument in arguments:
         name, _, settings = argument.partition("=")
@@ -51,7 +51,7 @@ def _test_sets(arguments: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _named(reference: str) -> tuple[str, str]:
-    """Split NAME=FILE[:ABLATION]; the default name is that of the file or ablation."""
+    """Return name and reference of [NAME=]FILE[:ABLATION]; the default name is that of the ablation or file."""
     name, separator, path = reference.partition("=")
     if separator:
         return name, path

@@ -1,4 +1,4 @@
-"""`tflane convert`: published PyTorch weights as a run folder, to evaluate, predict and fine-tune with."""
+"""`tflane convert`: published PyTorch weights to a run folder, for evaluation, prediction and fine-tuning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the run and the account of every tensor."""
+    """Write the run, and a table with the conversion of every tensor."""
     configure_jax()
     config = load_config(options.config)
     weights = options.weights or config.weights

@@ -25,7 +25,7 @@ _PRINTED_FAULTS = 50
 
 
 def show(options: argparse.Namespace) -> int:
-    """Draw samples of a split and print counts of what is in them."""
+    """Draw samples of a split, and print counts of their content."""
     config = RunConfig() if options.config is None else load_config(options.config)
     if options.data is not None and sources.named_source(options.data).example is RoadImage:
         config = _images(config)
@@ -50,7 +50,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def _images(config: RunConfig) -> RunConfig:
-    """Return a configuration whose data are images, so that --data can show images without a config file."""
+    """Return a configuration for images, so that --data can show images without a config file."""
     return config if isinstance(config.task, LaneShapeTask) else RunConfig(LaneShapeTask(), FrontViewData())
 
 
@@ -110,14 +110,14 @@ def overlap_of_splits(options: argparse.Namespace) -> int:
 
 
 def build(options: argparse.Namespace, overrides: Sequence[str]) -> int:
-    """Make the examples of every split of a configuration ahead of training, where they are made at all."""
+    """Generate the examples of every split of a configuration, if its source generates examples."""
     config = RunConfig() if options.config is None else load_config(options.config)
     config = apply_overrides(config, overrides)
     for split in SPLITS:
         source = config.data.source(split)
         build = sources.source_of(source).build
         if build is None:
-            print(f"{split}: {sources.source_name(source)} is read when it is needed, nothing to build")
+            print(f"{split}: {sources.source_name(source)} is read on demand, nothing to build")
         else:
             print(f"{split}: {build(source, True)} examples ready")
     return 0

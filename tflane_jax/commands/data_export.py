@@ -1,4 +1,4 @@
-"""`tflane data export`: a dataset with cameras in OpenLane-V2's layout."""
+"""`tflane data export`: writes a dataset with cameras in OpenLane-V2's layout."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tflane_jax.plots.tables import format_table
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
-    """Write the splits, check what was written, and print how much it is."""
+    """Write the splits, check the written files, and print their counts."""
     config = apply_overrides(load_config(options.config), overrides)
     splits = dict.fromkeys(options.splits)
     datasets = {split: sources.open_dataset(chosen_source(config, options, split)) for split in splits}

@@ -8,7 +8,7 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace) -> int:
-    """Train, evaluate and draw the comparison."""
+    """Train with and without traffic flow, evaluate, and draw the comparison."""
     from tflane_jax.demo import main  # pyright: ignore[reportMissingImports]
 
     configure_jax()

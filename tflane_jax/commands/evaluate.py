@@ -15,7 +15,7 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace) -> int:
-    """Evaluate, print the table and write it as Markdown and JSON."""
+    """Evaluate, print the table, and write it as Markdown and JSON."""
     configure_jax()
     trained, rest = opened(options)
     if rest:

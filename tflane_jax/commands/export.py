@@ -1,4 +1,4 @@
-"""`tflane export`: a monocular model as one StableHLO file, checked against the model and timed."""
+"""`tflane export`: writes a monocular model as one StableHLO file, checks its outputs, and measures latency."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
 HEIGHT, WIDTH = 360, 640
-_TOLERANCE = 1e-5  # other batch sizes round differently
+_TOLERANCE = 1e-5  # rounding depends on the batch size
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the file and the table beside it."""
+    """Write the program, and the table of latencies beside it."""
     configure_jax()
     run, rest = opened(options)
     if rest:

@@ -1,4 +1,4 @@
-"""`tflane markers store`: the on-board store of a log's markers."""
+"""`tflane markers store`: writes the on-board store of a log's markers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tflane_jax.world.simulate import simulate
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write a store, read it back, and print what it holds."""
+    """Write a store, read it back, and print its content."""
     if not options.radius > 0.0:
         raise UserError(f"--radius must be more than 0 m, not {options.radius:g}")
     surveyed, expires = _day(options.surveyed, "--surveyed"), _day(options.expires, "--expires")
@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _open_log(name: str) -> Log:
-    """Return the scene of the built-in world with this number, or the Argoverse 2 log in this folder."""
+    """Return a scene of the built-in world by its number, or an Argoverse 2 log by its folder."""
     if name.isdecimal():
         return simulate(int(name))
     if not Path(name).is_dir():

@@ -1,12 +1,13 @@
 """`tflane markers detect` and `tflane markers curves`.
 
-detect: detections.json, and one picture for each photo with the outline and the axes of every marker in it (x red, y
-green, z blue):
+`detect` writes one picture for each photo, with the outline and the axes of every marker (x red, y green, z blue), and
+detections.json:
     {"family", "size", "photos": [{"file", "picture", "markers": [{"id", "score", "position", "distance", "turn",
      "reprojection", "ambiguity", "pose"}, ...]}, ...]}
-    position and pose (ego_from_marker, 4 x 4) in the ego frame below the camera: x forward, y left, z up, metres.
+    Position and pose (ego_from_marker, 4 x 4) are in the ego frame, on the ground below the camera: x forward, y left,
+    z up, metres.
 
-curves: curves-NAME.md and .json for each curve, and curves.png.
+`curves` writes curves-NAME.md and .json for each curve, and curves.png.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _OUTLINE = (255, 210, 0)
 
 
 def find(options: argparse.Namespace) -> int:
-    """Find the markers in photos of one calibrated camera; print a table, write pictures and detections.json."""
+    """Detect markers in photos of one calibrated camera; print a table, write pictures and detections.json."""
     photos = list_photos(options.images)
     config = DetectorConfig(_family(options.family), options.size, corners=options.corners, enlarge=options.enlarge)
     config.validate()
@@ -63,15 +64,15 @@ def find(options: argparse.Namespace) -> int:
 
 
 def curves(options: argparse.Namespace) -> int:
-    """Measure how rate and pose get worse with distance; write tables and a picture."""
+    """Measure detection rate and pose error over distance; write tables and a picture."""
     if min(options.scales) <= 0.0:
-        raise UserError(f"--scales are positive shares of the native image, not {min(options.scales):g}")
+        raise UserError(f"--scales are positive fractions of the native image size, not {min(options.scales):g}")
     if not options.sigma_d > 0.0:
         raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
     make_folder(options.out)
     drawn: dict[str, list[dict[str, Any]]] = {}
     for scale in options.scales:
-        # The same scenes for all ways of finding corners.
+        # All corner methods see the same scenes.
         configs = [
             CurveConfig(
                 seeds=options.seeds,
@@ -113,7 +114,7 @@ def _without_distortion(
         return photo
     if len(distortion) not in (4, 5, 8):
         raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
-    # OpenCV counts pixels from the middle of the first one.
+    # OpenCV's pixel origin is the centre of the first pixel, ours its corner.
     shifted = intrinsics - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
     return opencv().undistort(photo, shifted, np.array(distortion))
 
@@ -127,7 +128,7 @@ def _views(
 
 def _record(found: DetectedMarkers, k: int) -> dict[str, Any]:
     pose = np.asarray(found.pose[k], np.float64)
-    # Its face turned to the left of facing straight back along x.
+    # 0 if the marker faces back along x, positive if it is turned to its own left.
     turn = np.rad2deg(np.arctan2(-pose[1, 2], -pose[0, 2]))
     return {
         "id": int(found.marker_id[k]),

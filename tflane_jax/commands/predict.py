@@ -1,4 +1,4 @@
-"""`tflane predict`; `predict_lanes` (lanes around the vehicle) and `predict_images` describe the files written."""
+"""`tflane predict`. For the written files, see `predict_lanes` (lanes around the vehicle) and `predict_images`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace) -> int:
-    """Predict with the first seed and write everything into --out."""
+    """Predict with the first seed, and write all files to --out."""
     configure_jax()
     trained, photos = opened(options)
     if not isinstance(trained.config.task, LaneShapeTask):

@@ -3,9 +3,10 @@
 Photos: predictions.json, and one picture for each photo:
     {"model", "step", "photos": [{"file", "width", "height", "picture",
      "lanes": [{"score", "points": [[column, row], ...]}, ...]}, ...]}
-    Points are in pixels of the photo, from the upper end of a lane to the lower one; lanes go from left to right.
+    Points are in pixels of the photo, from the upper end of a lane to the lower end; lanes are in order from left to
+    right.
 
-Examples of a split: pictures.png, and predictions.json and truth.json in TuSimple's format (one record a line), which
+Examples of a split: pictures.png, and predictions.json and truth.json in TuSimple's format (one record per line), which
 `tflane score tusimple` reads.
 """
 
@@ -37,7 +38,7 @@ from tflane_jax.tasks.lane_shape import found_lanes, predict_curves
 
 
 def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
-    """Find the lanes in photos of any size; write a picture of each and the points of all."""
+    """Predict the lane lines in photos of any size; write a picture of each, and the points of all."""
     photos = list_photos(paths)
     camera = PhotoCamera(options.focal, options.horizon)
     make_folder(options.out)
@@ -49,7 +50,7 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
         answer = jax.tree.map(lambda leaf: leaf[0], predict_curves(trained.config.task, trained.params[0], stacked))
         lanes = fitted.placement.to_photo(predicted_lines(answer))
-        # Predicted lanes may leave the picture; points outside it are neither drawn nor written.
+        # Predicted lanes may leave the photo; points outside are neither drawn nor written.
         inside = [_inside(lane, photo.shape) for lane in lanes]
         scores = lane_shapes.lane_scores(answer)[lane_shapes.left_to_right(answer)]
         found = [
@@ -69,7 +70,7 @@ def predict_photos(trained: Run, paths: list[Path], options: argparse.Namespace)
 
 
 def predict_split(trained: Run, options: argparse.Namespace) -> int:
-    """Find the lanes in some images of a split; write them beside the true ones."""
+    """Predict the lane lines in some images of a split; write predictions and ground truth."""
     dataset = sources.open_dataset(chosen_source(trained.config, options))
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
@@ -104,7 +105,7 @@ def _inside(lane: Float[np.ndarray, "p 2"], shape: tuple[int, ...]) -> Float[np.
 
 
 def _picture_names(photos: list[Path]) -> list[str]:
-    """Return a file name for each photo's picture; photos of the same name in different folders get numbers."""
+    """Return a file name for each photo's picture; photos with equal names in different folders get numbers."""
     seen: dict[str, int] = {}
     names: list[Any] = []
     for photo in photos:

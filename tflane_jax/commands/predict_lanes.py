@@ -2,10 +2,10 @@
 
 predictions.npz, arrays over F frames and Q queries:
     points (F, Q, P, 3), metres, ego frame; scores (F, Q), 0 to 1; successor (F, Q, Q), 0 to 1: [f, i, j] is the score
-    that lane j continues lane i; scene (F,) and timestamp_ns (F,) name the frame. A model with traffic elements adds,
-    over E element queries, box (F, E, 2, 2), corners in pixels of the front image; attribute_score (F, E, 13); and
-    element_lane (F, Q, E), 0 to 1: [f, i, e] is the score that element e governs lane i.
-truth.npz, the true lanes of the same frames over G slots:
+    that lane j continues lane i; scene (F,) and timestamp_ns (F,) identify the frame. A model with traffic elements
+    adds arrays over E element queries: box (F, E, 2, 2), corners in pixels of the front image; attribute_score
+    (F, E, 13); element_lane (F, Q, E), 0 to 1: [f, i, e] is the score that element e governs lane i.
+truth.npz, the ground-truth lanes of the same frames over G slots:
     points (F, G, P, 3), successor (F, G, G), valid (F, G), visibility (F, G), scene and timestamp_ns. `tflane score`
     reads both files.
 
@@ -43,7 +43,7 @@ _RELATION_THRESHOLD = 0.5
 
 
 def predict(trained: Run, options: argparse.Namespace) -> int:
-    """Predict some examples of a split with the first seed and write everything into --out."""
+    """Predict some examples of a split with the first seed, and write all files to --out."""
     task = limited_task(trained, options) or trained.config.task
     source = chosen_source(trained.config, options)
     dataset = sources.open_dataset(source)
@@ -139,6 +139,6 @@ def _relations(scores: Float[np.ndarray, "a b"], first: str, second: str) -> lis
 
 
 def _save_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    # An open file, because numpy appends .npz to any other name.
+    # An open file, because numpy would append .npz to the temporary name.
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]

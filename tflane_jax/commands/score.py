@@ -12,7 +12,7 @@ from tflane_jax.scoring.score import Scored, score
 
 
 def run(options: argparse.Namespace) -> int:
-    """Score, print the table and write it as Markdown and JSON."""
+    """Score, print the table, and write it as Markdown and JSON."""
     protocol = find_protocol(options.protocol)
     if options.bootstrap < 0:
         raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws, 0 for none")

@@ -1,4 +1,4 @@
-"""The model and the data that a command's options name."""
+"""The model and the data selected by a command's options."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _KINDS = {Example: "lane graphs", RoadImage: "images"}
 
 
 def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
-    """Return the model and the inputs that are left.
+    """Return the model and the remaining inputs.
 
     The model is that of --config (published weights), or else the first input (a run folder).
     """
@@ -45,18 +45,18 @@ def limited_task(run: Run, options: argparse.Namespace) -> Any:
 
 
 def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split | None = None) -> Any:
-    """Return the data that --split, --data, --root and --openlane name: a config of `datasets.sources`.
+    """Return the data selected by --split, --data, --root and --openlane: a configuration of `datasets.sources`.
 
-    Without --data and --root it is the configuration's own split. With --data, sizes of examples stay as configured.
+    Without --data and --root, this is the configuration's split. With --data, sizes of examples stay as configured.
 
     Args:
-        config: of the run; its task decides the kind of example.
+        config: of the run; its task determines the type of examples.
         options: of the command line.
-        split: in place of --split.
+        split: overrides --split.
 
     Raises:
-        UserError: a source with another kind of example, a --root that is missing or not taken, or a folder that does
-            not have the split.
+        UserError: the source has another type of examples, --root is missing or not supported, or the folder does not
+            have the split.
     """
     given = split or options.split
     split = given or options.default_split
@@ -76,7 +76,7 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
 
 
 def _check_choice(source: DataSource[Any], kind: type[Any], options: argparse.Namespace) -> None:
-    """Raise UserError where a source gives another kind of example, or --root is missing or not taken."""
+    """Raise UserError if a source has another type of examples, or --root is missing or not supported."""
     if source.example is not kind:
         names = source_names(kind)
         raise UserError(
@@ -92,7 +92,7 @@ def _check_choice(source: DataSource[Any], kind: type[Any], options: argparse.Na
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder that a command writes to; raise UserError where that fails."""
+    """Create the output folder of a command; raise UserError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

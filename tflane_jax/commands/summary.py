@@ -1,4 +1,4 @@
-"""`tflane summary`: parameters, operations and memory of a configuration, from shapes alone."""
+"""`tflane summary`: parameters, operations and memory of a configuration, computed from shapes alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
-    """Print the two tables, and save them where --out says."""
+    """Print the two tables, and save them to --out."""
     configure_jax()
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)

@@ -11,7 +11,7 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
-    """Evaluate trained models over the values of a setting."""
+    """Evaluate trained models for each value of a setting."""
     from tflane_jax.ablations.sweep import sweep
 
     pairs = [reference.partition("=") for reference in options.runs]

@@ -41,7 +41,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in {result.compile_seconds:.1f} s"
     )
     for name, value in result.metrics.items():
-        if "@" not in name:  # single thresholds are in metrics.jsonl
+        if "@" not in name:  # scores at single thresholds are in metrics.jsonl only
             print(f"  {name} = {value:.4f}")
     print(f"evaluate with: tflane eval {out}")
     return 0

@@ -1,7 +1,7 @@
-"""PyTorch checkpoints read without PyTorch, and without running anything that they name.
+"""Reads PyTorch checkpoints without PyTorch, and without executing code from them.
 
 Formats: zip (PyTorch >= 1.6: pickled object, one raw file per storage), its predecessor (pickles, then raw storages),
-plain pickles of arrays, and `.npz`. The content decides, not the suffix.
+plain pickles of arrays, and `.npz`. The format is detected from the content, not from the suffix.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import Refused
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
-# Where training programs keep the weights, the likeliest first.
+# Entries where training programs keep the weights, the most likely first.
 _WEIGHTS = ("state_dict", "model_state_dict", "model", "net", "network", "module", "weights", "params")
 
 
-# Tensors may share storages and repeat elements. Together they have at most so many elements per byte of the file, and
-# so many more.
+# Tensors may share storages and repeat elements (stride 0). A file may have at most
+# _MOST_REPEATED + _MOST_SHARED * (its bytes) elements in total, so that a small file cannot exhaust memory.
 _MOST_SHARED = 8
 _MOST_REPEATED = 2**24
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a file holds.
+    """Content of a checkpoint file.
 
     Attributes:
-        tensors: by the file's names, in its order; floats of fewer than 32 bits as float32.
-        entry: where in the file they stand, such as "state_dict"; "" for the file's own level.
-        others: names beside the tensors that are none: counters, settings.
+        tensors: by name, in the order of the file; floats of fewer than 32 bits as float32.
+        entry: path of the tensors in the file, such as "state_dict"; "" is the top level.
+        others: names beside the tensors that are not tensors: counters, settings.
     """
 
     tensors: dict[str, np.ndarray]
@@ -57,11 +57,11 @@ def read_checkpoint(path: Path, entry: str | None = None) -> Checkpoint:
 
     Args:
         path: the file.
-        entry: where in the file the weights stand, such as "ema/state_dict"; found where there is no doubt.
+        entry: path of the weights in the file, such as "ema/state_dict"; None: found if it is unambiguous.
 
     Raises:
-        UserError: there is no such file, it is damaged or no checkpoint, it names anything but tensors and plain data,
-            it has several sets of tensors and `entry` does not say which, or a tensor is quantised or sparse.
+        UserError: the file is missing, damaged or no checkpoint; it refers to anything but tensors and plain data; it
+            has several sets of tensors and no `entry` is given; or a tensor is quantised or sparse.
     """
     path = Path(path)
     try:
@@ -76,7 +76,7 @@ def read_checkpoint(path: Path, entry: str | None = None) -> Checkpoint:
         ) from None
     except (Damaged, UserError) as error:
         raise UserError(f"{path}: {error}") from None
-    # A damaged file may ask for any operation on any operands.
+    # Unpickling a damaged file can raise any exception.
     except Exception as error:
         raise UserError(
             f"{path} is no PyTorch checkpoint, or it is damaged{_opening(path)} ({type(error).__name__}: "
@@ -85,12 +85,12 @@ def read_checkpoint(path: Path, entry: str | None = None) -> Checkpoint:
 
 
 class _Contents(NamedTuple):
-    """The object of a file, and its storages.
+    """The unpickled object of a file, and its storages.
 
     Attributes:
-        tree: plain data and records of tensors.
-        read: returns a storage's bytes by key.
-        byteorder: of the storages.
+        tree: plain data and `Tensor` records.
+        read: returns the bytes of a storage by its key.
+        byteorder: of the storages, "little" or "big".
     """
 
     tree: Any
@@ -151,7 +151,7 @@ def _zip_contents(archive: zipfile.ZipFile, root: str) -> _Contents:
 
 
 def _legacy_contents(file: IO[bytes]) -> _Contents:
-    """Read the format before 1.6: magic number, version, machine, object, keys; then each storage with its size."""
+    """Read the format before PyTorch 1.6: magic number, version, machine, object, keys, then the storages."""
     tree = TorchUnpickler(file).load()
     if not isinstance(tree, int) or tree != _LEGACY_MAGIC:
         return _Contents(tree, _nothing, "little")
@@ -211,8 +211,8 @@ def _state_dict(contents: _Contents, entry: str | None, size: int) -> Checkpoint
 
 
 def _find(tree: Any, place: tuple[str, ...], seen: set[int]) -> list[tuple[str, ...]]:
-    """Return where in a tree of dicts tensors stand by name; likely places hide the others."""
-    # What a file holds may hold itself.
+    """Return the paths of dicts that hold tensors; an entry of `_WEIGHTS` takes precedence over all others."""
+    # Pickled dicts may contain themselves.
     if not isinstance(tree, dict) or id(tree) in seen:
         return []
     seen.add(id(tree))
@@ -226,7 +226,7 @@ def _find(tree: Any, place: tuple[str, ...], seen: set[int]) -> list[tuple[str, 
 
 
 def _descend(tree: Any, place: tuple[str, ...]) -> tuple[Any, tuple[str, ...]]:
-    """Return what stands at a place, and the place."""
+    """Return the entry at a path, and the path."""
     for i, name in enumerate(place):
         if not isinstance(tree, dict) or not dict.__contains__(tree, name):
             where = _shown(place[:i]) or "the file"
@@ -254,7 +254,7 @@ def _within(entry: str | None) -> str:
 
 
 def _opening(path: Path) -> str:
-    """Return how a text file begins: what was downloaded may be an error page or a pointer to the file."""
+    """Return the first line of a text file: a failed download may be an error page or a Git LFS pointer."""
     try:
         with path.open("rb") as file:
             line = (file.read(60).decode("ascii").splitlines() or [""])[0]

@@ -1,6 +1,6 @@
-"""What PyTorch's pickles are made of: records of tensors and storages, and arrays made of them.
+"""Unpickling of PyTorch's tensors and storages to records, and conversion of these to arrays.
 
-Nothing of PyTorch is imported or run: each name that a checkpoint needs stands for a record or a constant of this file.
+Nothing of PyTorch is imported or run: every name in a checkpoint is mapped to a record or a constant of this file.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ import numpy as np
 
 from tflane_jax.files.plain_pickle import PLAIN, Refused, RestrictedUnpickler, Sealed
 
-# No offset, size or stride is larger.
+# Upper limit of offsets, sizes and strides.
 _LARGEST = 2**48
 
 
 class Damaged(Exception):
-    """What is wrong with a file or a tensor."""
+    """A file or tensor is damaged or unsupported; the message names the reason."""
 
 
 class Storage(NamedTuple):
-    """Elements that tensors share: `size` elements of type `kind` from `start` in the file's storage `key`."""
+    """A storage of tensors: `size` elements of type `kind`, from element `start` of the file's storage `key`."""
 
     key: str
     kind: str
@@ -36,7 +36,7 @@ class Storage(NamedTuple):
 
 
 class Tensor(NamedTuple):
-    """A view of a storage; offset and strides count elements. `kind` is None where it is the storage's."""
+    """A view of a storage; offset and strides in elements. `kind` None: that of the storage."""
 
     storage: Storage
     offset: int
@@ -48,13 +48,13 @@ class Tensor(NamedTuple):
 
 
 class Unreadable(NamedTuple):
-    """A tensor of a sort that is not read."""
+    """A tensor of an unsupported sort."""
 
     what: str
 
 
 class Kind(NamedTuple):
-    """An element type: as stored, and as returned; None where it is not read."""
+    """An element type: as stored, and as returned (None: unsupported)."""
 
     stored: np.dtype
     returned: np.dtype | None
@@ -69,7 +69,7 @@ def _kinds(names: str, returned: str | None = "") -> dict[str, Kind]:
 
 KINDS: dict[str, Kind] = {
     **_kinds("float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64 complex64 complex128"),
-    # Narrow floats are exact in float32.
+    # float32 represents narrow floats exactly.
     **_kinds("float16 bfloat16 float8_e4m3fn float8_e5m2 float8_e4m3fnuz float8_e5m2fnuz float8_e8m0fnu", "float32"),
     "bool": Kind(np.dtype(np.uint8), np.dtype(bool)),
     "bytes without a type": Kind(np.dtype(np.uint8), np.dtype(np.uint8)),
@@ -82,14 +82,14 @@ KINDS: dict[str, Kind] = {
 
 
 def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *rest: Any) -> Tensor:
-    """Stand for `_rebuild_tensor` and `_rebuild_tensor_v2` (requires_grad, backward_hooks, metadata)."""
+    """Replace `_rebuild_tensor` and `_rebuild_tensor_v2` (requires_grad, backward_hooks, metadata)."""
     return _view(storage, offset, shape, strides, None, rest[2] if len(rest) > 2 else None)
 
 
 def _typed_tensor(
     storage: Any, offset: Any, shape: Any, strides: Any, grad: Any, hooks: Any, kind: Any, metadata: Any = None
 ) -> Tensor:
-    """Stand for `_rebuild_tensor_v3`."""
+    """Replace `_rebuild_tensor_v3`."""
     return _view(storage, offset, shape, strides, kind, metadata)
 
 
@@ -104,12 +104,12 @@ def _view(storage: Any, offset: Any, shape: Any, strides: Any, kind: str | None,
 
 
 def _first(value: Any, *rest: Any) -> Any:
-    """Stand for what wraps a tensor: `_rebuild_parameter(_with_state)`."""
+    """Replace wrappers of a tensor: `_rebuild_parameter(_with_state)`."""
     return value
 
 
 def _with_attributes(function: Any, kind: Any, arguments: Any, *state: Any) -> Any:
-    """Stand for `_rebuild_from_type_v2`, which adds attributes to a tensor."""
+    """Replace `_rebuild_from_type_v2`, which adds attributes to a tensor."""
     if not isinstance(function, Sealed) or kind not in ("Tensor", "Parameter"):
         raise Refused(f"a tensor of type {reprlib.repr(kind)}")
     return function(*arguments)
@@ -169,7 +169,7 @@ ALLOWED = {
     ("torch.serialization", "_get_layout"): Sealed(_first),
     ("torch", "device"): Sealed(lambda *_: "device"),
     ("torch", "Size"): Sealed(_first),
-    # What training scripts keep beside the weights.
+    # Training scripts save these beside the weights.
     ("argparse", "Namespace"): types.SimpleNamespace,
     ("collections", "defaultdict"): Sealed(lambda *_: {}),
     ("collections", "Counter"): Sealed(lambda *_: {}),
@@ -179,20 +179,20 @@ ALLOWED = {
 
 
 class TorchUnpickler(RestrictedUnpickler):
-    """Reads the object of a checkpoint.
+    """Unpickles the object of a checkpoint.
 
     Attributes:
-        storages: the file's storages that the object names, by key.
+        storages: the file's storages that the object refers to, by key.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
-        """Read from where the file stands."""
+        """Start at the file's present position."""
         _check_instructions(file)
         super().__init__(file, ALLOWED, encoding="latin1")
         self.storages: dict[str, Storage] = {}
 
     def persistent_load(self, pid: Any) -> Storage:
-        """Return the storage that an id stands for: ("storage", type, key, device, size[, view of an older file])."""
+        """Return the storage of an id ("storage", type, key, device, size[, view, in older files])."""
         match pid:
             case ("storage", str(kind), str(key), _, int(size), *view) if kind in KINDS:
                 self.storages[key] = Storage(key, kind, 0, size)
@@ -207,7 +207,7 @@ class TorchUnpickler(RestrictedUnpickler):
 
 
 def _check_instructions(file: IO[bytes]) -> None:
-    """Refuse what reaches past `find_class`, or makes the unpickler take memory for what is not there."""
+    """Refuse opcodes that bypass `find_class`, or that make the unpickler allocate memory without data."""
     start = file.tell()
     for count, (instruction, argument, _) in enumerate(pickletools.genops(file)):
         if instruction.name in ("EXT1", "EXT2", "EXT4"):
@@ -221,13 +221,13 @@ def to_array(tensor: Tensor | Unreadable, read: Callable[[str], bytes], byteorde
     """Return a tensor's elements.
 
     Args:
-        tensor: what to read.
-        read: returns the bytes of the file's storage of a key.
+        tensor: record of the tensor.
+        read: returns the bytes of a storage by its key.
         byteorder: "little" or "big", that of the file.
-        most: more elements are not given, since strides of 0 make them of nothing.
+        most: largest number of elements; strides of 0 would repeat elements without limit.
 
     Raises:
-        Damaged: the tensor is of a sort that is not read, or its elements are not there.
+        Damaged: the tensor is of an unsupported sort, too large, or its elements are missing.
     """
     remedy = "Save it as a dense tensor of floats in PyTorch"
     if isinstance(tensor, Unreadable):
@@ -250,7 +250,7 @@ def to_array(tensor: Tensor | Unreadable, read: Callable[[str], bytes], byteorde
     data = read(storage.key)
     if len(data) < (storage.start + storage.size) * unit:
         raise Damaged("has a storage that is cut short")
-    # A complex number is two numbers.
+    # Swap the bytes of real and imaginary parts separately.
     size = stored.itemsize
     part = np.dtype(f"u{size // 2 if stored.kind == 'c' else size}")
     flat = np.frombuffer(data, part, elements * size // part.itemsize, storage.start * unit)

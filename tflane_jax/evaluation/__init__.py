@@ -1,1 +1,1 @@
-"""Predictions and examples to every protocol."""
+"""Evaluation: predictions and examples converted to the inputs of every protocol."""

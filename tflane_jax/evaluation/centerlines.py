@@ -1,4 +1,4 @@
-"""Examples and predictions as the OpenLane-V2 centerline metrics compare them (host, numpy, one frame)."""
+"""Examples and predictions as inputs of the OpenLane-V2 centerline metrics (host, numpy, one frame)."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def detections_from_prediction(
 ) -> LaneDetections:
     """Return the lanes (and traffic elements) of all queries of ONE example's last layer, best score first.
 
-    Without topology, no edge has any confidence. No score threshold. The attribute of a traffic element is the one with
-    the highest score of its query.
+    All queries are kept, whatever their score. Without predicted topology, all edges have confidence 0. A traffic
+    element gets the attribute with the highest score.
     """
     scores = expit(np.asarray(prediction.logits)).max(-1)
     order = np.argsort(-scores, kind="stable")
@@ -49,9 +49,9 @@ def detections_from_prediction(
 
 
 def element_detections(elements: ElementPrediction, lanes: Int[np.ndarray, " p"] | None = None) -> ElementDetections:
-    """Return the traffic elements, best score first, with the lanes in the given order (None: that of the queries).
+    """Return the traffic elements, best score first, with lanes in the given order (None: query order).
 
-    Raises ValueError for a prediction without lane-element topology.
+    Raises ValueError if the prediction has no lane-element topology.
     """
     if elements.lane_logits is None:
         raise ValueError("the metrics of traffic elements need the lane-element topology (lane_logits)")

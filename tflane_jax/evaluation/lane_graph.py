@@ -1,4 +1,4 @@
-"""All protocols for what is around the vehicle, chosen by what a model predicts and an example labels.
+"""All protocols for lanes around the vehicle, selected by what a model predicts and an example labels.
 
 | predicted part | protocol | groups of numbers |
 |---|---|---|
@@ -31,11 +31,11 @@ from tflane_jax.scene import ElementPrediction, Example, LinePrediction, Predict
 
 
 class LaneGraphMetrics:
-    """Accumulator of every protocol that applies; which ones, the first frame's prediction decides.
+    """Accumulator of all protocols that apply to the predicted parts.
 
     Args:
-        versions: of the OpenLane-V2 centerline metrics.
-        frame_groups: names of groups of frames, see `GroupedCenterlineMetrics`.
+        versions: versions of the OpenLane-V2 centerline metrics.
+        frame_groups: names of the groups of frames, see `GroupedCenterlineMetrics`.
     """
 
     def __init__(self, versions: Sequence[Version] = ("v2.1",), frame_groups: Sequence[str] = ()) -> None:
@@ -53,12 +53,12 @@ class LaneGraphMetrics:
         """Add one frame.
 
         Args:
-            prediction: of the last decoder layer, for this example alone.
-            example: with the truth of everything that is predicted. Traffic elements count where both have them.
-            frame_group: the group of frames that this frame belongs to.
+            prediction: the last decoder layer's prediction for this example.
+            example: ground truth of all predicted parts. Traffic elements are measured if both have them.
+            frame_group: the group that this frame belongs to.
 
         Raises:
-            ValueError: nothing is predicted that a protocol measures.
+            ValueError: no protocol measures any predicted part.
         """
         parts = tuple(name for name in ("centerlines", "segments", "lines") if getattr(prediction, name) is not None)
         if not parts:
@@ -98,14 +98,14 @@ class LaneGraphMetrics:
             metrics.update(detections, truth)
 
     def compute(self) -> dict[str, dict[str, float]]:
-        """Return numbers by name, for every group of every protocol that applies."""
+        """Return metrics by name, for every group of every protocol that applies."""
         groups: dict[str, dict[str, float]] = {}
         for name, metrics in self._applied().items():
             groups |= metrics.compute() if name == "centerlines" else {name: metrics.compute()}
         return groups
 
     def _applied(self) -> dict[str, Any]:
-        """Return the accumulators that apply; without any frame, that of centerlines."""
+        """Return the accumulators that apply; before the first frame, that of centerlines."""
         measured = self._measured or ("centerlines",)
         applied: dict[str, Any] = {"centerlines": self._centerlines} if "centerlines" in measured else {}
         applied |= self._segments if "segments" in measured else {}
@@ -113,14 +113,14 @@ class LaneGraphMetrics:
 
 
 def _lines(lines: LinePrediction) -> MapDetections:
-    """Return the lines of the classes that MapTR's metric knows, each of its likeliest class."""
+    """Return the lines whose most likely class is measured by MapTR's metric."""
     confidence = expit(np.asarray(lines.logits))
     classes = confidence.argmax(-1)
     return map_detections(np.asarray(lines.points), classes, confidence.max(-1), classes < len(CLASSES))
 
 
 def _true_lines(example: Example) -> MapTruth:
-    """Return the labelled map lines; without labels, those that lane segments and areas imply."""
+    """Return the labelled map lines; without labels, those derived from lane segments and areas."""
     lines = example.map_lines
     if lines is None:
         return map_truth(example.segments, example.areas)
@@ -137,9 +137,9 @@ def evaluate_lanes(
     Frames of examples with markers are grouped by marker visibility as well, see `Sightings`.
 
     Args:
-        task: predicts lanes of any kind.
-        params: of the task.
-        arrays: examples with truth, see `datasets.batches`.
+        task: a model that predicts lanes of any kind.
+        params: its parameters.
+        arrays: examples with ground truth, see `datasets.batches`.
         config: batch size and versions.
 
     Raises:
@@ -160,7 +160,7 @@ def evaluate_lanes(
 
 
 def _labels(batch: Example) -> Example:
-    """Return examples without what sensors and priors saw: no protocol reads it."""
+    """Return examples without sensor data and priors, which no protocol reads."""
     inputs = ("bev", "hidden", "cameras", "traffic_flow", "markers", "sd_map")
     return batch.replace(**dict.fromkeys(inputs))  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -168,7 +168,7 @@ def _labels(batch: Example) -> Example:
 class Sightings:
     """Groups the frames of scenes, in order, by marker visibility.
 
-    "seen": a marker is detected; "gap": none is, but one was before in this scene; "before": none was yet.
+    "seen": a marker is detected; "gap": none is, but one was earlier in this scene; "before": none so far.
     """
 
     groups: tuple[str, ...] = ("seen", "gap", "before")

@@ -1,4 +1,4 @@
-"""Examples and predictions as the OpenLane-V2 lane-segment metrics compare them (host, numpy, one frame)."""
+"""Examples and predictions as inputs of the OpenLane-V2 lane-segment metrics (host, numpy, one frame)."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def segment_truth(
 ) -> SegmentTruth:
     """Return the valid lane segments, areas and traffic elements of one example.
 
-    Crossings stay the rings that the example holds. `tflane score` measures only the two long sides of a crossing in
-    the flavour "LaneSegNet", which needs the corners of the annotation.
+    Crossings stay closed rings. In contrast, `tflane score` in the flavour "LaneSegNet" measures only the two long
+    sides of a crossing, which it takes from the corners of the annotation.
 
     Args:
         segments: lane segments.
         areas: crossings and road boundaries.
         elements: traffic elements; None leaves them out.
-        lanes: centerlines, the rows of `elements.lane`. A segment is governed by the elements of the
-            centerlines on which it lies. None: the rows of `elements.lane` are the segments.
+        lanes: centerlines, the rows of `elements.lane`; a segment is governed by the elements of the centerlines on
+            which it lies. None: the rows of `elements.lane` are the segments.
 
     Raises:
-        ValueError: `elements.lane` has another number of rows.
+        ValueError: the number of rows of `elements.lane` is wrong.
     """
     keep = np.flatnonzero(np.asarray(segments.valid))
     governed = None

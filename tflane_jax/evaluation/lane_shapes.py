@@ -1,6 +1,6 @@
 """Predicted lane shapes as points in the image, for TuSimple's metric, files and pictures (host, numpy, one image).
 
-Decoding as by LSTR (Liu et al. 2021): docs/reference/lstr.md.
+Decoding as in LSTR (Liu et al. 2021; docs/reference/lstr.md).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ def lane_scores(prediction: CurvePrediction) -> Float[np.ndarray, " q"]:
 
 
 def detected(prediction: CurvePrediction) -> Bool[np.ndarray, " q"]:
-    """Return which queries are lanes: those whose lane logit is the larger one."""
+    """Return which queries are lanes: those whose lane logit exceeds the background logit."""
     logits = np.asarray(prediction.logits)
     return logits[..., 1] > logits[..., 0]
 
 
 def left_to_right(prediction: CurvePrediction) -> Int[np.ndarray, " l"]:
-    """Return the detected queries, ordered by the column of their lower end."""
+    """Return the indices of detected queries, ordered by the column of their lower end."""
     queries = np.flatnonzero(detected(prediction))
     curves = np.asarray(prediction.curves, np.float64)[queries]
     ends = curve_columns(curves[:, 2:], curves[:, 1:2])[:, 0]
@@ -51,7 +51,7 @@ def row_lanes(prediction: CurvePrediction, rows: Float[np.ndarray, " h"], *, hei
 def pixel_points(
     prediction: CurvePrediction, *, height: int, width: int, count: int = 100
 ) -> list[Int[np.ndarray, "p 2"]]:
-    """Return the pixels (column, row) of each detected lane for drawing, at `count` rows of its extent."""
+    """Return pixels (column, row) of each detected lane for drawing, at `count` rows of its extent."""
     curves = np.asarray(prediction.curves, np.float64)[detected(prediction)]
     rows = np.linspace(curves[:, 0], curves[:, 1], count, axis=-1)
     columns = curve_columns(curves[:, 2:], rows)

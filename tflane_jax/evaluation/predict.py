@@ -1,4 +1,4 @@
-"""Predicting a whole dataset: in batches, or as streams with memory."""
+"""Prediction for a whole dataset: in batches, or as streams with memory."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from tflane_jax.scene import Example, Prediction, stack_examples
 
 
 class Predictor(Protocol):
-    """A model as evaluation calls it; hashable, because jit takes it as a static argument."""
+    """The methods of a model that evaluation calls; hashable, because jit takes it as a static argument."""
 
     @property
     def streams(self) -> bool:
-        """Whether frames of a scene are predicted one after the other, with memory."""
+        """Whether the frames of a scene are predicted in order, with memory."""
         ...
 
     def predict(self, params: Params, example: Any) -> Prediction:
-        """Return the prediction for one example, a frame on its own: no batch axis, no dropout, no host callback."""
+        """Return the prediction for one example without memory: no batch axis, no dropout, no host callback."""
         ...
 
     def start(self) -> Any:
@@ -50,12 +50,13 @@ def predict_stream(task: Predictor, params: Params, memory: Any, frames: Any) ->
 
 
 def predictions(task: Predictor, params: Params, arrays: Any, batch_size: int) -> Iterator[tuple[range, Prediction]]:
-    """Yield the predictions for all examples in order: their indices and a stacked tree of numpy arrays.
+    """Yield indices and stacked predictions (numpy) for all examples, in order.
 
     Args:
         task, params: the model.
         arrays: examples, see `datasets.batches`.
-        batch_size: examples predicted at a time. The last batch is filled up and cut, so that one program serves all.
+        batch_size: examples per call. The last batch is padded and its predictions cut, so that all batches use one
+            compiled program.
     """
     for indices, _, answers in predicted_batches(task, params, arrays, batch_size):
         yield indices, answers
@@ -64,10 +65,10 @@ def predictions(task: Predictor, params: Params, arrays: Any, batch_size: int) -
 def predicted_batches(
     task: Predictor, params: Params, arrays: Any, batch_size: int
 ) -> Iterator[tuple[range, Any, Prediction]]:
-    """Yield indices, examples and predictions, the last two stacked; there may be more examples than indices.
+    """Yield indices, stacked examples and stacked predictions; padding may add examples beyond the indices.
 
-    A model with memory goes through the examples in order, as a stream; where a scene begins, `has_previous` empties
-    its memory.
+    A model with memory processes the examples in order, as a stream; at the start of a scene, `has_previous` is False
+    and its memory is ignored.
     """
     params = jax.device_put(params)
     memory = task.start() if task.streams else None
@@ -83,9 +84,9 @@ def predicted_batches(
 def predict_examples(
     task: Predictor, params: Params, dataset: Dataset, indices: Sequence[int]
 ) -> tuple[Example, Prediction]:
-    """Return some examples whole, with truth and all, and the predictions for them; both stacked, numpy.
+    """Return some examples with all their fields, and the predictions for them; both stacked, numpy.
 
-    A model with memory goes through each example's scene up to it.
+    A model with memory first processes the earlier frames of each example's scene.
     """
     examples = stack_examples([dataset.example(index) for index in indices])
     if not task.streams:
@@ -96,7 +97,7 @@ def predict_examples(
 
 
 def _streamed(task: Predictor, params: Params, dataset: Dataset, index: int) -> Prediction:
-    """Return the prediction for an example, as a stack of one, after the earlier frames of its scene."""
+    """Return the prediction for one example (leading axis 1), after the earlier frames of its scene."""
     frames = [dataset.example(index)]
     while frames[0].has_previous:
         frames.insert(0, dataset.example(index - len(frames)))

@@ -1,4 +1,4 @@
-"""What an evaluation is asked for, and what it found."""
+"""Settings and results of an evaluation."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from tflane_jax.metrics.topology import Version
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """Evaluation while training and after it.
+    """Settings of the evaluation, during and after training.
 
     Attributes:
-        batch_size: examples predicted at a time; changes no number.
-        pictures: examples of the validation split that are drawn, spread evenly over it.
-        versions: of OpenLane-V2's metrics. The first one gives the columns without a version in their names; the
-            others add columns where their numbers differ, say "OLS_v1.0".
+        batch_size: examples predicted at a time; does not affect the metrics.
+        pictures: number of validation examples that are drawn, spread evenly over the split.
+        versions: versions of OpenLane-V2's metrics. Columns of the first one have no version in their names; the others
+            add columns for metrics that differ, such as "OLS_v1.0".
     """
 
     batch_size: int = 16
@@ -26,12 +26,12 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found.
+    """Results of an evaluation.
 
     Attributes:
-        protocol: of the metrics, with its version.
-        groups: numbers by name, for each group that was measured ("all", "occluded", ...).
-        counts: names of numbers that count examples instead of rating them.
+        protocol: name and version of the metrics.
+        groups: metrics by name, for each measured group ("all", "occluded", ...).
+        counts: names of the entries that are counts, not scores.
     """
 
     protocol: str
@@ -39,7 +39,7 @@ class Evaluation:
     counts: tuple[str, ...] = ("frames", "lanes")
 
     def scores(self) -> dict[str, float]:
-        """Return the numbers as "group/name", without counts: what runs record and checkpoints are chosen by."""
+        """Return the scores by "group/name", without counts. Runs record them and rate checkpoints by them."""
         return {
             f"{group}/{name}": value
             for group, values in self.groups.items()

@@ -1,4 +1,4 @@
-"""Examples and predictions as MapTR's metric compares them: divider, crossing, boundary (host, numpy, one frame)."""
+"""Examples and predictions as inputs of MapTR's metric: divider, crossing, boundary (host, numpy, one frame)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
 
 _DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "ped_crossing", "boundary"))
-# Two neighbouring segments hold the line between them twice: lines nearer than this all along are one, metres.
+# Neighbouring segments both contain the line between them: lines closer than this along all points are one, metres.
 _SAME_LINE = 0.2
 
 
@@ -32,8 +32,8 @@ def map_truth(segments: LaneGraph, areas: Areas) -> MapTruth:
 def dividers(segments: LaneGraph) -> list[Float[np.ndarray, "p 2"]]:
     """Return the painted side lines of the valid lane segments, each line once.
 
-    A line that lies on another one, in either direction, is left out. The longer of the two stays, and the earlier of
-    equals.
+    A line that lies on a longer one along its whole length, in either direction, is left out. Of equally long ones,
+    the first is kept.
     """
     valid = np.asarray(segments.valid)
     sides = (segments.left, segments.left_type), (segments.right, segments.right_type)

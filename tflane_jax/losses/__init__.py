@@ -1,1 +1,1 @@
-"""Losses on matched pairs: a file for each host, terms that hosts share, auxiliary losses."""
+"""Losses on matched pairs of queries and targets: one file per host, common terms, auxiliary losses."""

@@ -1,4 +1,4 @@
-"""Auxiliary losses that several hosts have: denoised lanes, and lanes by BEV cell. None of the papers has them."""
+"""Auxiliary losses of several hosts: denoised lanes, and lanes per BEV cell. None of the lane papers has them."""
 
 from __future__ import annotations
 
@@ -25,15 +25,18 @@ def auxiliary_losses(
     cell_weight: float,
     denoising: Callable[[CenterlinePrediction, LaneGraph], Terms],
 ) -> tuple[list[Float[Array, ""]], Report]:
-    """Return the weighted auxiliary losses of a batch, to be added up in this order, and what is recorded of them.
+    """Return the weighted auxiliary losses of a batch, to be summed in this order, and the numbers to record.
 
     Args:
         outputs: auxiliary outputs, leading axis batch.
-        names: those that the host has.
-        lanes: truth, leading axis batch; padding may hold anything.
-        bev_range: the box that the BEV features cover.
-        cell_weight: of the loss on BEV cells.
-        denoising: weighted losses of denoised lanes by layer, from their predictions and the truth.
+        names: the auxiliary outputs that the host declares.
+        lanes: ground truth, leading axis batch; padding may hold anything.
+        bev_range: the box that the BEV features cover, metres.
+        cell_weight: weight of the loss on BEV cells.
+        denoising: from predictions of denoised lanes and the ground truth to weighted losses per layer.
+
+    Raises:
+        ValueError: a declared auxiliary output is missing, or has no loss here.
     """
     losses, report = [], {}
     for name in names:
@@ -46,20 +49,20 @@ def auxiliary_losses(
             report["cells"] = cell_weight * each(outputs.lane_cells, lanes, bev_range).mean()
             losses.append(report["cells"])
         else:
-            raise ValueError(f"the host names the auxiliary output {name}, which it did not give or no loss knows")
+            raise ValueError(f"the host declares the auxiliary output {name}, but it is missing or has no loss")
     return losses, report
 
 
 def denoising_pairs(
     prediction: CenterlinePrediction, lanes: LaneGraph
 ) -> tuple[CenterlinePrediction, Assignment, LaneGraph]:
-    """Return predictions of noised lanes with their truth, every copy as an example of its own.
+    """Return predictions of noised lanes, their assignment and ground truth, with every copy as a separate example.
 
     Query i belongs to lane i; lanes beyond the number of queries are left out.
 
     Args:
         prediction: leading axes (batch, copy, layer).
-        lanes: truth of the batch.
+        lanes: ground truth, leading axis batch.
     """
     batch, copies, layers, queries = prediction.logits.shape[:4]
     capacity = lanes.valid.shape[1]

@@ -1,4 +1,4 @@
-"""The loss of OpenLane-V2's large baseline: TopoNet's terms, lanes compared by Bezier control points."""
+"""Loss of OpenLane-V2's large baseline: TopoNet's terms, on Bezier control points (docs/reference/toponet.md)."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class BevFormerDetrLossConfig(TopoNetLossConfig):
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: BevFormerDetrConfig
     ) -> tuple[Float[Array, ""], Report]:
-        """Return the loss of a batch and what is recorded of it, see `HostLossConfig.loss`.
+        """Return the loss of a batch and the numbers to record, see `HostLossConfig.loss`.
 
-        Lanes are compared by as many control points as the host predicts.
+        Lanes are compared by the host's number of control points; by their points if it predicts points.
         """
         return lane_graph_host_loss(self, outputs, auxiliary, batch, host, host.control_points)

@@ -1,4 +1,4 @@
-"""What the losses of all hosts share: their interface, sums over matched queries, topology losses."""
+"""Common parts of all host losses: interface, counts of matched queries, topology loss."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Report = dict[str, Float[Array, ""]]
 
 @dataclass(frozen=True)
 class HostLossConfig:
-    """Weights of a host's loss; every host derives its own, in a file of its own.
+    """Weights of a host's loss; every host derives its own class, in its own file.
 
     Attributes:
-        cell_weight: of the auxiliary loss on BEV cells, where the host has it (`losses.lane_cells`).
+        cell_weight: weight of the auxiliary loss on BEV cells, if the host has it (`losses.lane_cells`).
     """
 
     cell_weight: float = 1.0
@@ -36,16 +36,16 @@ class HostLossConfig:
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
     ) -> tuple[Float[Array, ""], Report]:
-        """Return the loss of a batch and what is recorded of it.
+        """Return the loss of a batch and the numbers to record.
 
         Args:
             outputs: predictions of every decoder layer, leading axes (batch, layer).
             auxiliary: auxiliary outputs, leading axis batch.
-            batch: examples with truth, leading axis batch.
+            batch: examples with ground truth, leading axis batch.
             host: the host's configuration.
 
         Raises:
-            UserError: the truth lacks what the host predicts.
+            UserError: the examples lack ground truth for a predicted part.
         """
         raise NotImplementedError
 
@@ -68,13 +68,15 @@ def edge_loss(
     alpha: float,
     gamma: float,
 ) -> Float[Array, " layers"]:
-    """Return the mean focal loss over all pairs of queries of a batch; pairs that are not matched are no edges.
+    """Return the mean focal loss over all pairs of queries of a batch, for each layer.
+
+    Pairs with an unmatched query have the target "no edge".
 
     Args:
         logits: predicted edges.
-        rows, columns: which truth each query is matched with, on either side.
-        edges: true edges.
-        alpha, gamma: of the focal loss.
+        rows, columns: assignments of the row queries and of the column queries.
+        edges: true edges between targets.
+        alpha, gamma: parameters of the focal loss.
     """
 
     def one(logits, rows, columns, edges):
@@ -89,7 +91,7 @@ def edge_loss(
 
 
 def focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], alpha: float, gamma: float) -> Float[Array, "*b"]:
-    """Return the sigmoid focal loss, elementwise."""
+    """Return the sigmoid focal loss (Lin et al. 2017), elementwise."""
     return optax.losses.sigmoid_focal_loss(logits, target, alpha=alpha, gamma=gamma)
 
 
@@ -99,10 +101,10 @@ def last_layers(assignment: Assignment, layers: int) -> Assignment:
 
 
 def positives(assignment: Assignment) -> Float[Array, " layers"]:
-    """Return the number of matched queries of a batch, at least one: the normaliser of sums in the reference code."""
+    """Return the number of matched queries of a batch per layer, at least 1; published code divides sums by it."""
     return jnp.maximum(assignment.matched.sum((0, 2)).astype(jnp.float32), 1.0)
 
 
 def matched(assignment: Assignment) -> Float[Array, ""]:
-    """Return the mean number of matched targets of an example, in the last layer."""
+    """Return the mean number of matched targets per example, in the last layer."""
     return assignment.matched[:, -1].sum(-1).astype(jnp.float32).mean()

@@ -1,4 +1,4 @@
-"""Matching costs of the DETR family, for every pair of query and target (docs/reference/training.md)."""
+"""Matching costs of the DETR family, for all pairs of query and target (docs/reference/training.md)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 def focal_cost(
     logits: Float[Array, "*b"], alpha: float = 0.25, gamma: float = 2.0, eps: float = 1e-12
 ) -> Float[Array, "*b"]:
-    """Return the focal classification cost of calling each logit a positive, less that of a negative."""
+    """Return the focal cost of labelling each logit positive, minus the cost of labelling it negative."""
     p = jax.nn.sigmoid(logits)
     positive = -jnp.log(p + eps) * alpha * (1.0 - p) ** gamma
     negative = -jnp.log(1.0 - p + eps) * (1.0 - alpha) * p**gamma
@@ -18,16 +18,16 @@ def focal_cost(
 
 
 def pairwise_l1(prediction: Float[Array, "*b q d"], target: Float[Array, "*#b n d"]) -> Float[Array, "*b q n"]:
-    """Return the sum of absolute differences of every prediction to every target."""
+    """Return the L1 distance of every prediction to every target."""
     return jnp.abs(prediction[..., :, None, :] - target[..., None, :, :]).sum(-1)
 
 
 def generalised_iou(a: Float[Array, "*#b 2 2"], b: Float[Array, "*#b 2 2"], eps: float = 1e-6) -> Float[Array, "*b"]:
-    """Return the overlap of boxes less the share of their hull that neither covers, -1 to 1 (Rezatofighi et al. 2019).
+    """Return the generalised IoU of boxes, -1 to 1 (Rezatofighi et al. 2019): IoU - (hull - union) / hull.
 
     Args:
-        a, b: lower and upper corners.
-        eps: least area of union and hull.
+        a, b: boxes as lower and upper corners.
+        eps: lower limit of the areas of union and hull.
     """
     area = lambda low, high: (high - low)[..., 0] * (high - low)[..., 1]  # noqa: E731
     low, high = jnp.maximum(a[..., 0, :], b[..., 0, :]), jnp.minimum(a[..., 1, :], b[..., 1, :])

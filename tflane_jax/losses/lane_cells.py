@@ -1,7 +1,7 @@
-"""An auxiliary loss on BEV features: does a lane run through this cell, where exactly, and which way?
+"""Auxiliary loss on BEV features: per cell, lane occupancy, offset to the nearest lane and its direction.
 
-Not part of any of the papers. A decoder's first thousands of steps teach the features in front of it little, because
-its queries do not know yet where to look; this loss asks every cell, so that small models learn to see first.
+Not part of the lane papers. In the first thousands of steps, the decoder's gradient hardly trains the BEV features,
+because its queries do not attend to lanes yet. This loss supervises every cell directly, which small models need.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.scene import LaneGraph
 
-# Cells as far as this from a lane, in cells, say where it is. Bilinear sampling beside a lane sees their features.
-_REACH = 1.5
+# Cells up to this distance from a lane, in cells, learn offset and direction: bilinear sampling near a lane reads them.
+_RADIUS = 1.5
 
 
 class LaneCells(NamedTuple):
-    """What is true of the cells.
+    """Targets of the cells.
 
     Attributes:
-        inside: a lane runs through the cell.
-        near: one is not farther from its middle than 1.5 cells.
-        offset: from the middle to the nearest point of a lane, in cells along x and y; 0 where none is near.
-        direction: unit direction of that lane, 0 where none is near.
+        inside: a lane passes through the cell.
+        near: a lane passes within 1.5 cells of the cell's centre.
+        offset: from the centre to the nearest point of a lane, in cells along x and y; 0 unless `near`.
+        direction: unit direction of that lane; 0 unless `near`.
     """
 
     inside: Bool[Array, "h w"]
@@ -37,11 +37,12 @@ class LaneCells(NamedTuple):
 
 
 def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange) -> LaneCells:
-    """Return what the valid lanes of one example make true of each cell.
+    """Return the targets of all cells from the valid lanes of one example.
 
     Args:
-        lanes: truth; what stands in padding changes nothing.
-        shape: rows (along y) and columns (along x) of the grid that spans `range_`.
+        lanes: ground truth; padding may hold anything.
+        shape: rows (along y) and columns (along x) of the grid.
+        range_: the box that the grid covers, metres.
     """
     h, w = shape
     count = jnp.array([w, h], jnp.float32)
@@ -54,12 +55,12 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
         return LaneCells(nothing, nothing, jnp.zeros((h, w, 2)), jnp.zeros((h, w, 2)))
     x, y = jnp.arange(w) + 0.5, jnp.arange(h) + 0.5
     middle = jnp.stack(jnp.meshgrid(x, y), -1).reshape(-1, 1, 2)
-    # The nearest point of every piece.
-    share = ((middle - begin[None]) * step[None]).sum(-1) / jnp.maximum((step**2).sum(-1), 1e-9)[None]
-    offset = begin[None] + jnp.clip(share, 0.0, 1.0)[..., None] * step[None] - middle  # (hw, S, 2)
+    # The nearest point of every segment.
+    fraction = ((middle - begin[None]) * step[None]).sum(-1) / jnp.maximum((step**2).sum(-1), 1e-9)[None]
+    offset = begin[None] + jnp.clip(fraction, 0.0, 1.0)[..., None] * step[None] - middle  # (hw, S, 2)
     squared = jnp.where(valid[None], (offset**2).sum(-1), jnp.inf)
     nearest = squared.argmin(-1)
-    near = squared.min(-1) <= _REACH**2
+    near = squared.min(-1) <= _RADIUS**2
     apart = jnp.where(valid[None], jnp.abs(offset).max(-1), jnp.inf).min(-1)
     metres = step * jnp.asarray(range_.size(2), jnp.float32)[None] / count[None]
     direction = metres / jnp.sqrt((metres**2).sum(-1, keepdims=True) + 1e-6)
@@ -69,8 +70,10 @@ def lane_cells(lanes: LaneGraph, shape: tuple[int, int], range_: PerceptionRange
 
 
 def lane_cell_loss(cells: Float[Array, "h w 5"], lanes: LaneGraph, range_: PerceptionRange) -> Float[Array, ""]:
-    """Return the loss of one example: cross entropy, cells with and without a lane weighing alike, and the errors of
-    the offsets and directions of the cells near a lane.
+    """Return the loss of one example.
+
+    Cross entropy of the occupancy, with equal total weight for cells with and without a lane, plus the mean L1 error of
+    offset and direction over cells near a lane.
     """
     h, w, _ = cells.shape
     true = lane_cells(lanes, (h, w), range_)

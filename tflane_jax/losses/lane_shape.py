@@ -1,4 +1,4 @@
-"""Hungarian fitting loss of lane curves: GTN paper Eq. (3), (4), weighed as in LSTR (Liu et al. 2021)."""
+"""Hungarian fitting loss of lane curves: GTN paper, Eq. (3) and (4), with LSTR's weights (Liu et al. 2021)."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage
 
 @dataclass(frozen=True)
 class LaneShapeLossConfig:
-    """Weights of matching costs and loss terms alike; the defaults are LSTR's.
+    """Weights of both matching costs and loss terms; the defaults are LSTR's.
 
     Attributes:
         class_weight: omega_1.
-        curve_weight: omega_2; columns are shares of the image, summed over the points of a lane.
-        extent_weight: omega_3, of the rows where a lane begins and ends.
-        cell_weight: of the auxiliary loss on cells, for networks that have it; LSTR does not.
-        shared_horizon: every lane of an image is to begin at the highest row of any of them, as in LSTR's training.
-        least_depth: rows nearer to a predicted horizon than this share of the image count as this far below it. The
-            curve has a pole there, and LSTR, which goes without (1e-6), can leave it only by luck.
+        curve_weight: omega_2, for columns as fractions of the image width, summed over the points of a lane.
+        extent_weight: omega_3, for the rows where a lane begins and ends.
+        cell_weight: weight of the auxiliary loss on cells, for networks that have it; LSTR does not.
+        shared_horizon: the target of every lane begins at the highest row of all lanes in the image, as in LSTR.
+        least_depth: smallest distance of a row below the predicted horizon, as a fraction of the image height; smaller
+            ones are clamped. The curve has a pole at the horizon; with LSTR's 1e-6, training rarely recovers from a
+            predicted horizon close to a point's row.
         matcher: backend of `matching.match`.
     """
 
@@ -45,7 +46,7 @@ class LaneShapeLossConfig:
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: RoadImage, host: LstrConfig
     ) -> tuple[Float[Array, ""], Report]:
-        """Return the loss of a batch and what is recorded of it.
+        """Return the loss of a batch and the numbers to record.
 
         Args:
             outputs: curves of every decoder layer, leading axes (batch, layer).
@@ -54,7 +55,7 @@ class LaneShapeLossConfig:
             host: the network's configuration.
 
         Raises:
-            ValueError: a prediction without curves.
+            ValueError: the prediction has no curves.
         """
         if outputs.curves is None:
             raise ValueError("a lane-shape loss needs predicted curves")
@@ -69,12 +70,12 @@ class LaneShapeLossConfig:
 
 @struct.dataclass
 class LaneShapeTargets:
-    """Lane lines as the loss wants them; leading axes as the lines have them.
+    """Lane lines as targets of the loss; any leading axes.
 
     Attributes:
-        columns, rows: (L, P) u and v, shares of the image; 0 where there is no point.
+        columns, rows: (L, P) u and v as fractions of the image; 0 where there is no point.
         point_valid: (L, P).
-        extent: (L, 2) first and last row, alpha and beta of Eq. (8); 0 where there is no lane.
+        extent: (L, 2) first and last row, alpha and beta of Eq. (8); 0 for invalid lanes.
         valid: (L,) lanes with at least one point.
     """
 
@@ -86,7 +87,7 @@ class LaneShapeTargets:
 
 
 def lane_shape_targets(lines: LaneLines, *, shared_horizon: bool = True) -> LaneShapeTargets:
-    """Return the targets of lane lines (any leading axes); what stands in padding does not matter."""
+    """Return the targets of lane lines (any leading axes); padding may hold anything."""
     point_valid = lines.point_valid & lines.valid[..., None]
     valid = point_valid.any(-1)
     columns, rows = (jnp.where(point_valid, lines.points[..., i], 0.0) for i in range(2))
@@ -112,7 +113,7 @@ def curve_errors(
     curves: Float[Array, "*layers q 8"], targets: LaneShapeTargets, least_depth: float
 ) -> Float[Array, "*layers q l"]:
     """Return the sum over points of |u(v) - column| of every curve to every lane of one example."""
-    # Rows without a point stand at 1, far from any horizon.
+    # Rows without a point are set to 1, far from any horizon.
     rows = jnp.where(targets.point_valid, targets.rows, 1.0)
     lead = curves.shape[:-1]
     columns = curve_columns(_shape(curves), rows.reshape(*(1,) * len(lead), -1), least_depth)
@@ -121,7 +122,7 @@ def curve_errors(
 
 
 def cell_loss(logits: Float[Array, "h w"], targets: LaneShapeTargets) -> Float[Array, ""]:
-    """Return the mean cross-entropy of one example's cells: does a point of a lane line lie in each?"""
+    """Return the mean cross-entropy over one example's cells; a cell is positive if it contains a lane-line point."""
     height, width = logits.shape
     inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1) & (targets.rows < 1)
     # Index `height` lies outside, so other points write nowhere.
@@ -137,7 +138,7 @@ def matching_cost(
     weights: Float[Array, " l"],
     config: LaneShapeLossConfig,
 ) -> Float[Array, "layers q l"]:
-    """Return d(l, h) of Eq. (3) for one example: the cost of giving each lane to each query."""
+    """Return d(l, h) of Eq. (3) for one example: the cost of matching each lane with each query."""
     is_lane = jax.nn.softmax(prediction.logits)[..., 1:]
     fit = _lead(weights, 2) * curve_errors(prediction.curves, targets, config.least_depth)
     extent = jnp.abs(prediction.curves[..., None, :2] - _lead(targets.extent, 2)).sum(-1)
@@ -155,13 +156,13 @@ def lane_shape_loss(
         config: weights.
 
     Returns:
-        The total, and the weighted terms of the last layer: `class`, `curve`, `extent`, beside `matching/lanes`, the
-        mean number of matched lanes.
+        The total, and the weighted terms of the last layer: `class`, `curve`, `extent`; and `matching/lanes`, the
+        mean number of matched lanes per example.
     """
     every = lane_weights(targets, targets.valid)
     cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, every)
     assignment = match(cost, targets.valid[:, None], config.matcher)  # z of Eq. (3), (B, D, L): one host call
-    # Weights of a layer count the lanes that it matched.
+    # The weights of a layer use the lanes matched in that layer.
     weights = jax.vmap(lambda matched: lane_weights(targets, matched), in_axes=1, out_axes=1)(assignment.matched)
     per_layer = jax.vmap(jax.vmap(lambda p, a, w, t: _terms(p, a, w, t, config), in_axes=(0, 0, 0, None)))
     classes, curves, extents = per_layer(prediction, assignment, weights, targets)  # each (B, D)

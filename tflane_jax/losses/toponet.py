@@ -1,7 +1,8 @@
-"""TopoNet's loss of a lane graph with its traffic elements, with deep supervision (Li et al. 2023).
+"""TopoNet's loss of lane graphs and traffic elements, with deep supervision (Li et al. 2023).
 
-Per decoder layer: focal loss on the lane class, L1 on the matched centerlines in metres, focal loss on every entry of
-the predicted adjacency, and the same for traffic elements. Lanes are directed, so a target has one orientation only.
+Per decoder layer: focal loss on the lane class, L1 on matched centerlines in metres, focal loss on every entry of the
+predicted adjacencies, and the losses of traffic elements (`losses.traffic_elements`). Lanes are directed: a target has
+one orientation only. Weights and conventions: docs/reference/toponet.md.
 """
 
 from __future__ import annotations
@@ -48,11 +49,11 @@ class TopoNetLossConfig(HostLossConfig):
     """Weights of matching costs and loss terms; the defaults are TopoNet's.
 
     Attributes:
-        class_weight, points_weight: of cost and loss alike; points are in metres, summed over coordinates.
-        successor_weight, element_lane_weight: of the topologies' losses, means over all pairs of queries.
-        alpha, gamma: of every focal term.
+        class_weight, points_weight: of both cost and loss; points in metres, summed over coordinates.
+        successor_weight, element_lane_weight: of the topology losses, means over all pairs of queries.
+        alpha, gamma: parameters of every focal term.
         matcher: backend of `matching.match`.
-        elements: weights of traffic elements.
+        elements: weights for traffic elements.
         cell_weight: see `HostLossConfig`.
     """
 
@@ -68,7 +69,7 @@ class TopoNetLossConfig(HostLossConfig):
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
     ) -> tuple[Float[Array, ""], Report]:
-        """Return the loss of a batch and what is recorded of it, see `HostLossConfig.loss`."""
+        """Return the loss of a batch and the numbers to record, see `HostLossConfig.loss`."""
         return lane_graph_host_loss(self, outputs, auxiliary, batch, host, None)
 
 
@@ -80,12 +81,15 @@ def lane_graph_host_loss(
     host: Any,
     control_points: int | None,
 ) -> tuple[Float[Array, ""], Report]:
-    """Return the loss of a host of lane graphs: lanes, elements where it predicts them, and auxiliary losses.
+    """Return the loss of a lane-graph host: lanes, traffic elements if it predicts them, and auxiliary losses.
 
     Args:
         config: weights.
         outputs, auxiliary, batch, host: see `HostLossConfig.loss`.
         control_points: see `matching_cost`.
+
+    Raises:
+        UserError: elements are predicted, but the data have none.
     """
     elements = sizes = None
     if outputs.elements is not None:
@@ -117,28 +121,28 @@ def lane_graph_loss(
     size: Int[Array, "b 2"] | None = None,
     control_points: int | None = None,
 ) -> tuple[Float[Array, ""], Report]:
-    """Return the loss of a batch and its terms; lanes and elements are matched by one host call each.
+    """Return the loss of a batch and its terms; lanes and elements take one host call each for matching.
 
     Args:
-        prediction: outputs of every decoder layer, leading axes (batch, layer). A topology may have fewer layers: the
-            last ones.
+        prediction: outputs of every decoder layer, leading axes (batch, layer). A topology may have the last layers
+            only.
         lanes: ground truth, leading axis batch.
         config: weights.
-        elements: ground truth, needed where the prediction has elements.
-        size: width and height of the front images, likewise.
+        elements: ground truth, required if the prediction has elements.
+        size: width and height of the front images, pixels; required likewise.
         control_points: see `matching_cost`.
 
     Returns:
         The sum over layers of all weighted terms, and the terms of the last layer under `class`, `points`, `successor`,
-        `element_class`, `element_box`, `element_iou`, `element_lane`, beside `matching/lanes` and `matching/elements`,
-        the mean numbers of matched lanes and elements.
+        `element_class`, `element_box`, `element_iou`, `element_lane`; and `matching/lanes` and `matching/elements`,
+        the mean numbers of matched lanes and elements per example.
 
     Raises:
-        ValueError: a prediction without lanes, or with elements and nothing to compare them with.
+        ValueError: the prediction has no centerlines, or elements without ground truth.
     """
     if prediction.centerlines is None:
         raise ValueError("a lane-graph loss needs predicted centerlines")
-    # Padding may hold anything; from here on it holds zeros, so that 0 * padding is 0.
+    # Padding may hold NaN; clear it, so that 0 * padding is 0.
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
     cost = jax.vmap(lambda p, g: matching_cost(p, g, config, control_points))(prediction.centerlines, lanes)
     assignment = match(cost, lanes.valid[:, None], config.matcher)  # (B, D, N): one host call
@@ -159,9 +163,9 @@ def lane_graph_loss(
 def matching_cost(
     prediction: CenterlinePrediction, lanes: LaneGraph, config: TopoNetLossConfig, control_points: int | None = None
 ) -> Float[Array, "layers q n"]:
-    """Return the cost of giving each lane to each query, for one example; columns of padding are arbitrary.
+    """Return the cost of matching each lane with each query, for one example; columns of padding are arbitrary.
 
-    With `control_points`, lanes are compared by as many Bezier control points fitted to them, else by their points.
+    Lanes are compared by `control_points` Bezier control points fitted to them; by their points if it is None.
     """
     cost_class = focal_cost(prediction.logits, config.alpha, config.gamma)  # (D, Q, 1), broadcast over lanes
     cost_points = pairwise_l1(_lines(prediction.points, control_points), _lines(lanes.points, control_points)[None])
@@ -175,7 +179,7 @@ def lane_losses(
     config: TopoNetLossConfig,
     control_points: int | None = None,
 ) -> Terms:
-    """Return the weighted losses `class`, `points` and `successor` of every layer of a batch; no NaN in `lanes`."""
+    """Return the weighted losses `class`, `points` and `successor` of every layer of a batch; `lanes` has no NaN."""
     layer = jax.vmap(
         jax.vmap(partial(_lane_sums, config=config, control_points=control_points), in_axes=(0, 0, 0, None)),
         in_axes=(0, 0, 0, 0),
@@ -197,11 +201,11 @@ def lane_losses(
 def lane_denoising_losses(
     prediction: CenterlinePrediction, lanes: LaneGraph, config: TopoNetLossConfig, control_points: int | None = None
 ) -> Terms:
-    """Return what `lane_losses` does, for noised lanes: query i belongs to lane i, so nothing is matched.
+    """Return the `lane_losses` of noised lanes without matching: query i belongs to lane i.
 
     Args:
         prediction: leading axes (batch, copy, layer); see `models.lane_denoising`.
-        lanes: truth of the batch; lanes beyond the number of queries are left out, padding may hold anything.
+        lanes: ground truth; lanes beyond the number of queries are left out, padding may hold anything.
         config: weights.
         control_points: see `matching_cost`.
     """
@@ -219,7 +223,7 @@ def element_losses(
 ) -> Terms:
     """Return the weighted losses `element_class`, `element_box` and `element_iou` of every layer of a batch."""
     weights = config.elements
-    # The topology has layers of its own.
+    # The topology may have fewer layers than the other leaves.
     prediction = prediction.replace(lane_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
     each = jax.vmap(partial(element_terms, config=weights), in_axes=(0, 0, None, None))
     classes, boxes, apart = jax.vmap(each)(prediction, assignment, elements, size)  # each (B, D)
@@ -258,7 +262,7 @@ def _lane_sums(
     config: TopoNetLossConfig,
     control_points: int | None,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return class sum and points sum of one layer of one example."""
+    """Return the sums of class losses and of point errors, for one layer of one example."""
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     is_lane = jnp.zeros(logits.shape).at[query, 0].set(1.0, mode="drop")
@@ -267,7 +271,7 @@ def _lane_sums(
 
 
 def _lines(points: Float[Array, "*b p 3"], control_points: int | None) -> Float[Array, "*b d"]:
-    """Return what is compared of a centerline: its points or its control points, as one vector."""
+    """Return the points or the control points of a centerline as one vector."""
     if control_points is not None:
         fit = bezier_fit(points.shape[-2], control_points).astype(points.dtype)
         points = jnp.einsum("kp,...pc->...kc", fit, points)

@@ -1,6 +1,6 @@
 """Losses of traffic elements in the front view: Deformable DETR's, as TopoNet uses them (docs/reference/toponet.md).
 
-Per decoder layer: focal loss on the class, L1 on centre and size as shares of the image, and generalised IoU.
+Per decoder layer: focal loss on the class, L1 on centre and size as fractions of the image, and generalised IoU.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from tflane_jax.scene import ElementPrediction, TrafficElements
 
 @dataclass(frozen=True)
 class ElementLossConfig:
-    """Weights of matching costs and loss terms alike; the defaults are TopoNet's.
+    """Weights of both matching costs and loss terms; the defaults are TopoNet's.
 
     Attributes:
         class_weight, box_weight, iou_weight: of class, L1 and generalised IoU.
-        alpha, gamma: of the focal terms.
+        alpha, gamma: parameters of the focal terms.
     """
 
     class_weight: float = 1.0
@@ -34,7 +34,7 @@ class ElementLossConfig:
 
 
 def clear_padding(elements: TrafficElements) -> TrafficElements:
-    """Return the elements with zeros where there are none, so that 0 * padding is 0 (any leading axes)."""
+    """Return the elements with zeros in padding, so that 0 * padding is 0 (any leading axes)."""
     box = jnp.where(elements.valid[..., None, None], elements.box, 0.0)
     attribute = jnp.where(elements.valid, elements.attribute, 0)
     return elements.replace(box=box, attribute=attribute)  # pyright: ignore[reportAttributeAccessIssue]
@@ -43,17 +43,17 @@ def clear_padding(elements: TrafficElements) -> TrafficElements:
 def element_cost(
     prediction: ElementPrediction, elements: TrafficElements, size: Int[Array, " 2"], config: ElementLossConfig
 ) -> Float[Array, "layers e n"]:
-    """Return the cost of giving each element to each query, for one example; columns of padding are arbitrary.
+    """Return the cost of matching each element with each query, for one example; columns of padding are arbitrary.
 
     Args:
         prediction: outputs of every decoder layer.
-        elements: truth.
+        elements: ground truth.
         size: width and height of the front image, pixels.
         config: weights.
     """
     logits = jnp.take(prediction.logits, elements.attribute, -1, mode="clip")  # (D, E, N)
     cost_class = focal_cost(logits, config.alpha, config.gamma)
-    cost_box = pairwise_l1(_shares(prediction.box, size), _shares(elements.box, size)[None])
+    cost_box = pairwise_l1(_fractions(prediction.box, size), _fractions(elements.box, size)[None])
     iou = generalised_iou(prediction.box[:, :, None], elements.box[None, None])
     return config.class_weight * cost_class + config.box_weight * cost_box - config.iou_weight * iou
 
@@ -65,7 +65,7 @@ def element_terms(
     size: Int[Array, " 2"],
     config: ElementLossConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Return the sums of class, box and overlap losses of one layer of one example, without weights."""
+    """Return the unweighted sums of class, L1 and generalised-IoU losses of one layer of one example."""
     focal = partial(optax.losses.sigmoid_focal_loss, alpha=config.alpha, gamma=config.gamma)
     queries = prediction.logits.shape[0]
     # Index `queries` lies outside, so unmatched targets write nowhere.
@@ -74,14 +74,14 @@ def element_terms(
     class_loss = focal(prediction.logits, label).sum()
 
     chosen = prediction.box[assignment.query]  # (N, 2, 2)
-    error = jnp.abs(_shares(chosen, size) - _shares(elements.box, size)).sum(-1)
+    error = jnp.abs(_fractions(chosen, size) - _fractions(elements.box, size)).sum(-1)
     apart = 1.0 - generalised_iou(chosen, elements.box)
     total = lambda x: jnp.where(assignment.matched, x, 0.0).sum()  # noqa: E731
     return class_loss, total(error), total(apart)
 
 
-def _shares(box: Float[Array, "*b 2 2"], size: Int[Array, " 2"]) -> Float[Array, "*b 4"]:
-    """Return centre and size of boxes as shares of the image."""
+def _fractions(box: Float[Array, "*b 2 2"], size: Int[Array, " 2"]) -> Float[Array, "*b 4"]:
+    """Return centre and size of boxes as fractions of the image."""
     unit = jnp.maximum(size.astype(box.dtype), 1.0).reshape((1,) * (box.ndim - 2) + (2,))
     low, high = box[..., 0, :], box[..., 1, :]
     return jnp.concatenate([0.5 * (low + high) / unit, (high - low) / unit], -1)

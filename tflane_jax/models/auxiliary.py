@@ -1,4 +1,4 @@
-"""Outputs of a model that auxiliary losses alone look at."""
+"""Auxiliary outputs: outputs of a model that only auxiliary losses read."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ AuxiliaryName = Literal["denoised", "lane_cells", "line_cells"]
 
 @struct.dataclass
 class AuxiliaryOutputs:
-    """What a model gives to its auxiliary losses; a host says in `auxiliary` which of them it has.
+    """Auxiliary outputs of a model; None where it has none. `HostConfig.auxiliary` lists those of a host.
 
     Attributes:
-        denoised: centerlines of the denoising queries, leading axes (copy, layer).
-        lane_cells: (h, w, `CELL_CHANNELS`) lanes by BEV cell.
-        line_cells: (h, w) logit that a lane line passes through a cell of the image features.
+        denoised: centerlines of the denoising queries, leading axes (copy, layer); see `models.lane_denoising`.
+        lane_cells: (h, w, `CELL_CHANNELS`) lanes per BEV cell.
+        line_cells: (h, w) logit per cell of the image features: does a lane line pass through it?
     """
 
     denoised: CenterlinePrediction | None = None
@@ -36,17 +36,17 @@ class AuxiliaryOutputs:
 
 
 def auxiliary_outputs(state: Any) -> AuxiliaryOutputs:
-    """Return the auxiliary outputs among the variables that `Module.apply` changed."""
+    """Return the auxiliary outputs from the mutated collections that `Module.apply` returns."""
     flat: Any = flatten_dict(state.get(AUXILIARY, {}))
-    # Flax keeps what is sown in a tuple.
+    # `sow` appends to a tuple.
     return AuxiliaryOutputs(**{path[-1]: values[0] for path, values in flat.items()})
 
 
 class LaneCellHead(nn.Module):
-    """Predicts lanes by BEV cell as the auxiliary output `lane_cells`."""
+    """Predicts the auxiliary output `lane_cells` from BEV features."""
 
     @nn.compact
     def __call__(self, bev: Float[Array, "h w c"]) -> None:
-        """Predict from BEV features. No-op unless the `auxiliary` collection is mutable."""
+        """Sow the prediction for each BEV cell. No-op unless the `auxiliary` collection is mutable."""
         if self.is_mutable_collection(AUXILIARY):
             self.sow(AUXILIARY, "lane_cells", nn.Dense(CELL_CHANNELS, name="out")(bev))

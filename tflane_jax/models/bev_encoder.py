@@ -1,11 +1,14 @@
-"""The layers of BEVFormer's encoder, and the sizes of the whole (Li et al. 2022).
+"""BEVFormer's encoder layers and its configuration (Li et al. 2022; docs/reference/bevformer.md).
 
-Where the published code departs from the paper, an option reproduces it. `align="reference"` (TopoNet, LaneSegNet)
-rotates the previous features with nearest sampling about `rotation_center`, and shifts the reference points by the
-vehicle's motion. `align="bevformer"` (BEVFormer, MapTR, OpenLane-V2's baseline, SMERF) does the same with a shift along
-the axes of nuScenes' lidar; on a grid with x forward, such as OpenLane-V2's, that moves the points sideways.
-`temporal_value="initial"` gives every layer the queries before the first layer as the present frame;
-`value_projections=2` (OpenLane-V2's baseline, SMERF) projects them twice.
+By default, previous features are warped into the present frame ("warp"). Options reproduce published code that departs
+from the paper:
+
+- `align="reference"` (TopoNet, LaneSegNet) rotates the previous features with nearest sampling about `rotation_center`,
+  and shifts the reference points by the vehicle's motion.
+- `align="bevformer"` (BEVFormer, MapTR, OpenLane-V2's baseline, SMERF) does the same with a shift along the axes of
+  nuScenes' lidar; on a grid with x forward, such as OpenLane-V2's, this moves the points sideways.
+- `temporal_value="initial"`: in every layer, the value of the present frame is the queries before the first layer.
+- `value_projections=2` (OpenLane-V2's baseline, SMERF): temporal attention projects its value twice.
 """
 
 from __future__ import annotations
@@ -29,29 +32,29 @@ from tflane_jax.models.prior import BevHook
 
 @dataclass(frozen=True)
 class BevFormerConfig:
-    """Sizes of the encoder; the defaults are TopoNet's, `SMALL_BEVFORMER` trains on two CPU cores.
+    """Sizes of the encoder. The defaults are TopoNet's; `SMALL_BEVFORMER` is small enough to train on two CPU cores.
 
     Attributes:
-        grid: cells of the BEV features; one query each.
+        grid: cells of the BEV features; one query per cell.
         dim: channels; even.
         heads: attention heads.
         layers: encoder layers.
-        hidden: channels inside the feed-forward part.
-        dropout: probability, after each attention and inside and after the feed-forward part.
+        hidden: channels inside the feed-forward block.
+        dropout: probability, after each attention and inside and after the feed-forward block.
         temporal_points: sampling points per head and frame.
         spatial_points: sampling points per head and level, a multiple of `anchors`.
-        anchors: heights of a pillar.
+        anchors: points per pillar, at different heights.
         levels: feature levels of an image.
-        cameras: most cameras; each has its own embedding.
-        capacity: queries that one camera can serve, None for all (see `layers.bev_attention`); `check_capacity` tells
-            whether it suffices.
-        align: how the previous features come into the present frame, see the top of this file.
-        rotation_center: (column, row) of the rotation where `align` is not "warp", in cells from the grid's corner;
-            None is the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
-        temporal_value: the present frame's value in temporal attention, see the top of this file.
-        value_projections: how often temporal attention projects its value.
+        cameras: largest number of cameras; each has its own embedding.
+        capacity: largest number of queries that one camera serves, None for all (see `layers.bev_attention`);
+            `bevformer.check_capacity` checks it against a frame.
+        align: how previous features are brought into the present frame, see the module docstring.
+        rotation_center: centre of the rotation as (column, row), in cells from the grid's corner, unless `align` is
+            "warp"; None: the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
+        temporal_value: the present frame's value in temporal attention, see the module docstring.
+        value_projections: how many times temporal attention projects its value.
         remat: recompute each layer's activations for the gradient instead of keeping them.
-        precision: of the projections; parameters, sampling locations and results are float32.
+        precision: dtype of the projections; parameters, sampling locations and results are float32.
     """
 
     grid: BevGrid = BevGrid()
@@ -75,7 +78,7 @@ class BevFormerConfig:
 
     @property
     def dtype(self) -> Any:
-        """Of the projections, None for that of the parameters."""
+        """Dtype of the projections; None: that of the parameters."""
         return jnp.bfloat16 if self.precision == "bfloat16" else None
 
 
@@ -86,11 +89,11 @@ SMALL_BEVFORMER = BevFormerConfig(
 
 @struct.dataclass
 class BevMemory:
-    """What one frame hands to the next.
+    """BEV features that one frame passes to the next.
 
     Attributes:
         features: (h, w, c) BEV features of the previous frame, in that frame's ego frame.
-        valid: () false at the start of a sequence; then `features` is never looked at.
+        valid: () False at the start of a sequence; `features` is then ignored.
     """
 
     features: Float[Array, "h w c"]
@@ -104,7 +107,7 @@ class BevMemory:
 
 
 class BevEncoder(nn.Module):
-    """The layers."""
+    """The stack of encoder layers."""
 
     config: BevFormerConfig
 
@@ -122,7 +125,20 @@ class BevEncoder(nn.Module):
         deterministic: bool,
         fuse: BevHook | None = None,
     ) -> Float[Array, "q c"]:
-        """Return the encoded queries; see `BevFormer.encode` and the attentions for the arguments."""
+        """Return the encoded queries (Q, C).
+
+        Args:
+            queries: (Q, C) BEV queries, row-major.
+            position: (Q, C) their position encoding.
+            tokens: (V, HW, C) image features of V cameras, all levels concatenated.
+            shapes: (height, width) of every level.
+            reference: (V, Q, Z, 2) pillar points in each image, as fractions of its size.
+            visible: (V, Q, Z) which of them the camera sees.
+            history: aligned memory of the previous frame.
+            shift: (2,) offset of the previous frame's sampling points, as fractions of the grid.
+            deterministic: no dropout.
+            fuse: how priors change the queries of each layer, after spatial attention.
+        """
         config, initial = self.config, queries
         here = jnp.asarray(cell_points(config.grid))
         before = here + jnp.where(history.valid, shift, 0.0)[None]
@@ -131,15 +147,15 @@ class BevEncoder(nn.Module):
         # Static arguments: the module itself counts as the first.
         layer = nn.remat(BevEncoderLayer, static_argnums=(8, 9, 10)) if config.remat else BevEncoderLayer
         for i in range(config.layers):
-            # Without a memory the queries look at themselves twice.
+            # Without a memory, both frames are the queries themselves.
             previous = jnp.where(history.valid, past, queries)
-            looked_at = queries
+            present = queries
             if config.temporal_value == "initial":
-                looked_at = jnp.where(history.valid, initial, queries)
+                present = jnp.where(history.valid, initial, queries)
             queries = layer(config, name=f"layer_{i}")(
                 queries,
                 position,
-                (previous, looked_at),
+                (previous, present),
                 cells,
                 tokens,
                 reference,
@@ -152,7 +168,7 @@ class BevEncoder(nn.Module):
 
 
 class BevEncoderLayer(nn.Module):
-    """Temporal self-attention, spatial cross-attention, feed-forward part; a norm behind each."""
+    """Temporal self-attention, spatial cross-attention, feed-forward block; each followed by a norm."""
 
     config: BevFormerConfig
 
@@ -170,7 +186,7 @@ class BevEncoderLayer(nn.Module):
         deterministic: bool,
         fuse: Callable[[Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]] | None = None,
     ) -> Float[Array, "q c"]:
-        """Return the queries after the layer; `frames` are what temporal attention looks at, previous and present."""
+        """Return the queries after the layer; `frames` are the previous and present values of temporal attention."""
         config, grid = self.config, self.config.grid
         init = nn.initializers.xavier_uniform()
 
@@ -191,7 +207,7 @@ class BevEncoderLayer(nn.Module):
             config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
         )
         queries = add(queries, spatial(queries, tokens, shapes, reference, visible), "spatial")
-        # Barriers, so that a prior that is absent leaves what a layer without priors computes, to the bit.
+        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
         queries = lax.optimization_barrier(queries)
         if fuse is not None:
             queries = lax.optimization_barrier(fuse(queries, position))

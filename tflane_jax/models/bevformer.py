@@ -1,7 +1,7 @@
-"""BEVFormer: from feature maps of several cameras, and the previous frame's result, to bird's-eye-view features.
+"""BEVFormer: feature maps of several cameras, and the previous frame's BEV features, to BEV features.
 
-Reference: Li et al. 2022; the published version is TopoNet's "BEV constructer". A module encodes one frame, and time is
-an explicit carry: `encode_sequence` scans over the frames, and `step` encodes one of them, with equal results.
+Source: Li et al. 2022, and TopoNet's "BEV constructer" (docs/reference/bevformer.md). The module encodes one frame; the
+memory is an explicit carry. `encode_sequence` scans over frames, `step` encodes one frame, with equal results.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from tflane_jax.models.bev_encoder import BevEncoder, BevFormerConfig, BevMemory
 from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import CameraViews
 
-# Length of the reference's vector of vehicle motion (the "CAN bus").
+# Length of the published code's vector of vehicle motion ("CAN bus").
 MOTION = 18
 
 
 class BevFormer(nn.Module):
-    """The whole encoder of one frame."""
+    """BEV encoder of one frame."""
 
     config: BevFormerConfig
 
@@ -45,15 +45,18 @@ class BevFormer(nn.Module):
         deterministic: bool = True,
         fuse: BevHook | None = None,
     ) -> Float[Array, "h w c"]:
-        """Return the BEV features.
+        """Return the BEV features (rows, columns, C).
 
         Args:
-            features: levels of the image encoder, finest first.
-            cameras: where the images were taken; the pixels are not looked at.
-            memory: of the previous frame; None and an invalid one are the same.
-            previous_from_ego: pose of this ego frame in the previous one's, looked at where the memory is valid.
-            deterministic: no dropout; with it, the key `dropout` is needed.
-            fuse: what priors add behind the cameras of each layer.
+            features: levels (V, h, w, C) of the image encoder, finest first.
+            cameras: calibration and validity of the V cameras; of the images, only the shape is used.
+            memory: of the previous frame; None is equivalent to an invalid memory.
+            previous_from_ego: (4, 4) pose of this ego frame in the previous one; ignored for an invalid memory.
+            deterministic: no dropout. False needs the random key `dropout`.
+            fuse: how priors change the queries of each layer, after spatial attention.
+
+        Raises:
+            UserError: more cameras, or another number of levels, than configured.
         """
         config = self.config
         memory = memory or _no_memory(config)
@@ -76,7 +79,7 @@ class BevFormer(nn.Module):
         deterministic: bool = True,
         fuse: BevHook | None = None,
     ) -> Float[Array, "h w c"]:
-        """Return the BEV features from a memory that has been aligned (`align`) and a vector of vehicle motion."""
+        """Return the BEV features from an aligned memory (`align`) and the vehicle's motion (`motion_vector`)."""
         config, grid = self.config, self.config.grid
         if len(features) != config.levels or len(cameras.valid) > config.cameras:
             raise UserError(
@@ -95,7 +98,7 @@ class BevFormer(nn.Module):
             level.reshape(len(level), -1, config.dim) + by_camera + by_level[None, i : i + 1]
             for i, level in enumerate(features)
         ]
-        # What an invalid camera shows may be anything.
+        # Padding of invalid cameras may hold anything, NaN included.
         tokens = jnp.where(cameras.valid[:, None, None], jnp.concatenate(tokens, 1), 0.0)
         shapes = tuple((level.shape[1], level.shape[2]) for level in features)
         reference, visible = see_pillars(config, cameras)
@@ -105,12 +108,12 @@ class BevFormer(nn.Module):
 
 
 def _no_memory(config: BevFormerConfig) -> BevMemory:
-    # The barrier lets XLA round as it does with an invalid memory, which it cannot simplify away.
+    # The barrier keeps XLA from simplifying the zeros away, so that rounding is the same as with an invalid memory.
     return lax.optimization_barrier(BevMemory.empty(config))
 
 
 class MotionEmbedding(nn.Module):
-    """What is added to all queries for the vehicle's motion."""
+    """Embedding of the vehicle's motion, added to all queries."""
 
     dim: int
 
@@ -124,28 +127,28 @@ class MotionEmbedding(nn.Module):
 
 
 def see_pillars(config: BevFormerConfig, cameras: CameraViews) -> tuple[Float[Array, "v q z 2"], Bool[Array, "v q z"]]:
-    """Return where the pillars of all queries lie in each image (shares of its size), and which anchors it shows.
+    """Return where each camera sees the pillar points of all queries, and which of them it sees.
 
-    The features are those of the padded images, so shares of an image become shares of the array that it lies in.
+    Positions are fractions of the padded image array, because the features cover that array with its padding.
     """
     points = config.grid.range.denormalise(pillar_points(config.grid, config.anchors))
-    # Places need all of float32, also where an accelerator multiplies more coarsely by default.
+    # Full float32: accelerators may multiply matrices at lower precision by default.
     with jax.default_matmul_precision("highest"):
-        share, inside = project_pillars(
+        fraction, inside = project_pillars(
             jnp.asarray(points), cameras.intrinsics, cameras.camera_from_ego, jnp.asarray(cameras.size)
         )
     height, width = cameras.image.shape[1:3]
-    used = jnp.asarray(cameras.size).astype(share.dtype) / jnp.array([width, height], share.dtype)[None]
-    return share * used[:, None, None], inside & cameras.valid[:, None, None]
+    used = jnp.asarray(cameras.size).astype(fraction.dtype) / jnp.array([width, height], fraction.dtype)[None]
+    return fraction * used[:, None, None], inside & cameras.valid[:, None, None]
 
 
 def seen_queries(config: BevFormerConfig, cameras: CameraViews) -> Int[Array, " v"]:
-    """Return how many queries each camera sees."""
+    """Return the number of queries that each camera sees, (V,)."""
     return see_pillars(config, cameras)[1].any(-1).sum(-1)
 
 
 def check_capacity(config: BevFormerConfig, cameras: CameraViews) -> None:
-    """Raise UserError where a camera of a typical frame sees more queries than it can serve (on the host)."""
+    """Raise UserError if a camera of this frame sees more queries than `capacity` (runs on the host, not traced)."""
     most = int(np.max(seen_queries(config, cameras)))
     if config.capacity is not None and most > config.capacity:
         raise UserError(
@@ -157,7 +160,7 @@ def check_capacity(config: BevFormerConfig, cameras: CameraViews) -> None:
 def align(
     config: BevFormerConfig, memory: BevMemory, previous_from_ego: Float[Array, "4 4"]
 ) -> tuple[BevMemory, Float[Array, "2"]]:
-    """Return the memory in the present frame, and the shift left to the points that temporal attention looks at."""
+    """Return the memory in the present ego frame, and the remaining shift of temporal attention's sampling points."""
     if config.align == "warp":
         moved = warp(memory.features, config.grid, previous_from_ego)
         return BevMemory(moved, memory.valid), jnp.zeros(2, moved.dtype)
@@ -168,10 +171,10 @@ def align(
 
 
 def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]) -> Float[Array, " m"]:
-    """Return the vehicle's motion since the previous frame at the places of the reference's vector, zero without one.
+    """Return the vehicle's motion since the previous frame, in the layout of BEVFormer's CAN-bus vector; 0 without one.
 
-    Metres along the present axes at 0 to 2, radians and degrees turned at 16 and 17. The absolute heading and the
-    fields of the vehicle's bus that the reference holds beside them are left out: a lane does not depend on them.
+    Entries 0 to 2: translation in metres along the present axes; 16 and 17: yaw in radians and degrees. All others are
+    0: BEVFormer's absolute heading and bus signals do not determine lanes.
     """
     moved = previous_from_ego[:3, :3].T @ previous_from_ego[:3, 3]
     yaw = pose_yaw(previous_from_ego)
@@ -182,12 +185,12 @@ def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]
 
 @struct.dataclass
 class BevFrame:
-    """What the encoder reads of one frame, or of T frames with a leading axis.
+    """Inputs of the encoder for one frame, or for T frames with a leading axis.
 
     Attributes:
-        features: levels (V, h, w, C).
-        cameras: the views.
-        previous_from_ego: (4, 4).
+        features: levels (V, h, w, C), finest first.
+        cameras: the V views.
+        previous_from_ego: (4, 4) pose of this ego frame in the previous one.
         has_previous: () the previous frame belongs to the same sequence.
     """
 
@@ -205,6 +208,6 @@ def step(model: BevFormer, variables: Any, memory: BevMemory, frame: BevFrame) -
 
 
 def encode_sequence(model: BevFormer, variables: Any, frames: BevFrame) -> Float[Array, "t h w c"]:
-    """Return the BEV features of T frames, each of which knows the one before it."""
+    """Return the BEV features of T successive frames; each frame receives the memory of the one before."""
     start = BevMemory.empty(model.config)
     return lax.scan(lambda memory, frame: step(model, variables, memory, frame), start, frames)[1]

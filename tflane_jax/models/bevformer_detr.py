@@ -1,7 +1,7 @@
-"""BEVFormer-DETR, OpenLane-V2's large baseline: lanes and traffic elements found alone, related afterwards.
+"""BEVFormer-DETR, OpenLane-V2's large baseline (docs/reference/toponet.md).
 
-Unlike TopoNet, there is no graph in the decoder: plain feed-forward parts, and
-relationship heads on the queries of the last layers only. A lane is 11 points or a Bezier curve.
+Unlike TopoNet, the decoder has plain feed-forward blocks instead of a scene graph, and only the last layer has
+relationship heads. A lane is 11 points or a Bezier curve.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from tflane_jax.scene import LaneGraph, Prediction
 
 @dataclass(frozen=True, kw_only=True)
 class BevFormerDetrConfig(HostConfig):
-    """The model.
+    """Configuration of BEVFormer-DETR.
 
     Attributes:
-        decoder: lane decoder; references never move (`refine="fixed"`).
-        control_points: a lane is a Bezier curve of so many control points, read at `decoder.points` points; None: a
-            lane is its points. The loss compares what is predicted.
-        denoising: noised lanes to train the decoder with, or None as in the baseline.
+        decoder: lane decoder; its reference points must be fixed (`refine="fixed"`).
+        control_points: number of control points of a predicted Bezier curve, which is sampled at `decoder.points`
+            points; None: the points are predicted. The loss compares control points or points accordingly.
+        denoising: noised lanes in training (`models.lane_denoising`); None as in the baseline.
         encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
     """
 
@@ -53,11 +53,11 @@ class BevFormerDetrConfig(HostConfig):
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Denoised lanes, beside what every host has."""
+        """Denoised lanes if configured, and those of every host."""
         return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
 
     def build(self) -> BevFormerDetr:
-        """Return the Linen module; raises UserError where its parts do not fit each other."""
+        """Return the Linen module; raises UserError where its parts do not fit together."""
         check_elements(self.encoder, self.decoder.layers, self.elements)
         if self.decoder.refine != "fixed":
             raise UserError('the references of BEVFormer-DETR never move: set task.model.decoder.refine to "fixed"')
@@ -65,7 +65,7 @@ class BevFormerDetrConfig(HostConfig):
 
 
 def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
-    """Return the sizes of OpenLane-V2's large baseline; its copy in SMERF has `control_points=None`."""
+    """Return the published sizes of OpenLane-V2's large baseline; SMERF's copy has `control_points=None`."""
     decoder = replace(PAPER_LANE_DECODER, queries=100)
     return BevFormerDetrConfig(
         encoder=PAPER_CAMERA_ENCODER, decoder=decoder, elements=PAPER_ELEMENT_DECODER, control_points=control_points
@@ -73,7 +73,7 @@ def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
 
 
 class BevFormerDetr(Host):
-    """One example in, the predictions of every decoder layer out."""
+    """From one example to the predictions of every decoder layer."""
 
     config: BevFormerDetrConfig
 
@@ -92,17 +92,17 @@ class BevFormerDetr(Host):
     ) -> Prediction:
         """Return lanes of every decoder layer and the topology of the last, from BEV features and prior tokens.
 
-        Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
+        Sows the queries of every layer as `layer_queries` if the collection `intermediates` is mutable.
         """
         return decode_lanes(self, self._lines(), bev, elements, tokens or {}, lanes, deterministic)
 
     def _lines(self) -> LaneDecoderConfig:
-        """Return the decoder's sizes, with the points that it predicts."""
+        """Return the decoder's sizes, with `points` the number of predicted (control) points."""
         controls = self.config.control_points
         return self.config.decoder if controls is None else replace(self.config.decoder, points=controls)
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return the predictions of one set of queries."""
+        """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
         controls, config = self.config.control_points, self._lines()
         queries, position, reference = start
         outputs = []
@@ -112,9 +112,9 @@ class BevFormerDetr(Host):
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
             queries = layer(queries, position, reference, bev, None, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
-            seen = None if elements is None else elements.queries[i]
+            element_queries = None if elements is None else elements.queries[i]
             heads = LaneHeads(config, self.config.spec.bev_range, relations=last, name=f"heads_{i}")
-            output = heads(queries, reference, bev, seen)
+            output = heads(queries, reference, bev, element_queries)
             if controls is not None:
                 basis = jnp.asarray(bezier_basis(self.config.decoder.points, controls), output.points.dtype)
                 output = output._replace(points=jnp.einsum("pk,qkc->qpc", basis, output.points))

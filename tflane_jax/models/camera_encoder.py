@@ -1,7 +1,7 @@
-"""From the cameras of one frame to BEV features, and the front view in which traffic elements are found.
+"""Camera encoder: images of one frame to BEV features and front-view features.
 
-Images -> image encoder -> feature maps of all cameras -> BEVFormer -> BEV features; the maps of the front camera go on
-to the traffic elements.
+Images -> image encoder -> feature maps of all cameras -> BEVFormer -> BEV features. The feature maps of the front
+camera also go to the traffic-element decoder.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from tflane_jax.scene import Example
 
 @dataclass(frozen=True)
 class CameraEncoderConfig:
-    """The encoder of cameras; the defaults train on two CPU cores, `PAPER_CAMERA_ENCODER` holds TopoNet's sizes.
+    """The camera encoder. The defaults train on two CPU cores; `PAPER_CAMERA_ENCODER` has TopoNet's sizes.
 
     Attributes:
         images: from images to feature maps.
-        bev: from feature maps to BEV features; as many levels and channels.
-        cells: say of every BEV cell whether a lane runs through it, where and which way, for the auxiliary loss
-            `losses.lane_cells`. None of the papers has it; small models learn to see by it in minutes.
+        bev: from feature maps to BEV features; levels and channels must match those of `images`.
+        cells: predict for every BEV cell whether a lane passes through it, its offset and direction, for the auxiliary
+            loss `losses.lane_cells`. Not in the papers; it speeds up training of small models.
     """
 
     images: ImageEncoderConfig = ImageEncoderConfig()
@@ -50,12 +50,12 @@ PAPER_CAMERA_ENCODER = CameraEncoderConfig(PAPER_IMAGE_ENCODER, BevFormerConfig(
 
 
 class FrontView(NamedTuple):
-    """The image in which traffic elements are sought.
+    """Features of the front camera, the input of the traffic-element decoder.
 
     Attributes:
         features: levels (h, w, C), finest first.
         size: width and height of the image, pixels; zeros where the camera delivered none.
-        padded: (rows, columns) of the array that it lies in.
+        padded: (rows, columns) of the padded image array.
     """
 
     features: Sequence[Float[Array, "h w c"]]
@@ -64,12 +64,12 @@ class FrontView(NamedTuple):
 
 
 class EncoderOutput(NamedTuple):
-    """What an encoder makes of an example.
+    """Outputs of an encoder for one example.
 
     Attributes:
-        bev: BEV features, row 0 at the least y, column 0 at the least x.
-        front: None without cameras.
-        memory: for the next frame of the sequence; None without cameras.
+        bev: (h, w, C) BEV features, row 0 at the smallest y, column 0 at the smallest x.
+        front: features of the front camera; None without cameras.
+        memory: BEV memory for the next frame; None without cameras.
     """
 
     bev: Float[Array, "h w c"]
@@ -78,7 +78,7 @@ class EncoderOutput(NamedTuple):
 
 
 class CameraEncoder(nn.Module):
-    """Images of one frame, and the memory of the frame before it, to BEV features."""
+    """From the images of one frame and the memory of the previous frame to BEV features."""
 
     config: CameraEncoderConfig
 
@@ -86,13 +86,13 @@ class CameraEncoder(nn.Module):
     def __call__(
         self, example: Example, memory: BevMemory | None, *, train: bool, fuse: BevHook | None = None
     ) -> EncoderOutput:
-        """Return what the cameras show; raises UserError where the example has no images."""
+        """Return BEV features, front view and memory; raises UserError if the example has no images."""
         cameras = example.cameras
         if cameras is None:
             raise UserError("the model reads camera images, and these data have none: choose data with cameras")
         levels = ImageEncoder(self.config.images, name="images")(cameras, train=train)
         if memory is not None:
-            # No gradient through time, as in the reference; a new scene begins without memory.
+            # No gradient through time, as in the published code; a new scene starts without memory.
             memory = BevMemory(lax.stop_gradient(memory.features), memory.valid & example.has_previous)
         bev = BevFormer(self.config.bev, name="bev")(
             levels, cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train, fuse=fuse

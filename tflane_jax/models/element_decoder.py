@@ -1,7 +1,7 @@
 """Traffic lights and signs in the front view: Deformable DETR with iterative box refinement, TopoNet's TE head.
 
-Reference: Zhu et al. 2021, and TopoNet's published code. Features of the front camera, several levels -> encoder -> E
-queries that look at all levels -> after every decoder layer 13 class logits and a box, in pixels of that camera.
+Source: Zhu et al. 2021, and TopoNet's published code (docs/reference/toponet.md). Multi-level features of the front
+camera -> encoder -> E queries attend to all levels -> 13 class logits and a box in pixels after every decoder layer.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from tflane_jax.layers.transformer import FeedForward, Residual, TransformerConf
 
 @dataclass(frozen=True)
 class ElementDecoderConfig:
-    """Sizes; the defaults train on two CPU cores, `PAPER_ELEMENT_DECODER` holds TopoNet's.
+    """Sizes. The defaults train on two CPU cores; `PAPER_ELEMENT_DECODER` has TopoNet's.
 
     Attributes:
         dim: channels of features and queries.
         heads: attention heads.
-        levels: feature levels that are looked at.
-        encoder_layers, layers: of encoder and decoder; a host with a lane decoder wants as many `layers` there.
-        queries: traffic elements that can be found, E.
+        levels: feature levels of the front camera.
+        encoder_layers, layers: of encoder and decoder; `layers` must equal that of the host's lane decoder.
+        queries: E, the largest number of traffic elements found.
         sampling_points: per head and level.
-        hidden: channels inside the feed-forward parts.
-        dropout: of attention weights, hidden channels and everything that is added to a residual.
+        hidden: channels inside the feed-forward blocks.
+        dropout: probability, for attention weights, hidden channels and every residual branch.
     """
 
     dim: int = 64
@@ -57,12 +57,12 @@ PAPER_ELEMENT_DECODER = ElementDecoderConfig(
 
 @struct.dataclass
 class ElementOutput:
-    """What the decoder's layers say, leading axis D over layers.
+    """Outputs of the D decoder layers.
 
     Attributes:
-        queries: (D, E, C), what the lane decoder and the relationship heads look at.
+        queries: (D, E, C) features, inputs of the lane decoder and its relationship heads.
         box: (D, E, 2, 2) top-left and bottom-right corners, pixels of the front image.
-        logits: (D, E, K) by class, OpenLane-V2's 13 attributes.
+        logits: (D, E, K) of the classes, OpenLane-V2's 13 attributes.
     """
 
     queries: Float[Array, "layers e c"]
@@ -71,7 +71,7 @@ class ElementOutput:
 
 
 class ElementDecoder(nn.Module):
-    """Feature maps of one image in, traffic elements out.
+    """From feature maps of one image to traffic elements.
 
     Attributes:
         config: sizes.
@@ -93,17 +93,17 @@ class ElementDecoder(nn.Module):
         """Return boxes and classes after every layer.
 
         Args:
-            features: of the image array, `levels` of them, finest first; what shows padding alone changes nothing.
+            features: `levels` maps (h, w, C), finest first; cells that show padding only have no influence.
             size: width and height of the image, pixels; the rest of the array is padding.
             padded: (rows, columns) of the image array.
             deterministic: no dropout.
 
         Raises:
-            ValueError: another number of levels.
+            ValueError: the number of feature maps is not `levels`.
         """
         config = self.config
         if len(features) != config.levels:
-            raise ValueError(f"the element decoder looks at {config.levels} levels, and there are {len(features)}")
+            raise ValueError(f"the element decoder is configured for {config.levels} levels and got {len(features)}")
         shapes = [(feature.shape[0], feature.shape[1]) for feature in features]
         masks = [image_cells(shape, size, padded) for shape in shapes]
         valid = jnp.concatenate([mask.reshape(-1) for mask in masks])
@@ -119,18 +119,18 @@ class ElementDecoder(nn.Module):
             ]
         )
         cells = jnp.concatenate([cell_centres(shape, ratio) for shape, ratio in zip(shapes, ratios, strict=True)])
-        around = cells[:, None, None] * ratios[None, None]  # (T, 1, L, 2): the same spot on every level
+        around = cells[:, None, None] * ratios[None, None]  # (T, 1, L, 2): the same point on every level
         for i in range(config.encoder_layers):
             layer = ElementEncoderLayer(config, name=f"encoder_{i}")
             tokens = layer(tokens, position, around, shapes, valid, deterministic=deterministic)
         return self._decode(tokens, shapes, valid, ratios, size, deterministic)
 
     def _decode(self, memory, shapes, valid, ratios, size, deterministic: bool) -> ElementOutput:
-        """Run the decoder; boxes are (cx, cy, w, h), shares of the image."""
+        """Run the decoder; boxes are (cx, cy, w, h), fractions of the image size."""
         config = self.config
         embedding = self.param("queries", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
         position, queries = jnp.split(embedding, 2, -1)
-        # A spot first, a box from the second layer on.
+        # A point in the first layer, a box from the second on.
         reference = nn.sigmoid(nn.Dense(2, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         outputs = []
         for i in range(config.layers):
@@ -148,7 +148,7 @@ class ElementDecoder(nn.Module):
 
 
 class ElementEncoderLayer(nn.Module):
-    """Deformable self-attention of the cells of all levels, feed-forward; post-norm."""
+    """Deformable self-attention over the cells of all levels, then feed-forward; post-norm."""
 
     config: ElementDecoderConfig
 
@@ -156,10 +156,10 @@ class ElementEncoderLayer(nn.Module):
     def __call__(self, tokens, position, around, shapes, valid: Bool[Array, " t"], *, deterministic: bool):
         """Return the tokens (T, C) after the layer."""
         config, sizes = self.config, _sizes(self.config)
-        look = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
+        attend = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
         block = FeedForward(sizes, name="feed_forward")
         tokens = Residual(sizes, name="attended")(
-            tokens, lambda x: look(x + position, x, shapes, around, valid), deterministic=deterministic
+            tokens, lambda x: attend(x + position, x, shapes, around, valid), deterministic=deterministic
         )
         return Residual(sizes, name="fed")(
             tokens, lambda x: block(x, deterministic=deterministic), deterministic=deterministic
@@ -178,14 +178,14 @@ class ElementDecoderLayer(nn.Module):
         """Return the queries after the layer."""
         config, sizes = self.config, _sizes(self.config)
         attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
-        look = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
+        sample = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
         block = FeedForward(sizes, name="feed_forward")
 
         def among_queries(x):
             return attend(x + position, x + position, x, deterministic=deterministic)
 
         def to_image(x):
-            return look(x + position, memory, shapes, around, valid)
+            return sample(x + position, memory, shapes, around, valid)
 
         queries = Residual(sizes, name="attended")(queries, among_queries, deterministic=deterministic)
         queries = Residual(sizes, name="crossed")(queries, to_image, deterministic=deterministic)
@@ -195,11 +195,11 @@ class ElementDecoderLayer(nn.Module):
 
 
 class ElementBox(nn.Module):
-    """The box of each query, as a change of its reference in logits.
+    """Predicts the box of each query as an offset to its reference, in logits.
 
     Attributes:
         dim: channels of the queries.
-        first: the reference is a spot, and the boxes begin small.
+        first: first layer, where references are points; initial boxes are small.
     """
 
     dim: int
@@ -216,7 +216,7 @@ class ElementBox(nn.Module):
 
 
 def image_cells(shape: tuple[int, int], size: Int[Array, " 2"], padded: tuple[int, int]) -> Bool[Array, "h w"]:
-    """Return the cells of a feature map whose nearest pixel (towards the origin) shows the image, not padding."""
+    """Return which cells of a feature map show the image, not padding: those whose first pixel lies inside it."""
     rows, columns = (
         jnp.asarray(np.arange(cells) * pixels // cells) < limit
         for cells, pixels, limit in zip(shape, padded, (size[1], size[0]), strict=True)
@@ -225,21 +225,21 @@ def image_cells(shape: tuple[int, int], size: Int[Array, " 2"], padded: tuple[in
 
 
 def valid_ratio(mask: Bool[Array, "h w"]) -> Float[Array, " 2"]:
-    """Return the shares of columns and rows that show the image, at least one cell of each."""
+    """Return the fractions (x, y) of columns and rows that show the image, at least one cell of each."""
     h, w = mask.shape
     columns, rows = mask[0].sum(dtype=jnp.float32) / w, mask[:, 0].sum(dtype=jnp.float32) / h
     return jnp.maximum(jnp.stack([columns, rows]), jnp.array([1.0 / w, 1.0 / h]))
 
 
 def cell_centres(shape: tuple[int, int], ratio: Float[Array, " 2"]) -> Float[Array, "hw 2"]:
-    """Return the centre (x, y) of every cell, row-major, as shares of the part that shows the image."""
+    """Return the centre (x, y) of every cell, row-major, as fractions of the part that shows the image."""
     h, w = shape
     y, x = np.meshgrid((np.arange(h) + 0.5) / h, (np.arange(w) + 0.5) / w, indexing="ij")
     return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32) / ratio[None]
 
 
 def corners(box: Float[Array, "e 4"], size: Int[Array, " 2"]) -> Float[Array, "e 2 2"]:
-    """Return top-left and bottom-right corners in pixels of boxes (cx, cy, w, h), shares of an image of some size."""
+    """Return top-left and bottom-right corners, pixels, of boxes (cx, cy, w, h), fractions of the image `size`."""
     centre, half = box[:, :2], 0.5 * box[:, 2:]
     return jnp.stack([centre - half, centre + half], 1) * size.astype(box.dtype)[None, None]
 

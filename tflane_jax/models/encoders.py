@@ -1,4 +1,4 @@
-"""The encoders that a host can have: from cameras, or from the evidence raster, to BEV features."""
+"""The encoders of a host: from cameras, or from the BEV evidence raster, to BEV features."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def encode_example(
     """Return the encoder's output for one example.
 
     Args:
-        encoder: of the host.
+        encoder: the host's encoder.
         example: one frame.
-        memory: BEV features of the frame before; None without.
-        train: dropout, and the statistics of the batch in batch norms.
-        hook: what the priors add in every layer.
+        memory: BEV features of the previous frame, or None.
+        train: dropout is on, and batch norms use batch statistics.
+        hook: how priors change the BEV features of every layer.
 
     Raises:
-        UserError: the example lacks what the encoder reads.
+        UserError: the example lacks the encoder's input.
     """
     if isinstance(encoder, CameraEncoder):
         return encoder(example, memory, train=train, fuse=hook)
@@ -54,13 +54,15 @@ def start_bev_memory(config: EncoderConfig) -> BevMemory | None:
 
 
 def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoderConfig | None) -> None:
-    """Raise UserError where traffic elements have no front view, or another number of layers than the lane decoder."""
+    """Raise UserError if traffic elements have no front view, or not as many layers as the lane decoder."""
     if elements is None:
         return
     if not isinstance(encoder, CameraEncoderConfig):
-        raise UserError("traffic elements are found in the front camera's image: give the model an encoder of cameras")
+        raise UserError(
+            "traffic elements are detected in the front camera's image: give the model an encoder of cameras"
+        )
     if elements.layers != layers:
         raise UserError(
-            f"the decoders of elements and lanes go layer by layer, and have {elements.layers} and {layers}: "
-            "set elements.layers and decoder.layers to one number"
+            "each lane layer reads the element layer of its index, but the decoders of elements and lanes have "
+            f"{elements.layers} and {layers}: set elements.layers and decoder.layers to one number"
         )

@@ -1,4 +1,4 @@
-"""From the bird's-eye-view evidence raster to BEV features: the CPU-sized stand-in for cameras and BEVFormer."""
+"""From the BEV evidence raster to BEV features: a CPU-sized substitute for cameras and BEVFormer."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class EvidenceEncoderConfig:
 
     Attributes:
         dim: channels of the BEV features.
-        cell: raster cells a side that become one feature cell.
-        dilations: one residual block for each.
+        cell: a block of `cell` x `cell` raster cells becomes one feature cell.
+        dilations: of the convolutions, one residual block each.
         cells: see `CameraEncoderConfig.cells`.
-        range: the box that the raster covers, metres; that of `BevSensorConfig.grid`, which training checks.
+        range: the box that the raster covers, metres; equal to that of `BevSensorConfig.grid`, which training checks.
     """
 
     dim: int = 32
@@ -42,30 +42,33 @@ class EvidenceEncoderConfig:
 
 
 class EvidenceEncoder(nn.Module):
-    """Raster cells folded into channels, then residual blocks of growing reach."""
+    """Raster cells folded into channels, then dilated residual blocks."""
 
     config: EvidenceEncoderConfig
 
     @nn.compact
     def __call__(self, bev: UInt8[Array, "h w c"], fuse: BevHook | None = None) -> Float[Array, "hf wf d"]:
-        """Return features, `cell` times coarser than the raster; raises ValueError where that does not divide it.
+        """Return BEV features, `cell` times coarser than the raster.
 
         Args:
-            bev: evidence.
-            fuse: what priors add behind each residual block. Cells have no learned position here: it is a sine encoding
-                of (x, y).
+            bev: (h, w, c) evidence, row 0 at the smallest y.
+            fuse: how priors change the features after each residual block. The positions that it receives are a sine
+                encoding of (x, y).
+
+        Raises:
+            ValueError: `cell` does not divide the size of the raster.
         """
         (h, w, c), n = bev.shape, self.config.cell
         if h % n or w % n:
             raise ValueError(f"a raster of {h} x {w} cells does not fold into blocks of {n} x {n}")
         x = bev.astype(jnp.float32) / 255.0
-        # Folding loses nothing and spares the convolutions at full resolution, which would cost most on a CPU.
+        # Folding is lossless and avoids convolutions at full resolution, the most expensive ones on a CPU.
         x = x.reshape(h // n, n, w // n, n, c).transpose(0, 2, 1, 3, 4).reshape(h // n, w // n, n * n * c)
         x = nn.relu(_norm("stem_norm")(nn.Conv(self.config.dim, (3, 3), name="stem")(x)))
         for i, dilation in enumerate(self.config.dilations):
             y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
             x = nn.relu(x + _norm(f"block_{i}_norm")(y))
-            # Barriers, so that a prior that is absent leaves what an encoder without priors computes, to the bit.
+            # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
             x = lax.optimization_barrier(x)
             if fuse is not None:
                 places = cell_points(BevGrid(rows=x.shape[0], columns=x.shape[1]))
@@ -77,11 +80,11 @@ class EvidenceEncoder(nn.Module):
 
 
 def _positions(places: np.ndarray, x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:
-    """Return the encoding of where cells lie, as many channels as the features have (a multiple of 4)."""
-    # With 8 bands of 25 x 50 cells the shortest waves are two and three cells long.
+    """Return the position encoding of cells, with the channels of the features (a multiple of 4)."""
+    # With 8 bands on 25 x 50 cells, the shortest wavelengths are two and three cells.
     return sine_encoding(jnp.asarray(places, x.dtype), x.shape[-1] // 4, lowest=0.125)
 
 
 def _norm(name: str) -> nn.GroupNorm:
-    # Statistics of the example alone: no batch axis exists in here.
+    # Group norm: statistics of one example, as modules have no batch axis.
     return nn.GroupNorm(num_groups=8, name=name)

@@ -1,9 +1,9 @@
-"""Graph encoders in the place of LSTR's transformer encoder (GTN lane paper, section 2.1): GTN, GCN and HAN.
+"""Graph encoders in place of LSTR's transformer encoder (GTN lane paper, section 2.1): GTN, GCN and HAN.
 
-The paper puts Graph Transformer Networks into the encoding layer, compares GCN and HAN, and shares parameters between
-GNN and transformer; it does not say how. Our reading: an encoder layer keeps the transformer's structure (residual,
-norm, feed-forward, residual, norm), and graph convolution on learned meta-paths replaces self-attention. The nodes are
-the cells of the feature map, the edge types those of `layers.image_graph`.
+The paper puts Graph Transformer Networks (docs/reference/gtn.md) into the encoding layer, compares GCN and HAN, and
+shares parameters between GNN and transformer; it gives no details. Our reading: an encoder layer keeps the
+transformer's structure (residual, norm, feed-forward, residual, norm), and graph convolution on learned meta-paths
+replaces self-attention. The nodes are the cells of the feature map, the edge types those of `layers.image_graph`.
 
 Self-attention is one of the GTN's edge types, called similarity: its adjacency comes from the query and key projections
 of features + position, and the value and output projections are the weights of the graph convolution on all meta-paths.
@@ -45,12 +45,12 @@ class GtnEncoderConfig:
 
     Attributes:
         layers: encoder layers.
-        hops: edges of a meta-path.
+        hops: length of a meta-path, in edges.
         channels: meta-paths; the features are split evenly over them.
-        relations: structural edge types to choose from.
+        relations: structural edge types to select from.
         similarity: attention over all cells as an additional, last edge type: offered to the last hop only, to every
-            hop (each costs an attention), or to none, for a purely structural graph.
-        heads: of similarity; a single head shared by all channels is cheapest.
+            hop (one attention each), or to none (None), for a purely structural graph.
+        heads: of similarity; one head for all channels is cheapest.
         head_dim: channels of query and key of a head, as in LSTR's attention.
         hidden: hidden channels of the feed-forward network.
         dropout: probability for hidden channels and each residual branch.
@@ -75,7 +75,7 @@ class GtnEncoderConfig:
         return GraphEncoder(self, name=name)
 
     def offers_similarity(self, hop: int) -> bool:
-        """Return whether a hop may choose similarity."""
+        """Return whether a hop may select similarity."""
         return self.similarity == "every_hop" or (self.similarity == "last_hop" and hop == self.hops - 1)
 
     def mixing(self, name: str) -> MetaPathConvolution:
@@ -98,7 +98,7 @@ class GcnEncoderConfig:
     dropout: float = 0.1
 
     def build(self, dim: int, name: str) -> GraphEncoder:
-        """Return the Linen module; the number of channels follows from its input."""
+        """Return the Linen module; it infers the number of channels from its input."""
         del dim
         return GraphEncoder(self, name=name)
 
@@ -158,8 +158,8 @@ class GraphEncoder(nn.Module):
     ) -> Float[Array, "h w c"]:
         """Return the encoder output; invalid cells have no influence and are 0.
 
-        With `mutable="intermediates"` each layer stores `relations`, the weights of the edge types by hop and channel
-        (1 and 1 except for the GTN), and the weights of its attention.
+        If the collection `intermediates` is mutable, each layer sows `relations`, the weights of the edge types (hops,
+        channels, types), with one hop and one channel except for the GTN, and its attention weights.
 
         Args:
             features, position: of each cell; position encodings enter queries and keys only.
@@ -296,7 +296,7 @@ class HeterogeneousAttention(nn.Module):
 
 
 def _choices(offered: list[bool], structural: int) -> Bool[Array, "hops 1 e"]:
-    """Return which edge types a hop may choose: all structural ones, and similarity where it is offered."""
+    """Return which edge types each hop may select: all structural ones, and similarity where offered."""
     return jnp.asarray([[[True] * structural + [similar]] for similar in offered])
 
 

@@ -1,6 +1,6 @@
-"""A host detector: encoder, priors, decoder. What all hosts share, and what each of them declares.
+"""Base classes of host detectors: encoder, priors, decoder.
 
-A new host derives a configuration from `HostConfig` and a module from `Host`, in a file of its own.
+A new host derives a configuration from `HostConfig` and a module from `Host`, in its own file.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from tflane_jax.scene import Example, Prediction
 
 @struct.dataclass
 class HostMemory:
-    """What a host carries from frame to frame.
+    """Memory that a host carries from frame to frame.
 
     Attributes:
-        bev: BEV features of the frame before; None for an encoder without memory.
-        priors: memories of the priors that have one, by name.
+        bev: BEV features of the previous frame; None for an encoder without memory.
+        priors: memories by name, of the priors that have one.
     """
 
     bev: BevMemory | None = None
@@ -39,13 +39,13 @@ class HostMemory:
 
 @dataclass(frozen=True, kw_only=True)
 class HostConfig:
-    """What every host has; hosts add their decoders.
+    """Settings common to all hosts; each host adds its decoder.
 
     Attributes:
         encoder: BEV features from BEV evidence or from cameras.
         range: R_p, the box in which lanes are perceived, metres.
-        priors: traffic flow, SD map, markers; without any, the vision-only baseline.
-        elements: traffic elements in the front view, or None. They need cameras.
+        priors: traffic flow, SD map, markers; none of them gives the vision-only baseline.
+        elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
     """
 
     encoder: EvidenceEncoderConfig | CameraEncoderConfig = EvidenceEncoderConfig()
@@ -56,7 +56,7 @@ class HostConfig:
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
     truth: ClassVar[tuple[str, ...]] = ("lanes",)
-    """Fields of `Example` with the truth that the loss and the metrics of this host read."""
+    """Fields of `Example` that hold the ground truth of this host's loss and metrics."""
     query_type: ClassVar[Literal["instance", "point"]] = "instance"
     """What a query represents, see `HostSpec.query_type`."""
 
@@ -67,16 +67,16 @@ class HostConfig:
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Auxiliary outputs that the host has in training; each has a term in its loss."""
+        """Auxiliary outputs of the host in training; each has a loss term."""
         return ("lane_cells",) if self.encoder.cells else ()
 
     @property
     def spec(self) -> HostSpec:
-        """What priors are told of the host."""
+        """The properties of the host that priors depend on."""
         return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type)
 
     def build(self) -> Host:
-        """Return the Linen module; raises UserError where parts do not fit each other."""
+        """Return the Linen module; raises UserError where its parts do not fit together."""
         raise NotImplementedError
 
     def build_priors(self) -> dict[str, Prior]:
@@ -89,10 +89,10 @@ class HostConfig:
 
 
 class Host(nn.Module):
-    """From an example to the predictions of every decoder layer; subclasses say how queries are decoded.
+    """From an example to the predictions of every decoder layer; subclasses implement `decode_example`.
 
     Attributes:
-        config: of the host.
+        config: the host's `HostConfig`.
     """
 
     config: Any
@@ -108,21 +108,21 @@ class Host(nn.Module):
                 setattr(self, name, module)
 
     def __call__(self, example: Example, memory: HostMemory | None = None, *, train: bool = False) -> Prediction:
-        """Return predictions with a leading axis over decoder layers; the last one is the answer."""
+        """Return predictions with a leading axis over decoder layers; the last layer is the result."""
         return self.step(example, memory, train=train)[0]
 
     def step(
         self, example: Example, memory: HostMemory | None = None, *, train: bool = False
     ) -> tuple[Prediction, HostMemory]:
-        """Return what `__call__` does, and the memory for the next frame.
+        """Return the predictions, as `__call__` does, and the memory for the next frame.
 
         Args:
             example: one frame.
-            memory: of the frame before it; None is a frame on its own. No gradient flows through its BEV features.
-            train: dropout, which needs the key `dropout`, and the batch's own statistics.
+            memory: of the previous frame; None: no previous frame. No gradient flows through its BEV features.
+            train: dropout is on, which needs the random key `dropout`; norms use batch statistics.
 
         Raises:
-            UserError: the example lacks what the model reads.
+            UserError: the example lacks an input of the model.
         """
         memory = memory or HostMemory()
         observations, memories = observe(self.priors.by_name, example, memory.priors)
@@ -132,12 +132,12 @@ class Host(nn.Module):
     def answer(
         self, example: Example, memory: BevMemory | None, observations: ByPrior, *, train: bool = False
     ) -> tuple[Prediction, BevMemory | None]:
-        """Return predictions, and BEV features for the next frame: the part of `step` that is learned.
+        """Return predictions and the BEV memory for the next frame: the learned part of `step`.
 
         Args:
             example: one frame.
-            memory: BEV features of the frame before; None without.
-            observations: of every prior, see `models.priors.observe`.
+            memory: BEV features of the previous frame, or None.
+            observations: of every prior, by name, see `models.priors.observe`.
             train: see `step`.
         """
         tokens = encode(self.priors.by_name, observations, deterministic=not train)
@@ -161,17 +161,17 @@ class Host(nn.Module):
         """Return the predictions of every decoder layer.
 
         Args:
-            example: truth to denoise in training; nothing else of it may be looked at.
-            bev: BEV features.
-            elements: traffic elements of the front view, None without.
-            tokens: of every prior, by name.
+            example: source of the ground truth for denoising in training; no other field may be read.
+            bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
+            elements: outputs of the traffic-element decoder, or None.
+            tokens: prior tokens by name.
             deterministic: no dropout.
         """
         raise NotImplementedError
 
 
 class _Built:
-    """The priors of a module, out of sight of Linen, which would turn a plain dict of them into submodules."""
+    """Wraps the priors of a module, because Linen would turn a plain dict of them into submodules."""
 
     def __init__(self, by_name: dict[str, Prior]):
         self.by_name = by_name

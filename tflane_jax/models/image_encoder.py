@@ -1,4 +1,4 @@
-"""From camera images to feature maps: ResNet and feature pyramid on a stack of views (specs/modules.md section 11)."""
+"""From camera images to feature maps: ResNet and feature pyramid on a stack of views (docs/reference/bevformer.md)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig
 from tflane_jax.layers.resnet import RESNET_50, ResNet, ResNetConfig
 from tflane_jax.scene import CameraViews
 
-# Of ImageNet, RGB, in [0, 255].
+# ImageNet statistics, RGB, of values in [0, 255].
 MEAN_RGB = (123.675, 116.28, 103.53)
 STD_RGB = (58.395, 57.12, 57.375)
 
 
 @dataclass(frozen=True)
 class ImageEncoderConfig:
-    """Sizes of the encoder; the defaults train on two CPU cores, `PAPER_IMAGE_ENCODER` holds the papers' sizes.
+    """Sizes of the encoder. The defaults train on two CPU cores; `PAPER_IMAGE_ENCODER` has the papers' sizes.
 
     Attributes:
         backbone: sizes of the ResNet.
-        stages: of the backbone whose features go on, from 0; 1, 2, 3 are C3 to C5.
+        stages: backbone stages whose features enter the pyramid, from 0; 1, 2, 3 are C3 to C5.
         pyramid: sizes of the feature pyramid.
-        frozen_stages: parts of the backbone that never learn: 1 the stem, 2 the first stage as well. Their gradient is
-            zero, and weight decay leaves them alone.
-        remat: compute each stage of the backbone anew for the gradient instead of keeping what lies in between.
-        precision: of the computation; parameters and what comes out are float32.
+        frozen_stages: frozen parts of the backbone: 1, the stem; 2, the first stage as well. Their gradient is zero,
+            and weight decay skips them.
+        remat: recompute each stage's activations for the gradient instead of keeping them.
+        precision: dtype of the computation; parameters and results are float32.
     """
 
     backbone: ResNetConfig = ResNetConfig((1, 1, 1, 1), (16, 32, 64, 128))
@@ -47,15 +47,15 @@ PAPER_IMAGE_ENCODER = ImageEncoderConfig(
 
 
 class ImageEncoder(nn.Module):
-    """Views in, feature maps of several sizes out."""
+    """From views to feature maps of several resolutions."""
 
     config: ImageEncoderConfig
 
     @nn.compact
     def __call__(self, cameras: CameraViews, *, train: bool = False) -> list[Float[Array, "v h w c"]]:
-        """Return the levels, finest first.
+        """Return the levels (V, h, w, C), finest first.
 
-        `train` lets the norms take the batch's own statistics, unless they are frozen.
+        With `train`, norms use batch statistics, unless they are frozen.
         """
         config = self.config
         dtype = jnp.bfloat16 if config.precision == "bfloat16" else None
@@ -68,7 +68,7 @@ class ImageEncoder(nn.Module):
 
 
 def image_valid(cameras: CameraViews) -> Bool[Array, "v h w"]:
-    """Return which pixels show something: those inside the image of a camera that delivered one."""
+    """Return which pixels lie inside the image of a valid camera; the others are padding."""
     height, width = cameras.image.shape[1:3]
     rows = jnp.arange(height)[None, :, None] < cameras.size[:, 1, None, None]
     columns = jnp.arange(width)[None, None] < cameras.size[:, 0, None, None]
@@ -76,6 +76,6 @@ def image_valid(cameras: CameraViews) -> Bool[Array, "v h w"]:
 
 
 def normalise(image: UInt8[Array, "v h w 3"], valid: Bool[Array, "v h w"]) -> Float[Array, "v h w 3"]:
-    """Return RGB images with zero mean and unit variance over ImageNet; padding is zero, the mean colour."""
+    """Return RGB images with zero mean and unit variance over ImageNet; padding is 0, the mean colour."""
     mean, std = (jnp.asarray(values, jnp.float32)[None, None, None] for values in (MEAN_RGB, STD_RGB))
     return jnp.where(valid[..., None], (image.astype(jnp.float32) - mean) / std, 0.0)

@@ -1,11 +1,11 @@
-"""Lane decoder of TopoNet and BEVFormer-DETR: queries look at BEV features, and heads make centerlines of them.
+"""Lane decoder of TopoNet and BEVFormer-DETR: lane queries attend to BEV features; heads predict centerlines.
 
-In TopoNet they also pass messages along the predicted topology.
+In TopoNet, queries also pass messages along the predicted topology (docs/reference/toponet.md).
 
-Reference: specs/modules.md section 5. Two modes of refinement: "fixed" is TopoNet's own, where a query looks around one
-reference point that never moves; "iterative" starts from learned anchor lanes, moves all points from layer to layer,
-and lets each attention head look around its own point of the lane (LaneSegNet's heads-to-regions), and refines each
-point by what is seen there, which small models need to converge.
+Two modes of refinement. "fixed" is TopoNet's: a query samples around one reference point that never moves. "iterative"
+starts from learned anchor lanes and moves all their points from layer to layer; each attention head samples around its
+own point of the lane (LaneSegNet's heads-to-regions), and each point is refined by the BEV features at its position.
+Small models need "iterative" to converge.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tflane_jax.scene import CenterlinePrediction, ElementPrediction, Prediction
 
 
 class LaneDecoderLayer(nn.Module):
-    """Self-attention, deformable attention to the BEV, feed-forward with or without the scene graph; post-norm."""
+    """Self-attention, deformable attention to the BEV features, feed-forward or scene graph; post-norm."""
 
     config: LaneDecoderConfig
 
@@ -49,11 +49,11 @@ class LaneDecoderLayer(nn.Module):
         """Return the queries after one layer.
 
         Args:
-            queries, position: content of the queries and what is added to it where they look around.
-            reference: where their lanes are, in [0, 1].
-            bev: BEV features, row 0 at the least y, column 0 at the least x.
-            adjacency: the previous layer's edge probabilities; None is a layer without scene graph (BEVFormer-DETR).
-            elements: traffic elements for the scene graph, if the host has them.
+            queries, position: content of the queries and the position encoding added to it in attention.
+            reference: points of their lanes in [0, 1].
+            bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
+            adjacency: the previous layer's edge probabilities; None: a layer without scene graph (BEVFormer-DETR).
+            elements: traffic elements of the scene graph, or None.
             deterministic: no dropout.
         """
         config = self.config
@@ -63,12 +63,12 @@ class LaneDecoderLayer(nn.Module):
             return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change)
 
         attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
-        where = queries + position
-        queries = add("self_attention", queries, attend(where, where, queries, deterministic=deterministic))
-        look = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
+        placed = queries + position
+        queries = add("self_attention", queries, attend(placed, placed, queries, deterministic=deterministic))
+        sample = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
         (h, w, e), around = bev.shape, attention_reference(reference, config)
-        seen = look(queries + position, bev.reshape(h * w, e), ((h, w),), around)
-        queries = add("bev_attention", queries, seen)
+        sampled = sample(queries + position, bev.reshape(h * w, e), ((h, w),), around)
+        queries = add("bev_attention", queries, sampled)
         if adjacency is None:
             block = FeedForward(TransformerConfig(config.heads, config.hidden, config.dropout), name="feed_forward")
             return add("feed_forward", queries, block(queries, deterministic=deterministic))
@@ -78,22 +78,22 @@ class LaneDecoderLayer(nn.Module):
 
 
 class ElementEmbedding(nn.Module):
-    """Traffic-element queries of the front view, embedded for the lane decoder."""
+    """Embeds the queries of the traffic-element decoder for the lane decoder."""
 
     config: LaneDecoderConfig
 
     @nn.compact
     def __call__(self, queries: Float[Array, "e d"], *, deterministic: bool = True) -> Float[Array, "e c"]:
-        """Return the elements' features."""
+        """Return features with the lane decoder's channels."""
         x = nn.relu(nn.Dense(2 * self.config.dim, name="expand")(queries))
         x = nn.Dropout(self.config.dropout, name="dropout")(x, deterministic=deterministic)
         return nn.Dense(self.config.dim, name="contract")(x)
 
 
 class PointwiseRefinement(nn.Module):
-    """Moves each point of a lane by what is seen there, with one network for all points of all lanes.
+    """Moves each point of a lane by the BEV features at its position.
 
-    The heads' own perceptron must learn for every point anew what a line beside it means; this one learns it once.
+    One network serves all points of all lanes, whereas the point head has separate weights for every point.
 
     Attributes:
         config: sizes.
@@ -107,7 +107,7 @@ class PointwiseRefinement(nn.Module):
     def __call__(
         self, queries: Float[Array, "q c"], reference: Float[Array, "q p 3"], bev: Float[Array, "h w e"]
     ) -> Float[Array, "q p 3"]:
-        """Return the change of the reference points, zero before training."""
+        """Return the change of the reference points, in logits of [0, 1]; zero-initialised."""
         config, (h, w, e) = self.config, bev.shape
         here = sample_bilinear(bev.reshape(h * w, e), (h, w), reference[..., :2])
         heading = directions(self.range.denormalise(reference)[..., :2])
@@ -116,19 +116,19 @@ class PointwiseRefinement(nn.Module):
         x = x + nn.Dense(config.dim, use_bias=False, name="lane")(queries)[:, None]
         x = x + self.param("place", nn.initializers.normal(0.1), (1, config.points, config.dim))
         x = nn.relu(nn.Dense(config.dim, name="hidden")(nn.relu(x)))
-        # 0.3: Adam's steps are of one size for all parameters, and a point moves by metres where a lane moves by tens.
+        # 0.3: Adam's steps have one size for all parameters, but points move by metres and lanes by tens of metres.
         return 0.3 * nn.Dense(3, kernel_init=nn.initializers.zeros, name="change")(x)
 
 
 class LaneOutput(NamedTuple):
-    """What the heads of one decoder layer say.
+    """Outputs of the heads of one decoder layer.
 
     Attributes:
         points: (Q, P, 3) metres.
         unit: the same points in [0, 1].
-        logits: (Q, 1) of the class.
-        successor: (Q, Q) logits of lane-lane edges, None where the layer has no relationship heads.
-        element_lane: (Q, E) logits of lane-element edges, None where there are no elements either.
+        logits: (Q, 1) of the class "lane".
+        successor: (Q, Q) logits of lane-lane edges; None without relationship heads.
+        element_lane: (Q, E) logits of lane-element edges; None without relationship heads or elements.
     """
 
     points: Float[Array, "q p 3"]
@@ -159,13 +159,13 @@ class LaneHeads(nn.Module):
         bev: Float[Array, "h w e"],
         elements: Float[Array, "n d"] | None = None,
     ) -> LaneOutput:
-        """Return the layer's prediction; `elements` are features of traffic elements."""
+        """Return the layer's prediction; `elements` are traffic-element features or None."""
         config = self.config
         x = queries
         for i in range(2):
             x = nn.Dense(config.dim, name=f"class_{i}")(x)
             x = nn.relu(nn.LayerNorm(epsilon=1e-5, name=f"class_norm_{i}")(x))
-        # Bias -log 99: every query starts as one percent likely (focal loss prior).
+        # Bias -log 99: the initial probability is 0.01 (focal loss prior, Lin et al. 2017).
         logits = nn.Dense(1, bias_init=nn.initializers.constant(-np.log(99.0)), name="class_out")(x)
         # The change of the reference, in logits of [0, 1].
         change = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries).reshape(reference.shape)
@@ -184,7 +184,7 @@ class LaneHeads(nn.Module):
 def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -> Prediction:
     """Return lanes, elements and topologies with a leading axis over decoder layers.
 
-    The axis of a topology counts only the layers, always the last ones, that predict it.
+    For a topology, this axis has only the layers that predict it, always the last ones.
     """
     related = [output for output in outputs if output.successor is not None]
     lanes = CenterlinePrediction(
@@ -200,10 +200,10 @@ def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -
 
 
 def smooth_basis(points: int) -> Float[np.ndarray, "p k"]:
-    """Return cosines along a lane as columns, the k-th scaled by 1 / k^2: the shapes that a lane is moved by.
+    """Return a basis of lane deformations: column k is cos(k pi t) along the lane, scaled by 1 / k^2.
 
-    The columns span everything that free points do, but an equal change of all coefficients bends a lane instead of
-    making it zigzag: the first moves it, the second turns and stretches it, the third bends it.
+    The columns span all point displacements, but favour smooth ones: column 0 moves the lane, column 1 turns and
+    stretches it, column 2 bends it. Equal changes of free points would make it zigzag.
     """
     along = np.linspace(0.0, np.pi, points)
     order = np.arange(points)
@@ -211,7 +211,7 @@ def smooth_basis(points: int) -> Float[np.ndarray, "p k"]:
 
 
 def directions(points: Float[Array, "*b p 2"]) -> Float[Array, "*b p 2"]:
-    """Return the unit direction of travel at each point of a polyline, by central differences; 0 where it stands."""
+    """Return the unit direction at each point of a polyline, by central differences; 0 where points coincide."""
     before = jnp.concatenate([points[..., :1, :], points[..., :-1, :]], -2)
     after = jnp.concatenate([points[..., 1:, :], points[..., -1:, :]], -2)
     step = after - before
@@ -219,7 +219,7 @@ def directions(points: Float[Array, "*b p 2"]) -> Float[Array, "*b p 2"]:
 
 
 def attention_reference(reference: Float[Array, "q p 3"], config: LaneDecoderConfig) -> Float[Array, "q r 2"]:
-    """Return where the heads look: one common point ("fixed"), or points spread along the lane, one for each head."""
+    """Return the reference points of the heads: a common one ("fixed"), or one per head, spread along the lane."""
     if config.refine == "fixed":
         return reference[:, :1, :2]
     along = np.linspace(0, config.points - 1, config.heads).round().astype(int)
@@ -229,5 +229,5 @@ def attention_reference(reference: Float[Array, "q p 3"], config: LaneDecoderCon
 def next_reference(
     reference: Float[Array, "q p 3"], unit: Float[Array, "q p 3"], config: LaneDecoderConfig
 ) -> Float[Array, "q p 3"]:
-    """Return the reference of the next layer; like Deformable DETR's it carries no gradient."""
+    """Return the reference of the next layer, without gradient, as in Deformable DETR."""
     return reference if config.refine == "fixed" else lax.stop_gradient(unit)

@@ -1,8 +1,8 @@
-"""Denoising queries for training (DN-DETR, Li et al. 2022): lanes of the truth, moved and bent, to be put right.
+"""Denoising queries for training (DN-DETR, Li et al. 2022): noised ground-truth lanes to be restored.
 
-Not part of any of the papers. A learned query must find out by itself which lane is meant for it, and while that keeps
-changing it learns to stand between lanes. A noised lane belongs to one lane from the start, so that the decoder learns
-to see where that runs; small models need it to converge. In prediction there are none.
+Not part of the lane papers. Early in training, the matching of learned queries changes from step to step, and queries
+settle between lanes. A denoising query belongs to one lane from the start, so the decoder gets a stable target; small
+models need this to converge. There are no denoising queries in prediction.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from tflane_jax.scene import LaneGraph, Prediction
 
 @dataclass(frozen=True)
 class DenoisingConfig:
-    """How lanes are noised.
+    """Noise added to ground-truth lanes.
 
     Attributes:
         copies: groups of noised lanes.
-        shift: standard deviation of a whole lane's place along x and y, metres.
-        turn: of its angle about its middle, radians.
-        stretch: of the logarithm of its length.
-        straighten: largest share of its way to the straight line between its ends; a lane goes a uniform part of it.
+        shift: standard deviation of a lane's translation along x and y, metres.
+        turn: standard deviation of its rotation about its mean point, radians.
+        stretch: standard deviation of the logarithm of its scale.
+        straighten: upper limit of the uniform weight with which a lane is blended with the chord between its ends.
     """
 
     copies: int = 2
@@ -43,11 +43,11 @@ class DenoisingConfig:
 
 
 class NoisedQueries(nn.Module):
-    """Queries placed on noised lanes; those without a lane are placed anywhere and must learn to reject it.
+    """Queries placed on noised lanes; surplus queries get random straight lanes as negative examples.
 
     Attributes:
         config: sizes of the decoder.
-        noise: how lanes are noised.
+        noise: noise added to lanes.
         range: the box that normalised coordinates span.
     """
 
@@ -59,7 +59,7 @@ class NoisedQueries(nn.Module):
     def __call__(
         self, lanes: LaneGraph
     ) -> tuple[Float[Array, "g q c"], Float[Array, "g q c"], Float[Array, "g q p 3"]]:
-        """Return content, position and reference points in [0, 1] of every copy; query i belongs to lane i."""
+        """Return content, position and reference points in [0, 1] of every copy (G); query i belongs to lane i."""
         config, copies = self.config, self.noise.copies
         keys = jax.random.split(self.make_rng("dropout"), copies)
         lines = jax.vmap(lambda key: noised_lanes(key, lanes, config.queries, self.range, self.noise))(keys)
@@ -81,16 +81,16 @@ def decode_lanes(
     lanes: LaneGraph | None,
     deterministic: bool,
 ) -> Prediction:
-    """Return what the learned queries predict; predictions of denoising queries become the auxiliary output `denoised`.
+    """Return the predictions of learned queries, and sow those of denoising queries as auxiliary output `denoised`.
 
-    Both kinds go through one decoder and exchange nothing.
+    Both kinds pass through the same decoder without exchanging information.
 
     Args:
-        host: has the decoder, `decode_queries(start, bev, elements, tokens, deterministic)`, where `start` is what
-            `LaneQueries` returns, and `config.denoising`.
-        config: of the queries.
-        bev, elements, tokens, deterministic: handed on.
-        lanes: truth to denoise; nothing else looks at it.
+        host: module with `config.denoising` and the decoder, `decode_queries(start, bev, elements, tokens,
+            deterministic)`, where `start` is as from `LaneQueries`.
+        config: sizes of the queries.
+        bev, elements, tokens, deterministic: passed to `decode_queries`.
+        lanes: ground truth to denoise; not used otherwise.
     """
     start, noise = LaneQueries(config, host.config.spec.bev_range, name="queries")(), host.config.denoising
     if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
@@ -111,22 +111,22 @@ def decode_lanes(
 def noised_lanes(
     key: jax.Array, lanes: LaneGraph, count: int, range_: PerceptionRange, noise: DenoisingConfig
 ) -> Float[Array, "q p 3"]:
-    """Return the first `count` lanes noised, metres; where there is none, a straight one anywhere in the range."""
+    """Return the first `count` lanes noised, metres; in place of padding, random straight lanes in the range."""
     shift, turn, stretch, bend, place, way = jax.random.split(key, 6)
     truth = jnp.where(lanes.valid[:, None, None], lanes.points, 0.0)[:count]
     truth = jnp.pad(truth, ((0, count - len(truth)), (0, 0), (0, 0)))
     valid = jnp.pad(lanes.valid[:count], (0, count - len(lanes.valid[:count])))
-    share = jnp.linspace(0.0, 1.0, truth.shape[1])[None, :, None]
-    # Partly straightened, or it would never learn to bend.
-    chord = truth[:, :1] + share * (truth[:, -1:] - truth[:, :1])
+    fraction = jnp.linspace(0.0, 1.0, truth.shape[1])[None, :, None]
+    # Partly straightened, so that the decoder learns to bend lanes.
+    chord = truth[:, :1] + fraction * (truth[:, -1:] - truth[:, :1])
     truth = truth + noise.straighten * jax.random.uniform(bend, (count, 1, 1)) * (chord - truth)
     middle = truth.mean(1, keepdims=True)
     size = jnp.exp(noise.stretch * jax.random.normal(stretch, (count, 1, 1)))
     angle = noise.turn * jax.random.normal(turn, (count,))
     spot = middle[:, 0] + noise.shift * jnp.pad(jax.random.normal(shift, (count, 2)), ((0, 0), (0, 1)))
     moved = placed(size * (truth - middle), angle, spot)
-    # A lane of 24 m.
-    along = jnp.concatenate([24.0 * (share - 0.5), jnp.zeros((1, truth.shape[1], 2))], -1)
+    # Random lanes are 24 m long.
+    along = jnp.concatenate([24.0 * (fraction - 0.5), jnp.zeros((1, truth.shape[1], 2))], -1)
     heading = jax.random.uniform(way, (count,), maxval=2 * jnp.pi)
     anywhere = range_.denormalise(jax.random.uniform(place, (count, 3)))
     elsewhere = placed(jnp.broadcast_to(along, truth.shape), heading, anywhere)
@@ -136,6 +136,6 @@ def noised_lanes(
 def placed(
     lines: Float[Array, "q p 3"], heading: Float[Array, " q"], spot: Float[Array, "q 3"]
 ) -> Float[Array, "q p 3"]:
-    """Return polylines about the origin, turned in the plane and moved to their spots."""
+    """Return polylines rotated by `heading` (radians, about z) and moved from the origin to `spot` (metres)."""
     pose = yaw_pose(spot[:, 0], spot[:, 1], heading).at[:, 2, 3].set(spot[:, 2])
     return transform_points(pose, lines)

@@ -1,4 +1,4 @@
-"""The sizes of the lane decoder, and the learned queries that it begins with."""
+"""The sizes of the lane decoder, and its learned queries."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tflane_jax.layers.positions import inverse_sigmoid
 
 @dataclass(frozen=True)
 class LaneDecoderConfig:
-    """Sizes of the decoder; the defaults train on two CPU cores, `PAPER_LANE_DECODER` holds TopoNet's.
+    """Sizes of the decoder. The defaults train on two CPU cores; `PAPER_LANE_DECODER` has TopoNet's.
 
     Attributes:
         dim: channels of a query.
@@ -27,11 +27,11 @@ class LaneDecoderConfig:
         points: points P of a centerline.
         sampling_points: deformable sampling points per head.
         hidden: channels inside the feed-forward block.
-        relation: channels of a side of the relationship head.
-        edge_weight: share of neighbours in the scene graph.
-        bands: frequencies per coordinate that tell where a refined lane is.
+        relation: channels of each partner in the relationship head.
+        edge_weight: weight of neighbours in the scene graph.
+        bands: frequencies per coordinate in the position encoding of a refined lane.
         refine: see `models.lane_decoder`.
-        dropout: of attention weights, hidden channels, messages and everything that is added to a residual.
+        dropout: probability, for attention weights, hidden channels, messages and every residual branch.
     """
 
     dim: int = 64
@@ -54,7 +54,7 @@ PAPER_LANE_DECODER = LaneDecoderConfig(
 
 
 class LaneQueries(nn.Module):
-    """The learned queries: content, position and the reference points that the position encodes.
+    """The learned queries: content, position and reference points.
 
     Attributes:
         config: sizes.
@@ -68,7 +68,7 @@ class LaneQueries(nn.Module):
     def __call__(self) -> tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]]:
         """Return content, position and initial reference points in [0, 1].
 
-        "fixed": all points of a lane on one spot that the position decides; "iterative": learned anchor lanes.
+        "fixed": one point per lane, a linear function of the position; "iterative": learned anchor lanes.
         """
         config = self.config
         embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
@@ -84,18 +84,18 @@ class LaneQueries(nn.Module):
 def spread_lanes(
     config: LaneDecoderConfig, range_: PerceptionRange, length: float = 24.0
 ) -> Float[np.ndarray, "q p 3"]:
-    """Return straight lanes spread evenly over the range, in [0, 1]: the anchors before training.
+    """Return the initial anchors: straight lanes spread evenly over the range, in [0, 1].
 
-    Middles and headings follow a Halton sequence: three lanes in five run along the ego's own axis, half of them
-    against it, and the others anywhere. `length` is in metres.
+    Centres and headings follow a Halton sequence: 30 percent head along the ego's x axis, 30 percent against it, 40
+    percent in any direction. `length` is in metres.
     """
     sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
     middle = np.asarray(range_.low(2)) + sample[:, :2] * np.asarray(range_.size(2))
-    share = sample[:, 2] / 0.6
-    heading = np.where(share < 1.0, np.pi * (share < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
+    fraction = sample[:, 2] / 0.6
+    heading = np.where(fraction < 1.0, np.pi * (fraction < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
     along = np.linspace(-length / 2, length / 2, config.points)
     direction = np.stack([np.cos(heading), np.sin(heading)], -1)
     lanes = np.zeros((config.queries, config.points, 3), np.float32)
     lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
-    # Off the border, where the sigmoid that the points go through is flat.
+    # Away from 0 and 1, where the sigmoid of the points is flat.
     return np.clip(range_.normalise(lanes), 0.02, 0.98)

@@ -1,7 +1,7 @@
-"""LSTR: lane lines in one image as parameters of the lane shape model (Liu et al. 2020), with exchangeable encoders.
+"""LSTR: lane lines in one image as parameters of the lane shape model (Liu et al. 2021), with exchangeable encoders.
 
 Image -> reduced ResNet-18 -> encoder (transformer, or one of the graph encoders of the GTN paper) -> decoder with one
-query per lane -> class, extent and curve of each lane. Facts: shared specs/modules.md section 2; GTN paper section 2.
+query per lane -> class, extent and curve of each lane. Source: docs/reference/lstr.md; GTN lane paper, section 2.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import CurvePrediction
 
-# Of TuSimple images in [0, 1], blue, green, red: the order in which the published weights read them.
+# TuSimple statistics of values in [0, 1], in BGR order, which the published weights expect.
 MEAN_BGR = (0.40789654, 0.44719302, 0.47026115)
 STD_BGR = (0.28863828, 0.27408164, 0.27809835)
 
@@ -33,20 +33,20 @@ class TransformerEncoderConfig:
 
     Attributes:
         layers: encoder layers.
-        layer: sizes of each.
+        layer: sizes of a layer.
     """
 
     layers: int = 2
     layer: TransformerConfig = TransformerConfig()
 
     def build(self, dim: int, name: str) -> TransformerEncoder:
-        """Return the Linen module; `dim` is what its input has."""
+        """Return the Linen module; it infers the number of channels from its input."""
         del dim
         return TransformerEncoder(self, name=name)
 
 
-# What anchored heads count in, orders of magnitude of a road: alpha, beta; k'', f'', m'', n'; columns at the two rows.
-# (A bend of 500 m is an m'' of about 1e-3; a change of 1e-5 in k'' moves a lane's far end by a fiftieth of the image.)
+# Mean and scale of the outputs of anchored heads: alpha, beta; k'', f'', m'', n'; columns at the two anchor rows.
+# (A curve radius of 500 m is an m'' of about 1e-3; 1e-5 in k'' moves a lane's far end by 1/50 of the image.)
 _TYPICAL = np.array([0.38, 0.95, 0.0, 0.3, 0.0, 0.5, 0.0, 0.0], np.float32)
 _SPREAD = np.array([0.05, 0.1, 1e-5, 0.03, 2e-3, 0.05, 0.1, 1.0], np.float32)
 
@@ -58,20 +58,21 @@ class LstrConfig:
     """The network; the defaults are LSTR's.
 
     Attributes:
-        backbone: features of the image.
-        dim: channels behind the backbone, a multiple of 4.
-        encoder: what lets the cells of the feature map look at each other.
-        decoder_layers, decoder: layers that answer the queries.
-        queries: most lanes that can be found.
-        shrink: side of the blocks of pixels that are averaged before the network sees them; 2 takes a quarter of the
-            time (the last stage's stride 1 then leaves as many cells as at full size).
-        located: add the position encoding to the features themselves, so that what is attended to says where it is.
-            In LSTR positions steer attention only, and where something is must be learned from the image's borders.
-        cells: say of each cell of the encoder's memory whether a lane line passes through it, for an auxiliary loss.
-            Without it the first few thousand steps answer alike to every image.
-        anchors: two rows (shares of the image); the network then says where a lane's straight part crosses them, and
-            b'' and b''' follow; and all numbers are counted in what they typically are. The same curves, but LSTR's own
-            numbers (None) differ in size by five orders of magnitude, which takes it half a million small steps.
+        backbone: sizes of the ResNet.
+        dim: channels after the backbone, a multiple of 4.
+        encoder: transformer or graph encoder over the cells of the feature map.
+        decoder_layers, decoder: number and sizes of the decoder layers.
+        queries: largest number of lanes found.
+        shrink: side in pixels of the blocks that are averaged before the backbone; 2 takes a quarter of the time (with
+            stride 1 in the last stage, the feature map has as many cells as at full size).
+        located: add the position encoding to the features, so that attention values carry positions. In LSTR
+            positions enter queries and keys only, and must otherwise be learned from the image's borders.
+        cells: predict for each cell of the encoder output whether a lane line passes through it, for an auxiliary
+            loss. Without it, predictions hardly depend on the image for the first few thousand steps.
+        anchors: two rows, as fractions of the image height: the network predicts the columns where a lane's straight
+            part crosses them, from which b'' and b''' follow, and all outputs are scaled to typical values. None:
+            LSTR's parameters, which span five orders of magnitude and take about 500,000 small steps to train. Both
+            describe the same curves.
     """
 
     backbone: ResNetConfig = ResNetConfig()
@@ -109,7 +110,7 @@ class TransformerEncoder(nn.Module):
         *,
         deterministic: bool = True,
     ) -> Float[Array, "h w c"]:
-        """Return the memory; cells that are not valid influence nothing."""
+        """Return the encoder output; invalid cells have no influence."""
         shape, mask = features.shape, key_mask(valid.reshape(-1))
         x = jnp.where(valid[..., None], features, 0.0).reshape(-1, shape[-1])
         position = position.reshape(-1, shape[-1])
@@ -119,7 +120,7 @@ class TransformerEncoder(nn.Module):
 
 
 class Lstr(nn.Module):
-    """One normalised image in, the predictions of every decoder layer out."""
+    """From one normalised image to the predictions of every decoder layer."""
 
     config: LstrConfig
 
@@ -127,12 +128,12 @@ class Lstr(nn.Module):
     def __call__(
         self, image: Float[Array, "h w 3"], valid: Bool[Array, "h w"], *, train: bool = False
     ) -> CurvePrediction:
-        """Return predictions with a leading axis over decoder layers; the last one is the answer.
+        """Return predictions with a leading axis over decoder layers; the last layer is the result.
 
         Args:
-            image: see `normalise`.
-            valid: pixels that show something; cells of the feature map whose pixel is not valid are not attended to.
-            train: batch statistics in the norms (under `vmap` over the axis `batch_norm.BATCH_AXIS`), and dropout.
+            image: as from `normalise`.
+            valid: pixels that are not padding; cells of the feature map whose pixel is padding are not attended to.
+            train: dropout is on, and norms use batch statistics (under `vmap` over `batch_norm.BATCH_AXIS`).
         """
         config = self.config
         image, valid = shrink(image, valid, config.shrink)
@@ -147,14 +148,14 @@ class Lstr(nn.Module):
         if config.cells and self.is_mutable_collection(AUXILIARY):
             self.sow(AUXILIARY, "line_cells", nn.Dense(1, name="cell_head")(memory)[..., 0])
         memory = memory.reshape(-1, config.dim)
-        position, seen = position.reshape(-1, config.dim), key_mask(cells.reshape(-1))
+        position, mask = position.reshape(-1, config.dim), key_mask(cells.reshape(-1))
 
         query = self.param("queries", nn.initializers.normal(1.0), (config.queries, config.dim))
         x, outputs = jnp.zeros_like(query), []
         norm = nn.LayerNorm(epsilon=1e-5, name="decoder_norm")
         for i in range(config.decoder_layers):
             layer = DecoderLayer(config.decoder, name=f"decoder_{i}")
-            x = layer(x, memory, query, position, None, seen, deterministic=not train)
+            x = layer(x, memory, query, position, None, mask, deterministic=not train)
             outputs.append(norm(x))
         return LaneShapeHeads(config.dim, config.anchors, name="heads")(jnp.stack(outputs))
 
@@ -176,7 +177,7 @@ class LaneShapeHeads(nn.Module):
         logits = nn.Dense(2, name="class")(queries)
         specific = Mlp((self.dim, self.dim, 4), name="specific")(queries)  # alpha, beta, b'', b'''
         shared = Mlp((self.dim, self.dim, 4), name="shared")(queries)  # k'', f'', m'', n'
-        # Lanes of one image share these four (GTN paper, section 2.4); the mean runs over all queries, as in LSTR.
+        # All lanes of an image have these four in common (GTN paper, section 2.4): their mean over queries, as in LSTR.
         shared = jnp.broadcast_to(shared.mean(-2, keepdims=True), shared.shape)
         curves = jnp.concatenate([specific[..., :2], shared, specific[..., 2:]], -1)
         if self.anchors is not None:
@@ -185,7 +186,7 @@ class LaneShapeHeads(nn.Module):
 
 
 def _from_columns(curves: Float[Array, "*b 8"], anchors: tuple[float, float]) -> Float[Array, "*b 8"]:
-    """Return curves whose last two numbers, columns of the straight part at two rows, have become b'' and b'''."""
+    """Return curves with the last two entries, columns at the anchor rows, converted to b'' and b'''."""
     upper, lower = anchors
     slope = (curves[..., 7] - curves[..., 6]) / (lower - upper)
     straight = jnp.stack([slope, slope * upper - curves[..., 6]], -1)
@@ -197,7 +198,7 @@ def _like(values: np.ndarray, x: Array) -> Array:
 
 
 def normalise(image: UInt8[Array, "*b h w 3"], valid: Bool[Array, "*b h w"]) -> Float[Array, "*b h w 3"]:
-    """Return what the network reads of RGB images: BGR, zero mean and unit variance over TuSimple, padding black."""
+    """Return the network's input from RGB images: BGR, zero mean and unit variance over TuSimple, black padding."""
     image = jnp.where(valid[..., None], image, 0)
     lead = (1,) * (image.ndim - 1)
     mean, std = (jnp.asarray(values).reshape(*lead, 3) for values in (MEAN_BGR, STD_BGR))
@@ -207,7 +208,10 @@ def normalise(image: UInt8[Array, "*b h w 3"], valid: Bool[Array, "*b h w"]) -> 
 def shrink(
     image: Float[Array, "h w 3"], valid: Bool[Array, "h w"], side: int
 ) -> tuple[Float[Array, "hs ws 3"], Bool[Array, "hs ws"]]:
-    """Return means of blocks of side x side pixels, valid where all are; raises ValueError where some are left."""
+    """Return means of blocks of side x side pixels, valid where all pixels are.
+
+    Raises ValueError if `side` does not divide the image size.
+    """
     if side == 1:
         return image, valid
     height, width = valid.shape
@@ -218,6 +222,6 @@ def shrink(
 
 
 def nearest(mask: Bool[Array, "h w"], rows: int, columns: int) -> Bool[Array, "rows columns"]:
-    """Return the mask at `rows` x `columns` cells: of each its first pixel, floor(i * size / cells)."""
+    """Return the mask at `rows` x `columns` cells, read at each cell's first pixel, floor(i * size / cells)."""
     height, width = mask.shape
     return mask[jnp.arange(rows) * height // rows][:, jnp.arange(columns) * width // columns]

@@ -1,10 +1,10 @@
-"""Confidence-gated marker fusion (Wu and Hu): from the lanes that markers name to guided BEV features.
+"""Confidence-gated marker fusion (Wu and Hu): lanes stored for the detected markers are fused into BEV features.
 
-Lanes of a frame's markers -> memory (`priors.marker_memory`) -> one token for each lane (III-A) -> in every layer of
-the BEV encoder, behind the cameras, attention of the BEV features to the tokens, gated by the confidence (III-B).
+Lanes of a frame's markers -> memory (`priors.marker_memory`) -> one token per lane (III-A) -> in every layer of the BEV
+encoder, after spatial attention, BEV features attend to the tokens, gated by the confidence (III-B).
 
-A frame without guidance leaves the BEV features exactly as they are, so that a model that never sees a marker is the
-model without markers; Eq. (3) alone would normalise them once more.
+Without marker lanes, BEV features stay exactly as they are, so that the model equals the one without markers; Eq. (3)
+as written would apply its LayerNorm.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ from tflane_jax.scene import Example, MarkerObservations
 
 @dataclass(frozen=True)
 class MarkerFusionConfig:
-    """The module; the defaults are the paper's, `SMALL_MARKER_FUSION` trains on two CPU cores.
+    """The module. The defaults are the paper's; `SMALL_MARKER_FUSION` trains on two CPU cores.
 
     Attributes:
         prior: confidence and polylines.
-        memory: temporal memory, None for the ablation without (Table III).
+        memory: temporal memory; None for the ablation without (Table III).
         encoding: of a polyline (Table IV): "sine" is the transformer on Eq. (1), "transformer" the same on raw
             coordinates, "mlp" a perceptron on all raw coordinates of a line.
         lines: sizes of the transformer; `dim` is that of a token.
-        fusion: "gated" is Eq. (3); "uniform" sets its c to one, "hard" to one from `hard_threshold` on and to nothing
-            below (Table II).
-        hard_threshold: confidence from which on "hard" trusts a marker.
+        fusion: "gated" is Eq. (3); "uniform" sets c = 1; "hard" sets c = 1 from `hard_threshold` on and ignores
+            markers below (Table II).
+        hard_threshold: lowest confidence at which "hard" uses markers.
         heads: of the attention to the tokens.
         width: channels of that attention; None: those of the BEV features.
-        norm: where the LayerNorm of Eq. (3) stands. "sum": around the sum, as written. "query": on the BEV features as
-            they ask, F + c Attn(LayerNorm(F), ..), silent at first, so that a host can go on from where it is.
-            BEVFormer's features are normalised already where a prior comes in; those of BEV evidence are not, and
-            Eq. (3) as written is a shock to a host trained without it.
-        radius: a BEV cell attends only to lanes that pass within this many metres. None: to all, as Eq. (3) is
-            written, and has to learn from their tokens which are near; that takes longer than a small model trains.
-        query_position: add their positions to the BEV features where they look at the tokens. Eq. (3) writes none;
-            SMERF does, and BEV features of a convolution do not know where they are.
-        connectivity: let lanes know their successors and predecessors (the paper's future work).
+        norm: position of the LayerNorm in Eq. (3). "sum": around the sum, as written. "query": on the attention's
+            queries, F + c Attn(LayerNorm(F), ..), with a zero-initialised output, so that training can continue from a
+            host without markers. BEVFormer normalises its features before the fusion; the evidence encoder does not,
+            and for a host trained without markers, Eq. (3) as written changes all features at once.
+        radius: a BEV cell attends only to lanes that pass within this many metres. None: to all lanes, as in Eq. (3);
+            the cell must then learn from the tokens which lanes are near, which takes small models too long.
+        query_position: add position encodings to the attention's queries. Eq. (3) has none, SMERF has; without, BEV
+            features from convolutions carry no positions.
+        connectivity: lanes exchange messages with their successors and predecessors (the paper's future work).
     """
 
     prior: MarkerPriorConfig = MarkerPriorConfig()
@@ -90,13 +90,13 @@ SMALL_MARKER_FUSION = MarkerFusionConfig(
 
 
 class FusedMarkers(NamedTuple):
-    """What every BEV layer needs of a frame's markers.
+    """Prior tokens of a frame's markers, as every BEV layer reads them.
 
     Attributes:
-        tokens: (N, D) of the lanes.
+        tokens: (N, D) one token per lane.
         lanes: the lanes themselves.
         gate: () c of Eq. (3).
-        valid: (N,) lanes that are attended to.
+        valid: (N,) lanes that may be attended to.
     """
 
     tokens: Float[Array, "n d"]
@@ -115,7 +115,7 @@ class MarkerPrior(Prior):
         self.marker_tokens = MarkerTokens(config, host.bev_range)
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the encoder of lanes."""
+        """Return the lane encoder."""
         return {"marker_tokens": self.marker_tokens}
 
     def start(self) -> MarkerMemory | None:
@@ -126,9 +126,9 @@ class MarkerPrior(Prior):
         return MarkerMemory.empty(config.memory.frames, config.prior.lanes, config.prior.points)
 
     def observe(self, example: Example, memory: MarkerMemory | None) -> tuple[MarkerGuidance, MarkerMemory | None]:
-        """Return the lanes of this frame's markers, or remembered ones, and the memory for the next frame."""
+        """Return the lanes of this frame's markers, or those in memory, and the memory for the next frame."""
         config, markers = self.config, example.markers
-        if markers is None:  # data without markers are data in which no marker is in sight
+        if markers is None:  # as in a frame without a visible marker
             markers = MarkerObservations.empty(1, 1, config.prior.points)
         observed = jax.tree.map(jnp.asarray, select_marker_lanes(markers, config.prior))
         if memory is None or config.memory is None:
@@ -152,21 +152,21 @@ class MarkerPrior(Prior):
 
 
 class MarkerTokens(nn.Module):
-    """Polylines to one token each (III-A), and on request what they know of their neighbours.
+    """Encodes polylines to one token each (III-A), with messages between neighbours if `connectivity` is set.
 
     Attributes:
-        config: see there.
-        range: the host's, by which coordinates are normalised.
+        config: settings of the fusion.
+        range: the box that normalised coordinates span, that of the host's BEV features.
     """
 
     config: MarkerFusionConfig
     range: PerceptionRange
 
     @nn.compact
-    def __call__(self, guide: MarkerGuidance, *, deterministic: bool = True) -> Float[Array, "n c"]:
-        """Return the tokens, scaled by their weights (Eq. 4); 0 where not valid."""
-        config, valid = self.config, guide.valid
-        points = jnp.where(valid[:, None, None], self.range.normalise(guide.points), 0.0)
+    def __call__(self, lanes: MarkerGuidance, *, deterministic: bool = True) -> Float[Array, "n c"]:
+        """Return the tokens (N, D), scaled by the lanes' weights (Eq. 4); 0 for invalid lanes."""
+        config, valid = self.config, lanes.valid
+        points = jnp.where(valid[:, None, None], self.range.normalise(lanes.points), 0.0)
         count = points.shape[1]
         if config.encoding == "mlp":
             x = Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2))
@@ -176,18 +176,18 @@ class MarkerTokens(nn.Module):
             x = PolylineEncoder(sizes, name="lines")(points, nothing, valid, deterministic=deterministic)
         x = jnp.where(valid[:, None], x, 0.0)
         if config.connectivity:
-            x = jnp.where(valid[:, None], LaneNeighbours(config.lines.dim, name="neighbours")(x, guide.successor), 0.0)
-        return x * guide.weight[:, None]  # Eq. (4)
+            x = jnp.where(valid[:, None], LaneNeighbours(config.lines.dim, name="neighbours")(x, lanes.successor), 0.0)
+        return x * lanes.weight[:, None]  # Eq. (4)
 
 
 class LaneNeighbours(nn.Module):
-    """One round of messages along the directed connectivity of a marker's lanes."""
+    """One round of messages along the directed topology of a marker's lanes."""
 
     dim: int
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "n c"], successor: Bool[Array, "n n"]) -> Float[Array, "n c"]:
-        """Return tokens that know the mean of their successors and of their predecessors."""
+        """Return tokens plus linear maps of the means over successors and over predecessors."""
         out = tokens
         for name, edges in (("successors", successor), ("predecessors", successor.T)):
             weight = edges.astype(tokens.dtype)
@@ -210,13 +210,13 @@ class MarkerFusion(nn.Module):
         mask: Bool[Array, "#q n"],
         gate: Float[Array, ""],
     ) -> Float[Array, "q c"]:
-        """Return the BEV features after the fusion; exactly those that came in where there is no token to look at.
+        """Return the BEV features after the fusion; they stay exactly as they are if the mask admits no token.
 
         Args:
-            bev, position: features of the cells, and of where they are.
-            tokens: of all lanes that guide.
-            mask: which cell may look at which token.
-            gate: c of Eq. (3), as `fusion_gate` gives it.
+            bev, position: features of the cells and their position encoding.
+            tokens: of the marker lanes.
+            mask: which cell may attend to which token.
+            gate: c of Eq. (3), as from `fusion_gate`.
         """
         config, channels = self.config, bev.shape[-1]
         norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
@@ -229,20 +229,20 @@ class MarkerFusion(nn.Module):
         return jnp.where(mask.any(), fused if added else norm(fused), bev)  # Eq. (3)
 
 
-def fusion_gate(guide: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
-    """Return c of Eq. (3) and the tokens that are looked at, for the variant of Table II."""
+def fusion_gate(lanes: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:
+    """Return c of Eq. (3) and which tokens may be attended to, for the variants of Table II."""
     if config.fusion == "gated":
-        return guide.gate, guide.valid
-    one = jnp.ones_like(guide.gate)
+        return lanes.gate, lanes.valid
+    one = jnp.ones_like(lanes.gate)
     if config.fusion == "uniform":
-        return one, guide.valid
-    return one, guide.valid & (guide.gate >= config.hard_threshold)
+        return one, lanes.valid
+    return one, lanes.valid & (lanes.gate >= config.hard_threshold)
 
 
 def fusion_mask(
-    guide: MarkerGuidance, valid: Bool[Array, " n"], cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
+    lanes: MarkerGuidance, valid: Bool[Array, " n"], cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
 ) -> Bool[Array, "#q n"]:
-    """Return which BEV cell, centred at (x, y) in metres, may look at which token."""
+    """Return which BEV cell, centred at (x, y) in metres, may attend to which token."""
     if config.radius is None:
         return key_mask(valid)
-    return radius_mask(jnp.asarray(cells), guide.points, valid, config.radius)
+    return radius_mask(jnp.asarray(cells), lanes.points, valid, config.radius)

@@ -1,4 +1,4 @@
-"""Parameters of a model as one tree, running statistics beside what is learned."""
+"""Parameters of a model as one tree: learned parameters and running statistics."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any
 from tflane_jax.layers.batch_norm import STATISTICS
 
 Params = dict[str, Any]
-"""What a model predicts with. Its entry `STATISTICS`, where there is one, holds running statistics of batch norms: no
-gradient reaches them, and the optimizer does not see them."""
+"""Variables of a model. The optional entry `STATISTICS` holds the running statistics of batch norms, which have no
+gradient and are not passed to the optimizer."""
 
 
 def split_statistics(params: Params) -> tuple[Params, Params]:
-    """Return what is learned, and the statistics as a tree with the one entry `STATISTICS` or none."""
+    """Return the learned parameters, and the statistics as a tree with the entry `STATISTICS` or no entry."""
     learned = {name: value for name, value in params.items() if name != STATISTICS}
     return learned, {name: value for name, value in params.items() if name == STATISTICS}
 
 
 def joined_statistics(variables: Any) -> Params:
-    """Return the variables that `Module.init` gave as one tree of parameters."""
+    """Return the variables from `Module.init` as one tree of parameters."""
     return dict(variables["params"]) | {name: variables[name] for name in (STATISTICS,) if name in variables}

@@ -1,14 +1,14 @@
-"""What a prior is to a host: an observation of each frame, its tokens, and two hooks.
+"""Interface between a host and its priors: an observation of each frame, its tokens, and two hooks.
 
-For every frame, a host
+For every frame, a host calls of each prior
 
-1. lets each prior `observe` the example, beside what the prior remembers of earlier frames; nothing here is learned,
-2. lets it `encode` the observation to tokens, once,
-3. offers it the BEV features of every encoder layer (`into_bev`),
-4. offers it the queries in front of every decoder layer (`into_queries`).
+1. `observe`: example and memory of earlier frames to an observation; nothing is learned here,
+2. `encode`: observation to prior tokens, once,
+3. `into_bev`: fuses the tokens into the BEV features, in every encoder layer,
+4. `into_queries`: fuses the tokens into the queries, before every decoder layer.
 
-A prior overrides what it uses. Where nothing was observed, both hooks must return exactly what came in or, for a prior
-with parameters of its own such as the traffic-flow module, what they return for an empty observation.
+A prior overrides the methods that it uses. Without data, both hooks must return their input unchanged or, for a prior
+that always transforms its input, such as the traffic-flow module, the result for an empty observation.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from tflane_jax.scene import Example
 
 @dataclass(frozen=True)
 class HostSpec:
-    """What a host tells its priors about itself; no prior has a setting for any of it.
+    """Properties of a host that its priors depend on; priors have no settings for these.
 
     Attributes:
         dim: channels of a query.
         range: R_p, the box in which lanes are perceived, metres.
         bev_range: the box that the BEV features cover and that normalised coordinates span, metres.
-        query_type: what a query represents: a whole lane ("instance": TopoNet, LaneSegNet) or one of its points
-            ("point": MapTR). TF-Lane, Eq. (3).
+        query_type: a query represents a whole lane ("instance": TopoNet, LaneSegNet) or one of its points ("point":
+            MapTR), see TF-Lane, Eq. (3).
     """
 
     dim: int
@@ -43,17 +43,18 @@ class HostSpec:
 
 
 BevHook = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
-"""What priors add to the BEV features of an encoder layer: (layer, cell centers (q, 2) in [0, 1], features (q, c),
-position encodings (q, c)) -> features. It makes its modules inside, so that their parameters belong to the layer."""
+"""Fusion of all priors into the BEV features of an encoder layer: (layer, cell centers (q, 2) in [0, 1], features
+(q, c), position encodings (q, c)) -> features. The hook creates its modules when called, so their parameters belong to
+the layer."""
 
 
 class BevCells(NamedTuple):
-    """BEV features of Q cells, as an encoder layer hands them to a prior.
+    """BEV features of Q cells, as an encoder layer passes them to a prior.
 
     Attributes:
         features: (Q, C).
         position: (Q, C) position encoding of the cells.
-        centers: (Q, 2) where the cells lie, metres.
+        centers: (Q, 2) cell centers (x, y), metres, ego frame.
     """
 
     features: Float[Array, "q c"]
@@ -62,12 +63,12 @@ class BevCells(NamedTuple):
 
 
 class HostQueries(NamedTuple):
-    """Queries in front of a decoder layer, as a host hands them to a prior.
+    """Queries before a decoder layer, as a host passes them to a prior.
 
     Attributes:
         features: (Q, D).
         position: (Q, D) position encoding.
-        mask: (Q, Q) [i, j] query i may attend to query j; None where all may attend to all. A host with groups of
+        mask: (Q, Q) [i, j] query i may attend to query j; None: all to all. A host with groups of
             queries that must not exchange information (MapTRv2's one-to-one and one-to-many groups) masks them here.
     """
 
@@ -77,16 +78,16 @@ class HostQueries(NamedTuple):
 
 
 class Prior:
-    """A prior in one host; subclasses override what they use.
+    """A prior in one host; subclasses override the methods that they use.
 
-    Observations, tokens and memories are pytrees of the prior's own; the host only passes them on.
+    Each prior defines its own pytrees of observations, tokens and memories; the host only passes them on.
     """
 
     reads: ClassVar[tuple[str, ...]] = ()
-    """Fields of `Example` that `observe` reads, so that data without the others can be loaded."""
+    """Fields of `Example` that `observe` reads; others need not be loaded."""
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the modules that `encode` calls, by the name of their parameters in the host."""
+        """Return the modules that `encode` calls, by their parameter names in the host."""
         return {}
 
     def start(self) -> Any:
@@ -94,31 +95,31 @@ class Prior:
         return None
 
     def observe(self, example: Example, memory: Any) -> tuple[Any, Any]:
-        """Return what the prior knows of this frame, and the memory for the next frame.
+        """Return the observation of this frame, and the memory for the next frame.
 
         Args:
-            example: one frame; the field that the prior reads may be None.
-            memory: of the frame before; None for a frame on its own, and then None comes back.
+            example: one frame; the fields that the prior reads may be None.
+            memory: of the previous frame; None for a single frame, and the returned memory is then None too.
         """
         raise NotImplementedError
 
     def encode(self, observation: Any, *, deterministic: bool) -> Any:
-        """Return the tokens of an observation; with dropout (not `deterministic`) the key `dropout` is needed."""
+        """Return the prior tokens; dropout (`deterministic=False`) needs the random key `dropout`."""
         del deterministic
         return observation
 
     def into_bev(self, tokens: Any, layer: int, cells: BevCells) -> Float[Array, "q c"]:
-        """Return the BEV features of an encoder layer with the prior fused in; modules belong to the encoder."""
+        """Return the BEV features of an encoder layer with the prior fused in; new modules belong to the encoder."""
         del tokens, layer
         return cells.features
 
     def into_queries(self, tokens: Any, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
-        """Return the queries in front of a decoder layer with the prior fused in; modules belong to the host."""
+        """Return the queries before a decoder layer with the prior fused in; new modules belong to the host."""
         del tokens, layer
         return queries.features
 
     def fuses_into_bev(self) -> bool:
-        """Return whether the prior has a say in BEV features."""
+        """Return whether the prior overrides `into_bev`."""
         return type(self).into_bev is not Prior.into_bev
 
 

@@ -1,6 +1,6 @@
-"""The priors that a host can take: the one list of them, and the steps that treat all alike.
+"""The list of all priors, and the steps that apply to each of them.
 
-A new prior is a file of its own, with a `Prior` and its configuration, and one line in `PriorsConfig`.
+A new prior is a file with a `Prior` and its configuration, and one line in `PriorsConfig`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.scene import Example
 
 ByPrior = dict[str, Any]
-"""Something of each prior (observation, tokens, memory), by its name in `PriorsConfig`."""
+"""Observations, tokens or memories of several priors, by their names in `PriorsConfig`."""
 
 
 @dataclass(frozen=True)
 class PriorsConfig:
-    """Which priors a host takes, each None where it does without; they are fused in this order.
+    """The priors of a host, None for an absent one; they are fused in this order.
 
     Attributes:
         traffic_flow: tracks of other road users, into the queries (TF-Lane).
@@ -57,7 +57,7 @@ def observe(priors: Mapping[str, Prior], example: Example, memories: ByPrior) ->
     Args:
         priors: of the host.
         example: one frame.
-        memories: of the frame before; a prior without an entry sees the frame on its own.
+        memories: of the previous frame, by name; a prior without an entry has no memory.
     """
     observations, following = {}, {}
     for name, prior in priors.items():
@@ -68,7 +68,7 @@ def observe(priors: Mapping[str, Prior], example: Example, memories: ByPrior) ->
 
 
 def observe_clip(priors: Mapping[str, Prior], clip: Example) -> ByPrior:
-    """Return the observations of the successive frames of one scene (a leading axis on every leaf)."""
+    """Return the observations of successive frames of one scene (leading axis on every leaf)."""
     start = start_memories(priors)
     remembering = {name: prior for name, prior in priors.items() if name in start}
     alone = {name: prior for name, prior in priors.items() if name not in start}
@@ -87,7 +87,7 @@ def encode(priors: Mapping[str, Prior], observations: ByPrior, *, deterministic:
 
 
 def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> BevHook | None:
-    """Return what the priors add to every layer of a BEV encoder; None where no prior adds anything."""
+    """Return the fusion of all priors into the layers of a BEV encoder; None if no prior fuses into BEV features."""
     fusing = {name: prior for name, prior in priors.items() if prior.fuses_into_bev()}
     if not fusing:
         return None
@@ -104,7 +104,7 @@ def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> Be
 def fuse_into_queries(
     priors: Mapping[str, Prior], tokens: ByPrior, layer: int, queries: HostQueries
 ) -> Float[Array, "q d"]:
-    """Return the queries in front of a decoder layer with every prior fused in."""
+    """Return the queries before a decoder layer with every prior fused in."""
     for name, prior in priors.items():
         queries = queries._replace(features=prior.into_queries(tokens[name], layer, queries))
     return queries.features

@@ -1,6 +1,6 @@
-"""SMERF (Luo et al. 2024): an SD map as tokens, to which BEV queries attend.
+"""SMERF (Luo et al. 2024; docs/reference/smerf.md): an SD map as tokens, to which BEV queries attend.
 
-The tokens are made once a frame and fused in every layer of the BEV encoder, behind the cameras.
+The map is encoded once per frame; every layer of the BEV encoder fuses the tokens after spatial attention.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from tflane_jax.scene import Example, SdMap
 
 @dataclass(frozen=True)
 class SdMapModuleConfig:
-    """Sizes of encoder and fusion; the defaults are SMERF's, `SMALL_SD_MAP` trains on two CPU cores.
+    """Sizes of encoder and fusion. The defaults are SMERF's; `SMALL_SD_MAP` trains on two CPU cores.
 
     Attributes:
         prior: coordinates and labels.
-        lines: from polylines to tokens.
+        lines: encoder of polylines.
         heads: of the attention to the tokens.
         width, norm, radius: see `MarkerFusionConfig`; SMERF's are the defaults.
-        absent: where no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias
-            of the attention's output and normalises, as the published code does with an empty map beside a full one.
+        absent: if no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias of
+            the attention's output and normalises, as the published code does for an empty map in a batch.
     """
 
     prior: SdMapPriorConfig = SdMapPriorConfig()
@@ -49,23 +49,23 @@ class SdMapModuleConfig:
 
 
 SMALL_SD_MAP = SdMapModuleConfig(
-    # A road is some 7 m to each side of its line, and the line a few metres off.
+    # A road extends about 7 m to each side of its line, and the line is a few metres off.
     lines=PolylineEncoderConfig(dim=64, layers=2, hidden=128, dropout=0.0),
     width=64,
     norm="query",
     radius=10.0,
 )
 
-# Points on a line of the map that stands for an absent one.
+# Points per line of the empty map that replaces an absent one.
 POINTS = 11
 
 
 class FusedSdMap(NamedTuple):
-    """What every BEV layer needs of a frame's SD map.
+    """Prior tokens of a frame's SD map, as every BEV layer reads them.
 
     Attributes:
-        tokens: (R, D) of the lines.
-        valid: (R,).
+        tokens: (R, D) one token per line.
+        valid: (R,) False in padding.
         sd_map: the lines themselves.
     """
 
@@ -84,7 +84,7 @@ class SdMapPrior(Prior):
         self.sd_map_tokens = SdMapEncoder(config, host.bev_range)
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return the encoder of lines."""
+        """Return the line encoder."""
         return {"sd_map_tokens": self.sd_map_tokens}
 
     def observe(self, example: Example, memory: None) -> tuple[SdMap, None]:
@@ -104,7 +104,7 @@ class SdMapPrior(Prior):
 
 
 class SdMapEncoder(nn.Module):
-    """An SD map to one token for each line.
+    """From an SD map to one token per line.
 
     Attributes:
         config: sizes.
@@ -116,16 +116,16 @@ class SdMapEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, sd_map: SdMap, *, deterministic: bool = True) -> tuple[Float[Array, "r d"], Bool[Array, " r"]]:
-        """Return tokens, 0 in padding, and which of them are valid.
+        """Return the tokens, 0 in padding, and their validity.
 
         Args:
-            sd_map: one frame's map. Parameters depend on the number of points on a line: those initialised without
-                a map fit maps of 11 points, as `ExampleConfig.sd_map` gives.
-            deterministic: no dropout; with it, the key `dropout` is needed.
+            sd_map: one frame's map. Parameter shapes depend on the number of points per line; parameters initialised
+                without a map fit lines of 11 points, the default of `ExampleConfig.sd_map`.
+            deterministic: no dropout. False needs the random key `dropout`.
         """
-        seen = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
+        lines = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
         encoder = PolylineEncoder(self.config.lines, name="lines")
-        return encoder(seen.points, seen.labels, seen.valid, deterministic=deterministic), seen.valid
+        return encoder(lines.points, lines.labels, lines.valid, deterministic=deterministic), lines.valid
 
 
 class SdMapFusion(nn.Module):
@@ -142,12 +142,12 @@ class SdMapFusion(nn.Module):
         valid: Bool[Array, " r"],
         mask: Bool[Array, "q r"] | None = None,
     ) -> Float[Array, "q c"]:
-        """Return the BEV features after the fusion; where no line is valid, see `SdMapModuleConfig.absent`.
+        """Return the BEV features after the fusion; without valid lines, see `SdMapModuleConfig.absent`.
 
         Args:
-            bev, position: features of the cells, and of where they are.
+            bev, position: features of the cells and their position encoding.
             tokens, valid: of the lines.
-            mask: which cell may look at which line, see `sd_map_mask`; None: at all that are valid.
+            mask: which cell may attend to which line, see `sd_map_mask`; None: to all valid lines.
         """
         config, channels, present = self.config, bev.shape[-1], valid.any()
         norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
@@ -157,14 +157,14 @@ class SdMapFusion(nn.Module):
         query = norm(bev) if added else bev
         found = attention(query + position, tokens, tokens, key_mask(valid) if mask is None else mask)
         if config.absent == "reference":
-            # Attention over nothing is 0 before the output's projection there, and behind it here.
+            # Attention without keys: published code has 0 before the output projection, this one after it.
             found = jnp.where(present, found, attention.variables["params"]["output"]["bias"][None])
         fused = bev + found if added else norm(bev + found)
         return fused if config.absent == "reference" else jnp.where(present, fused, bev)
 
 
 def sd_map_mask(sd_map: SdMap, cells: Float[ArrayLike, "q 2"], config: SdMapModuleConfig) -> Bool[Array, "q r"] | None:
-    """Return which BEV cell, centred at (x, y) in metres, may look at which line of the map; None: at all."""
+    """Return which BEV cell, centred at (x, y) in metres, may attend to which line of the map; None: to all."""
     if config.radius is None:
         return None
     return radius_mask(jnp.asarray(cells), jnp.asarray(sd_map.points), jnp.asarray(sd_map.valid), config.radius)

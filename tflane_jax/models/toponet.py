@@ -1,9 +1,9 @@
 """TopoNet (Li et al. 2023), with or without priors.
 
-Images -> BEV features -> lane queries -> (priors) -> decoder layers -> centerlines, scores, lane-lane topology;
-front view -> traffic elements, which join the decoder's scene graph -> lane-element topology.
+Images -> BEV features -> lane queries -> (priors) -> decoder layers -> centerlines, scores, lane-lane topology.
+Front view -> traffic elements -> the decoder's scene graph -> lane-element topology.
 The small version reads BEV evidence instead of images and has no traffic elements; decoder, graph, heads and losses
-are the same.
+are the same. Source: docs/reference/toponet.md.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from tflane_jax.scene import LaneGraph, Prediction
 
 @dataclass(frozen=True, kw_only=True)
 class TopoNetConfig(HostConfig):
-    """The model; without priors it is the vision-only baseline.
+    """Configuration of TopoNet; without priors, the vision-only baseline.
 
     Attributes:
         decoder: lane decoder.
-        denoising: noised lanes to train the decoder with, or None as in the paper.
+        denoising: noised lanes in training (`models.lane_denoising`); None as in the paper.
         encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
     """
 
@@ -55,22 +55,22 @@ class TopoNetConfig(HostConfig):
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Denoised lanes, beside what every host has."""
+        """Denoised lanes if configured, and those of every host."""
         return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
 
     def build(self) -> TopoNet:
-        """Return the Linen module; raises UserError where encoder, decoder and elements do not fit each other."""
+        """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""
         check_elements(self.encoder, self.decoder.layers, self.elements)
         return TopoNet(self)
 
 
 def paper_config() -> TopoNetConfig:
-    """Return the paper's sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 lane and 100 element queries."""
+    """Return the published sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 lane and 100 element queries."""
     return TopoNetConfig(encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_LANE_DECODER, elements=PAPER_ELEMENT_DECODER)
 
 
 class TopoNet(Host):
-    """One example in, the predictions of every decoder layer out."""
+    """From one example to the predictions of every decoder layer."""
 
     config: TopoNetConfig
 
@@ -89,38 +89,38 @@ class TopoNet(Host):
     ) -> Prediction:
         """Return lanes and topology of every decoder layer, from BEV features, traffic elements and prior tokens.
 
-        Stores the queries of every layer as the intermediate `layer_queries` where a caller asks for it.
+        Sows the queries of every layer as `layer_queries` if the collection `intermediates` is mutable.
         """
         return decode_lanes(self, self.config.decoder, bev, elements, tokens or {}, lanes, deterministic)
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return the predictions of one set of queries."""
+        """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
         config, (queries, position, reference) = self.config.decoder, start
-        # The first layer knows of no edges.
+        # No edges in the first layer.
         adjacency = jnp.zeros((config.queries, config.queries))
-        governs = None if elements is None else jnp.zeros((config.queries, elements.logits.shape[1]))
+        element_edges = None if elements is None else jnp.zeros((config.queries, elements.logits.shape[1]))
         outputs = []
         for i in range(config.layers):
-            where = position
+            placed = position
             if config.refine == "iterative":
-                # A query that moves says where it is.
+                # The position encoding follows the refined lane.
                 along = jnp.concatenate([sine_encoding(reference[..., :2], config.bands), reference], -1)
                 along = along.reshape(config.queries, -1)
-                where = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, where))
-            seen = nodes = None
-            if elements is not None and governs is not None:
+                placed = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed))
+            embedded = nodes = None
+            if elements is not None and element_edges is not None:
                 embed = ElementEmbedding(config, name=f"element_embedding_{i}")
-                seen = embed(elements.queries[i], deterministic=deterministic)
-                nodes = ElementNodes(seen, elements.logits[i], governs)
+                embedded = embed(elements.queries[i], deterministic=deterministic)
+                nodes = ElementNodes(embedded, elements.logits[i], element_edges)
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
-            queries = layer(queries, where, reference, bev, adjacency, nodes, deterministic=deterministic)
+            queries = layer(queries, placed, reference, bev, adjacency, nodes, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
-            output = LaneHeads(config, self.config.spec.bev_range, name=f"heads_{i}")(queries, reference, bev, seen)
+            output = LaneHeads(config, self.config.spec.bev_range, name=f"heads_{i}")(queries, reference, bev, embedded)
             outputs.append(output)
             reference = next_reference(reference, output.unit, config)
             if output.successor is not None:
                 adjacency = edge_probabilities(output.successor)
             if output.element_lane is not None:
-                governs = edge_probabilities(output.element_lane)
+                element_edges = edge_probabilities(output.element_lane)
         return make_prediction(outputs, elements)

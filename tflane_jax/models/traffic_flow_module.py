@@ -1,12 +1,13 @@
-"""The traffic-flow module (TFM) of TF-Lane: lane queries in, lane queries out.
+"""The traffic-flow module (TFM) of TF-Lane: fuses traffic flow into lane queries.
 
-Two parts, as in Fig. 2 of the paper: the temporal encoder turns the history of each instance into one token (section
-3.3, "Temporal Domain Encoder", Fig. 4), the spatial encoder lets lane queries and tokens attend to each other under the
-spatial mask M_s (Fig. 5, Eq. (2) and (3)). Neither knows anything of the host detector.
+Two parts, as in Fig. 2 of the paper. The temporal encoder turns the history of each instance into one token (section
+3.3, "Temporal Domain Encoder", Fig. 4). In the spatial encoder, lane queries and tokens attend to each other under the
+spatial mask M_s (Fig. 5, Eq. (2) and (3)). Both are independent of the host detector.
 
-Where the paper is silent, and what stands here: each fusion module is multi-head attention with a residual and a
+The paper leaves open, and we chose: each fusion module is multi-head attention with a residual connection and a
 LayerNorm; the transformation T of Eq. (3) is a residual two-layer perceptron with a LayerNorm; an instance's token is
-made from the mean of its valid frames after self-attention and from where its first and its last valid frame are.
+computed from the mean of its valid frames after self-attention, and from position and heading in its first and last
+valid frame.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class TrafficFlowModuleConfig:
     """Shape of the TFM; the defaults are the paper's best (Table 5, Abla5: LT/LL, depth 1, normalised coordinates).
 
     Attributes:
-        fusions: which of the four modules run, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
+        fusions: which of the four fusion modules are used, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
         depth: temporal self-attention layers, "Dep." in Table 5.
         position_encoding: "sine" for normalised coordinates, "linear" for metres.
         bands: frequencies per coordinate of the sine encoding.
@@ -55,13 +56,13 @@ class TrafficFlowModuleConfig:
 
 @dataclass(frozen=True)
 class TrafficFlowConfig:
-    """Traffic flow as a prior of a host.
+    """The prior "traffic flow" of a host.
 
     Attributes:
         prior: selection of instances.
         module: the TFM.
-        insert: "before_decoder" enhances the queries once, as the paper says (section 3.3); "every_layer" enhances
-            them before each decoder layer, with parameters of its own.
+        insert: "before_decoder" enhances the queries once, as in the paper (section 3.3); "every_layer" enhances them
+            before each decoder layer, with separate parameters.
     """
 
     prior: TrafficFlowPriorConfig = TrafficFlowPriorConfig()
@@ -96,14 +97,14 @@ class TrafficFlowPrior(Prior):
     def encode(
         self, observation: TrafficFlowTokens, *, deterministic: bool
     ) -> tuple[Float[Array, "t d"], Bool[Array, " t"]]:
-        """Return TF_Feat and which instances are valid."""
+        """Return TF_Feat (T, D) and which instances are valid (T,)."""
         del deterministic
         return self.temporal_encoder(observation), observation.valid
 
     def into_queries(
         self, tokens: tuple[Float[Array, "t d"], Bool[Array, " t"]], layer: int, queries: HostQueries
     ) -> Float[Array, "q d"]:
-        """Return L'_Feat in front of the layers that `insert` names."""
+        """Return L'_Feat before the layers selected by `insert`."""
         if layer > 0 and self.config.insert == "before_decoder":
             return queries.features
         features, valid = tokens
@@ -126,20 +127,20 @@ class TemporalEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, tokens: TrafficFlowTokens) -> Float[Array, "t d"]:
-        """Return TF_Feat; what stands at invalid instances is finite and meaningless."""
+        """Return TF_Feat; rows of invalid instances are finite but meaningless."""
         x = self._embed(tokens)
         for i in range(self.config.depth):
             x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, tokens.frame_valid)
         x = nn.LayerNorm(name="norm")(x)
         weight = tokens.frame_valid.astype(x.dtype)
         mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
-        # A mean blurs where a moving instance was; its first and its last valid frame say it.
+        # The mean blurs the positions of a moving instance; its first and last valid frames keep them.
         first = tokens.frame_valid.argmax(-1)
         last = weight.shape[1] - 1 - tokens.frame_valid[:, ::-1].argmax(-1)
         ends = jnp.stack([first, last], 1)[..., None]
-        # Taken before they are encoded: XLA would encode all frames a second time.
-        where = self._where(*(jnp.take_along_axis(x, ends, 1) for x in (tokens.position, tokens.heading)))
-        return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, where.reshape(len(mean), -1)], -1))
+        # Select frames before encoding them: otherwise XLA would encode all frames a second time.
+        located = self._where(*(jnp.take_along_axis(x, ends, 1) for x in (tokens.position, tokens.heading)))
+        return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, located.reshape(len(mean), -1)], -1))
 
     def _where(self, position: Float[Array, "t n 3"], heading: Float[Array, "t n 2"]) -> Float[Array, "t n e"]:
         """Encode position and heading."""
@@ -148,7 +149,7 @@ class TemporalEncoder(nn.Module):
         return jnp.concatenate([position, heading], -1)
 
     def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
-        """Encode where, how large, of which category and how long ago every frame is."""
+        """Encode position, heading, size, category and age of every frame."""
         width, (instances, frames) = self.config.width, tokens.frame_valid.shape
         x = nn.Dense(width, name="frame")(self._where(tokens.position, tokens.heading))
         category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
@@ -179,12 +180,12 @@ class TemporalLayer(nn.Module):
 
 
 class SpatialEncoder(nn.Module):
-    """The four fusion modules and the paradigm-aware composition.
+    """The four fusion modules and the paradigm-aware composition (section 3.3).
 
     Attributes:
         config: shape.
         dim: channels of lane queries and traffic tokens.
-        query_type: what a query of the host represents; I(Q_type) of Eq. (3) is 1 for points.
+        query_type: see `HostSpec.query_type`; I(Q_type) of Eq. (3) is 1 for points.
     """
 
     config: TrafficFlowModuleConfig
@@ -203,9 +204,9 @@ class SpatialEncoder(nn.Module):
 
         Args:
             lanes: L_Feat, the host's lane queries.
-            lane_position: the host's query positions, added to queries and keys and never to values.
+            lane_position: the host's query positions, added to queries and keys but not to values.
             traffic: TF_Feat.
-            mask: M_s; quadrants of fusion modules that are switched off are never built.
+            mask: M_s; quadrants of unused fusion modules are never built.
         """
 
         def fuse(name: Fusion, x, x_position, y, y_position, quadrant):
@@ -218,7 +219,7 @@ class SpatialEncoder(nn.Module):
             )
             return nn.LayerNorm(name=f"{label}_norm")(x + attended)
 
-        # An instance that no lane may see is padding and may hold anything, NaN included.
+        # An instance that no lane may attend to is padding and may hold anything, NaN included.
         traffic = jnp.where(mask.lane_traffic.any(0)[:, None], traffic, 0.0)
         # A traffic token carries its own position already.
         none = jnp.zeros_like(traffic)

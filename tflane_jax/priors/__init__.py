@@ -1,1 +1,1 @@
-"""Priors: raw observations -> tokens and masks of fixed size. No parameters; runs in numpy or under jit."""
+"""Priors: raw observations -> arrays and masks of fixed size. No parameters; runs in numpy or under jit."""

@@ -1,15 +1,15 @@
 """Temporal marker memory (Wu and Hu, section III-C): an explicit carry of fixed size, without parameters.
 
 The bank has one slot for each of the last T frames, with the lanes of that frame's markers and their confidence. The
-paper stores encoded tokens. The bank stores the polylines before the encoder, which is equivalent at inference and
-allows to compensate the ego motion.
+paper stores encoded tokens. This bank stores the polylines instead, which is equivalent at inference and allows
+compensation of the ego motion.
 
 Choices that the paper leaves open (the first two are options):
 
-- The vehicle moves while a marker is remembered, and the paper mentions no compensation. `compensation="ego_motion"`
-  moves remembered lanes into the present ego frame; "none" keeps their coordinates.
-- Eq. (3) has one confidence c, but every remembered token has its own. `gate="strongest"` takes the largest decayed
-  one; "one" leaves the scaling to Eq. (4).
+- The paper mentions no compensation of the ego motion. `compensation="ego_motion"` transforms stored lanes into the
+  present ego frame; "none" keeps their coordinates.
+- Eq. (3) has one confidence c, but every stored token has its own. `gate="strongest"` takes the largest decayed
+  confidence; "one" leaves the scaling to Eq. (4).
 - T, gamma, alpha and epsilon are not given; the defaults are ours.
 - With several markers in a frame, c_t is the highest confidence; lanes of the others are scaled relative to it.
 """
@@ -32,13 +32,13 @@ class MarkerMemoryConfig:
     """Size and decay of the memory.
 
     Attributes:
-        frames: T, slots of the bank, the present frame included.
+        frames: T, slots of the bank, including the present frame.
         decay: gamma, in (0, 1]; 1 is the ablation without decay.
         exponent: alpha of Eq. (4), in (0, 1].
         threshold: epsilon; a frame with a lower confidence uses the bank.
-        lanes: maximal number of prior tokens, those with the largest weights; None is the whole union of Eq. (4), T L
-            lanes. The time of the encoder grows with this number.
-        compensation: of the ego motion, for remembered lanes.
+        lanes: largest number of prior tokens, those with the largest weights; None is the whole union of Eq. (4), T L
+            lanes. The encoder's time grows with this number.
+        compensation: of the ego motion, for stored lanes.
         gate: c of Eq. (3) for tokens from the bank.
     """
 
@@ -69,8 +69,8 @@ class MarkerMemory:
 
     @classmethod
     def empty(cls, frames: int, lanes: int, points: int) -> MarkerMemory:
-        """Return an empty bank for L lanes of K points a frame."""
-        zeros: Any = np.zeros  # the type says JAX array, numpy serves as well
+        """Return an empty bank of T frames for L lanes of K points per frame."""
+        zeros: Any = np.zeros  # typed as JAX arrays; numpy arrays work as well
         return cls(
             points=zeros((frames, lanes, points, 2), np.float32),
             confidence=zeros((frames, lanes), np.float32),
@@ -121,11 +121,11 @@ def remember(
     """Return the memory for the next frame and the prior tokens of this one.
 
     Args:
-        memory: of the frame before.
-        observed: lanes of this frame's markers, as many as a slot holds.
+        memory: of the previous frame.
+        observed: lanes of this frame's markers, padded to the slot's L lanes.
         previous_from_ego: pose of this ego frame in the previous one; ignored without a previous frame.
-        has_previous: False at the start of a scene: the memory is ignored.
-        config: see `MarkerMemoryConfig`.
+        has_previous: False at the start of a scene; the memory is then ignored.
+        config: size and decay.
     """
     kept = memory.valid & has_previous
     points = memory.points
@@ -153,7 +153,7 @@ def remember(
 def _union(
     bank: MarkerMemory, weight: Float[Array, "t l"], used: Bool[Array, "t l"], gate: Array, most: int | None
 ) -> MarkerGuidance:
-    """Return the lanes of all slots, or the `most` with the largest weights, of equal ones the latest."""
+    """Return the lanes of all slots, or the `most` lanes with the largest weights, the latest first among equals."""
     slots, lanes, k = bank.points.shape[:3]
     points, weight, used = bank.points.reshape(slots * lanes, k, 2), weight.reshape(-1), used.reshape(-1)
     chosen = jnp.arange(slots * lanes)
@@ -171,12 +171,12 @@ def _union(
 
 
 def _push(newest: Array, slots: Array) -> Array:
-    """Return the slots shifted by one frame: the newest in front, without the oldest."""
+    """Return the slots shifted by one frame: the newest is first, the oldest is dropped."""
     return jnp.concatenate([jnp.asarray(newest, slots.dtype)[None], slots[:-1]])
 
 
 def _to_present(points: Float[Array, "t l k 2"], previous_from_ego: Float[Array, "4 4"]) -> Float[Array, "t l k 2"]:
-    """Return points of the previous ego frame in this one's, in the plane: the inverse of a planar pose."""
+    """Return points of the previous ego frame in the present one, by the inverse pose in the plane."""
     rotation, shift = previous_from_ego[:2, :2], previous_from_ego[:2, 3]
     # With pitch and roll the upper left block is not orthogonal, so the transpose is not its inverse.
     return jnp.einsum("ij,tlkj->tlki", jnp.linalg.inv(rotation), points - shift[None, None, None])

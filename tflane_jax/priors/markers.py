@@ -18,14 +18,14 @@ from tflane_jax.scene import MarkerObservations
 
 @dataclass(frozen=True)
 class MarkerPriorConfig:
-    """How marker observations become polylines with a confidence.
+    """Selection and confidence of marker lanes.
 
     Attributes:
         points: K, points of a polyline (paper: 11).
-        lanes: L, lanes of all markers of a frame; of more, those of the markers with the highest confidence.
+        lanes: L, largest number of lanes of a frame's markers; lanes of the most confident markers are kept.
         distance_scale: tau_d of Eq. (2), metres.
         residual_scale: tau_r of Eq. (2), metres.
-        use_score: multiply the confidence by the detector's raw score, which the paper mentions as a supplement.
+        use_score: multiply the confidence by the detector's raw score, an addition that the paper mentions.
     """
 
     points: int = 11

@@ -17,10 +17,10 @@ from tflane_jax.scene import SdCategory, SdMap
 
 @dataclass(frozen=True)
 class SdMapPriorConfig:
-    """How an SD map becomes tokens.
+    """Encoding of an SD map.
 
     Attributes:
-        categories: labels, `scene.SdCategory`; a category beyond them counts as the last.
+        categories: number of labels, `scene.SdCategory`; larger categories count as the last one.
     """
 
     categories: int = len(SdCategory)
@@ -44,7 +44,7 @@ class SdMapTokens:
 def sd_map_tokens(sd_map: SdMap, config: SdMapPriorConfig, bev_range: PerceptionRange) -> SdMapTokens:
     """Return the tokens of one frame's SD map; padding may hold anything.
 
-    Normalised coordinates span `bev_range`, the box of the host's BEV features.
+    Coordinates are normalised by `bev_range`, the box of the host's BEV features.
     """
     xp = namespace(sd_map.points, sd_map.category, sd_map.valid)
     points = xp.where(sd_map.valid[:, None, None], sd_map.points, 0.0)

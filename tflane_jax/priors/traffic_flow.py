@@ -21,13 +21,13 @@ from tflane_jax.scene import TrafficFlow
 
 @dataclass(frozen=True)
 class TrafficFlowPriorConfig:
-    """How traffic flow becomes tokens.
+    """Selection and encoding of traffic flow.
 
     Attributes:
         frames: f_t, number of past frames, the latest ones (paper: 20).
         min_valid_frames: tol_pts, an instance needs this many valid frames (paper: 5).
         max_instances: T_max, the number of slots (paper: N_t = 30).
-        top_instances: T_top, how many slots may be filled; None fills all. 0 is inference without traffic flow.
+        top_instances: T_top, largest number of filled slots; None: all slots. 0 is inference without traffic flow.
         occluded_frames: "mask" ignores frames in which the tracker did not see the box (Fig. 4); "keep" uses them.
         front_sector_deg: opening angle of the front sector, which has the highest weight (paper: 60).
         distance_scale: distance that halves the weight of an instance outside that sector, metres.
@@ -54,7 +54,7 @@ class TrafficFlowTokens:
         size: (T, 3) length, width, height, metres; 0 in padding.
         category: (T,) `scene.RoadUser`; 0 in padding.
         frame_valid: (T, N) the temporal mask.
-        valid: (T,) instance validity, from which the spatial mask is made.
+        valid: (T,) instance validity, the source of the spatial mask.
         weight: (T,) ego-centric weight in (0, 1]; 0 in padding.
         index: (T,) index of the instance in the traffic flow; 0 in padding.
     """
@@ -77,10 +77,11 @@ def select_traffic_flow(
     Args:
         flow: tracks in the current ego frame.
         config: selection.
-        region: R_t; positions outside it are not used. A host's perception range.
-        bev_range: the box that normalised coordinates span. That of the host's BEV features.
+        region: R_t, the host's perception range; positions outside it are ignored.
+        bev_range: the box of the host's BEV features, which normalised coordinates span.
 
-    Raises ValueError if the traffic flow has fewer frames than the configuration.
+    Raises:
+        ValueError: the traffic flow has fewer frames than the configuration.
     """
     xp = namespace(flow.position, flow.valid)
     recorded = flow.valid.shape[1]
@@ -96,9 +97,9 @@ def select_traffic_flow(
         occluded=flow.occluded[:, recorded - config.frames :],
         valid=flow.valid[:, recorded - config.frames :],
     )
-    seen = flow.valid if config.occluded_frames == "keep" else flow.valid & ~flow.occluded
+    observed = flow.valid if config.occluded_frames == "keep" else flow.valid & ~flow.occluded
     position = xp.where(flow.valid[..., None], flow.position, 0.0)
-    frame_valid = seen & region.contains(position)
+    frame_valid = observed & region.contains(position)
     instance_valid = frame_valid.sum(-1) >= max(config.min_valid_frames, 1)
 
     latest = _latest_valid(frame_valid)
@@ -133,8 +134,8 @@ def select_traffic_flow(
 def ego_centric_weight(position: Float[Array, "k 2"], config: TrafficFlowPriorConfig) -> Float[Array, " k"]:
     """Return the weight of instances at these positions (ego frame, metres), in (0, 1].
 
-    1 within the front sector; elsewhere it decreases with bearing and distance. The paper (section 3.3) gives the
-    sector and says that weights decrease "based on relative positions"; the two factors are ours.
+    1 within the front sector; elsewhere it decreases with bearing and distance. The paper (section 3.3) defines the
+    sector and states that weights decrease "based on relative positions"; both factors are our choice.
     """
     xp = namespace(position)
     half = math.radians(config.front_sector_deg) / 2

@@ -1,8 +1,8 @@
-"""The vocabulary that every package shares: what is around the vehicle at one moment, as fixed-size arrays.
+"""Common data containers: examples, ground truth, priors and predictions of one frame, as fixed-size arrays.
 
 One `Example` holds one frame of one scene in the **ego frame** (x forward, y left, z up; metres, radians).
-Containers are pytrees without a batch axis; callers `vmap`. Every padded array has a bool `valid` beside it, and
-`valid` is the only truth: padding content is arbitrary (NaN included) and must never reach an output.
+Containers are pytrees without a batch axis; callers `vmap`. Every padded array has a bool `valid` beside it. Padding
+is arbitrary (NaN included) and must never affect an output.
 Arrays are numpy on the host and jax on the device; dtype float32, bool and int32 unless a docstring says otherwise.
 
 Host-side recordings in global coordinates (maps, poses, tracks) are in `tflane_jax.scene.logs`.

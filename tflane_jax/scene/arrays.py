@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-# Leaves are numpy on the host and jax on the device, and either may be indexed, reduced and passed on.
+# A union would make pyright reject operations that only one of the two types allows.
 if TYPE_CHECKING:
     from typing import Any as Array
 else:

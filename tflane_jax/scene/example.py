@@ -1,4 +1,4 @@
-"""One frame as a model and its loss take it."""
+"""Examples: inputs and ground truth of one frame, or of one image."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from tflane_jax.scene.views import CameraViews
 
 @struct.dataclass
 class Example:
-    """One frame: what the sensors and the priors say, and the truth.
+    """One frame: sensor data, priors and ground truth.
 
-    A prior or sensor that a dataset does not offer at all is None; one that is absent in this frame is all invalid.
-    Both mean the same to a model.
+    A prior or sensor that a dataset lacks is None; one that is absent in this frame is all invalid. Models treat both
+    alike.
 
     Attributes:
-        bev: (H, W, C) uint8 evidence in [0, 255] per `BevChannel`; row 0 lies at the least y, column 0 at the least x
-            (BEVFormer's grid).
-        hidden: (H, W) bool, ground that no ray reaches. Never a model input: it is there for evaluation and pictures.
+        bev: (H, W, C) uint8 evidence in [0, 255] per `BevChannel`; row 0 is at the smallest y, column 0 at the smallest
+            x, as in BEVFormer.
+        hidden: (H, W) bool, ground out of line of sight. Only for evaluation and pictures, never a model input.
         traffic_flow: prior of TF-Lane.
-        markers: prior of marker fusion.
+        markers: prior of marker fusion (Wu and Hu).
         sd_map: prior of SMERF.
-        lanes: truth, merged centerlines (OpenLane-V2 `lane_centerline`).
-        segments: truth, lane segments (OpenLane-V2 `lane_segment`).
-        areas: truth, crossings and road boundaries.
-        traffic_elements: truth.
+        lanes: ground truth, merged centerlines (OpenLane-V2 `lane_centerline`).
+        segments: ground truth, lane segments (OpenLane-V2 `lane_segment`).
+        areas: ground truth, crossings and road boundaries.
+        traffic_elements: ground truth, traffic lights and signs.
         previous_from_ego: (4, 4) pose of this ego frame in the previous frame's ego frame.
         has_previous: () the previous frame belongs to the same scene.
-        cameras: what the cameras see.
-        map_lines: truth, lines of a vector map; None where a dataset has none of its own.
+        cameras: calibrated images.
+        map_lines: ground truth, lines of a vector map; None if the dataset does not label them.
     """
 
     bev: UInt8[Array, "h w c"] | None
@@ -79,8 +79,8 @@ class RoadImage:
 
     Attributes:
         image: (H, W, 3) uint8, RGB.
-        image_valid: (H, W) false where augmentation left no image.
-        lines: truth.
+        image_valid: (H, W) False in padding, such as that of augmentation.
+        lines: ground truth.
     """
 
     image: UInt8[Array, "h w 3"]

@@ -1,7 +1,7 @@
 """The log of a drive: vector map, ego poses and tracks, in numpy on the host.
 
-The built-in world simulates a `Log` and the Argoverse 2 reader reads one; `tflane_jax.datasets.examples` makes an
-`Example` of one moment. Global coordinates (city frame) stay float64. Only tracks are padded, with `valid`.
+The built-in world simulates a `Log` and the Argoverse 2 reader reads one; `tflane_jax.datasets.examples` turns
+one moment into an `Example`. Global coordinates (city frame) stay float64. Only tracks are padded, with `valid`.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class MapElement:
 
     Attributes:
         position: (3,) centre, global metres.
-        yaw: direction that it faces, global radians.
+        yaw: direction of its front, global radians.
         category: 1 traffic light, 2 road sign.
-        attribute: OpenLane-V2 attribute; for a light this is the state at the start.
+        attribute: OpenLane-V2 attribute; of a light, its initial state.
         lanes: ids of the lane segments that it governs.
     """
 
@@ -65,9 +65,8 @@ class VectorMap:
         crossings: closed rings (n, 3), first point repeated at the end.
         road_boundaries: polylines (n, 3); a closed ring repeats its first point.
         elements: traffic lights and signs.
-        buildings: (B, 5) x, y, length, width, yaw of opaque blocks beside the road, unlimited in height.
-        roads: the middle line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first
-            point.
+        buildings: (B, 5) x, y, length, width, yaw of opaque blocks of unlimited height.
+        roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
     """
 
     segments: dict[int, LaneSegment]
@@ -87,7 +86,7 @@ class Tracks:
         yaw: (F, K) radians.
         size: (K, 3) length, width, height, metres.
         category: (K,) `scene.RoadUser`.
-        occluded: (F, K) the tracker reports the box without seeing it.
+        occluded: (F, K) the tracker reports a box that its sensors did not see.
         valid: (F, K).
         uuid: (K,) str, name of the track in the source.
     """
@@ -108,12 +107,12 @@ class Tracks:
 
 @dataclass(frozen=True)
 class KeyFrame:
-    """A moment at which an example is made.
+    """A moment of a log that becomes an example.
 
     Attributes:
-        timestamp_ns: the moment.
-        global_from_ego: (4, 4) float64 pose at that moment.
-        track_frame: index of this moment's frame among the log's track frames; its history lies strictly before it.
+        timestamp_ns: time, nanoseconds.
+        global_from_ego: (4, 4) float64 pose at that time.
+        track_frame: index of this moment among the log's track frames; the history is the frames before it.
     """
 
     timestamp_ns: int
@@ -148,15 +147,15 @@ class Log:
         map: static map.
         timestamps_ns: (F,) int64, one for each track frame.
         global_from_ego: (F, 4, 4) float64, the ego pose of each track frame.
-        tracks: reported by the tracker; the only traffic that a prior may use.
-        actors: all true boxes, for line of sight and the obstacle channel; the same object as `tracks` if the source
-            simulates no tracker.
-        keyframes: moments at which examples are made, in time order.
+        tracks: boxes reported by the tracker; priors use no other traffic.
+        actors: all true boxes, for line of sight and the obstacle channel; the same object as `tracks` unless the
+            source simulates a tracker.
+        keyframes: moments that become examples, in time order.
         element_attribute: (F, E) attribute of each map element at each track frame (the state of a light); None if
             all are constant.
-        weather: 0 (clear) to 1 (worst), dims the evidence.
-        paint_wear: 0 (fresh) to 1 (gone), dims lane paint.
-        seed: of all random numbers drawn when this log is rendered.
+        weather: 0 (clear) to 1 (worst); weakens all evidence.
+        paint_wear: 0 (fresh) to 1 (gone); weakens lane paint.
+        seed: of all random numbers in rendering this log.
         markers: fiducial markers beside the road; None if there are none.
     """
 

@@ -32,13 +32,13 @@ class MarkerFamily(enum.Enum):
     APRILTAG_36H11 = "DICT_APRILTAG_36h11"
 
 
-# White cells around the black square of a printed marker, which detectors need.
+# Width in cells of the white margin of a printed marker, which detectors need.
 MARGIN = 1
 
 
 @functools.cache
 def dictionary_of(family: MarkerFamily) -> Any:
-    """Return OpenCV's dictionary; raises UserError where OpenCV is missing or built without its aruco module."""
+    """Return OpenCV's dictionary; raises UserError if OpenCV or its aruco module is missing."""
     cv2 = opencv()
     if not hasattr(cv2, "aruco") or not hasattr(cv2.aruco, "ArucoDetector"):
         raise UserError("this OpenCV has no aruco.ArucoDetector: pip install 'opencv-python-headless>=4.10'")
@@ -46,24 +46,24 @@ def dictionary_of(family: MarkerFamily) -> Any:
 
 
 def marker_count(family: MarkerFamily) -> int:
-    """Return how many ids a family has; they count from 0."""
+    """Return the number of ids of a family; ids start at 0."""
     return len(dictionary_of(family).bytesList)
 
 
 def correctable_bits(family: MarkerFamily) -> int:
-    """Return how many wrong bits of a marker of this family can be corrected with a unique id."""
+    """Return the number of wrong bits that can be corrected in a marker of this family."""
     return int(dictionary_of(family).maxCorrectionBits)
 
 
 def cells_across(family: MarkerFamily) -> int:
-    """Return how many cells the black square has along a side, its border included."""
+    """Return the number of cells along a side of the black square, including its border."""
     return int(dictionary_of(family).markerSize) + 2
 
 
 def marker_cells(family: MarkerFamily, marker_id: int) -> Bool[np.ndarray, "n n"]:
     """Return which cells of a marker are white, top row first, with its black border and without a margin.
 
-    The array is cached and read-only. Raises UserError for an id that the family does not have.
+    The array is cached and read-only. Raises UserError for an id outside the family.
     """
     return _cells(family, int(marker_id))
 
@@ -87,6 +87,6 @@ def board_cells(family: MarkerFamily, marker_id: int) -> Bool[np.ndarray, "m m"]
 
 
 def board_size(family: MarkerFamily, size: float) -> float:
-    """Return the side of a printed marker with its margin, metres, where its black square has the side `size`."""
+    """Return the side of a printed marker with its margin, metres; `size` is the side of its black square."""
     across = cells_across(family)
     return size * (across + 2 * MARGIN) / across

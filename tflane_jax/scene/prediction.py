@@ -1,6 +1,6 @@
-"""What models predict about one frame; a part that a model does not predict is None.
+"""Predictions for one frame; a part that a model does not predict is None.
 
-Arrays may have a leading axis over decoder layers (`*layers`); without it, they are the last layer's answer.
+Arrays may have a leading axis over decoder layers (`*layers`); without it, they are the last layer's.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class SegmentPrediction:
         left, right: (Q, P, 3) boundaries in driving direction, metres.
         logits: (Q, C) class logits (sigmoid): lane segment, then pedestrian crossing.
         left_type_logits, right_type_logits: (Q, T) by `LineType`; None where types are not predicted.
-        mask_logits: (Q, H, W) lane area on the BEV grid, row 0 at the least y; None without a mask head.
+        mask_logits: (Q, H, W) lane area on the BEV grid, row 0 at the smallest y; None without a mask head.
         successor_logits: (Q, Q) [i, j]: segment j continues segment i; None for a model without topology.
     """
 
@@ -75,7 +75,7 @@ class ElementPrediction:
     Attributes:
         box: (E, 2, 2) top-left and bottom-right corners, pixels of camera 0.
         logits: (E, 13) by OpenLane-V2 attribute (sigmoid).
-        lane_logits: (Q, E) [i, e]: element e governs lane i of the prediction beside it; None without topology.
+        lane_logits: (Q, E) [i, e]: element e governs lane i of the same prediction; None without topology.
     """
 
     box: Float[Array, "*layers e 2 2"]
@@ -99,7 +99,7 @@ class CurvePrediction:
 
 @struct.dataclass
 class Prediction:
-    """Everything that a model predicts about one frame; no model predicts all parts.
+    """All predictions for one frame; no model predicts all parts.
 
     Attributes:
         centerlines: merged centerlines and their topology.

@@ -27,7 +27,7 @@ class SdCategory(enum.IntEnum):
     """Category of a line of an SD map, as SMERF numbers it."""
 
     ROAD = 0
-    CROSSWALK = 1  # sidewalks and other ways of pedestrians too
+    CROSSWALK = 1  # also sidewalks and other pedestrian ways
     TRUCK_ROAD = 2
     HIGHWAY = 3
     RESIDENTIAL = 4
@@ -48,8 +48,8 @@ class TrafficFlow:
         yaw: (K, N) heading in the current ego frame, radians.
         size: (K, 3) length, width, height, metres.
         category: (K,) `RoadUser`.
-        occluded: (K, N) the tracker reported the box without seeing it (interpolated or hidden).
-        valid: (K, N) the track exists in that frame. An instance that no frame holds is padding.
+        occluded: (K, N) the tracker reported a box that its sensors did not see (interpolated or hidden).
+        valid: (K, N) the track exists in that frame. An instance without a valid frame is padding.
     """
 
     position: Float[Array, "k n 3"]
@@ -61,7 +61,7 @@ class TrafficFlow:
 
     @classmethod
     def empty(cls, capacity: int, frames: int) -> TrafficFlow:
-        """Return a traffic flow with room for `capacity` instances and none valid."""
+        """Return a traffic flow of `capacity` invalid instances."""
         flag = np.zeros((capacity, frames), bool)
         return cls(
             position=np.zeros((capacity, frames, 3), np.float32),
@@ -83,7 +83,7 @@ class TrafficFlow:
 
 @struct.dataclass
 class MarkerObservations:
-    """Fiducial markers detected in the current frame and the local lane graph that each id names.
+    """Fiducial markers detected in the current frame, with the local lane graph stored for each id.
 
     Attributes:
         marker_id: (M,) identity.
@@ -107,7 +107,7 @@ class MarkerObservations:
 
     @classmethod
     def empty(cls, capacity: int, lanes: int, points: int) -> MarkerObservations:
-        """Return room for `capacity` markers of `lanes` lanes each, and none valid."""
+        """Return `capacity` invalid markers of `lanes` lanes each."""
         return cls(
             marker_id=np.zeros(capacity, np.int32),
             pose=np.tile(np.eye(4, dtype=np.float32), (capacity, 1, 1)),
@@ -145,7 +145,7 @@ class SdMap:
 
     @classmethod
     def empty(cls, capacity: int, points: int) -> SdMap:
-        """Return a map with room for `capacity` lines of `points` points and none valid."""
+        """Return a map of `capacity` invalid lines of `points` points."""
         return cls(np.zeros((capacity, points, 2), np.float32), np.zeros(capacity, np.int32), np.zeros(capacity, bool))
 
     def validate(self) -> None:

@@ -1,4 +1,4 @@
-"""What is true around the vehicle, or in one image: lanes, areas, traffic elements, lane lines."""
+"""Ground truth around the vehicle, or in one image: lanes, areas, traffic elements, lane lines."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class LaneGraph:
         left, right: (N, P, 3) boundaries in driving direction, metres.
         left_type, right_type: (N,) `LineType`.
         is_connector: (N,) lane inside an intersection.
-        visibility: (N,) share of the centerline in direct line of sight, 0 to 1.
-        successor: (N, N) [i, j] true where the end of lane i is the start of lane j.
+        visibility: (N,) fraction of the centerline in direct line of sight, 0 to 1.
+        successor: (N, N) [i, j] the end of lane i is the start of lane j.
         valid: (N,).
     """
 
@@ -64,7 +64,7 @@ class LaneGraph:
 
     @classmethod
     def empty(cls, capacity: int, points: int) -> LaneGraph:
-        """Return a graph with room for `capacity` lanes of `points` points and none valid."""
+        """Return a graph of `capacity` invalid lanes of `points` points."""
         line = np.zeros((capacity, points, 3), np.float32)
         label = np.zeros(capacity, np.int32)
         flag = np.zeros(capacity, bool)
@@ -105,7 +105,7 @@ class Areas:
 
     @classmethod
     def empty(cls, capacity: int, points: int) -> Areas:
-        """Return a set with room for `capacity` areas and none valid."""
+        """Return `capacity` invalid areas of `points` points."""
         return cls(np.zeros((capacity, points, 3), np.float32), np.zeros(capacity, np.int32), np.zeros(capacity, bool))
 
     def validate(self) -> None:
@@ -122,7 +122,7 @@ class MapLines:
     Attributes:
         points: (L, P, 3) metres, ego frame; a ring repeats its first point at the end.
         category: (L,) `LineClass`.
-        closed: (L,) the line is a ring, so that its start and direction mean nothing.
+        closed: (L,) the line is a ring; its start and direction are arbitrary.
         valid: (L,).
     """
 
@@ -133,7 +133,7 @@ class MapLines:
 
     @classmethod
     def empty(cls, capacity: int, points: int) -> MapLines:
-        """Return a map with room for `capacity` lines of `points` points and none valid."""
+        """Return a map of `capacity` invalid lines of `points` points."""
         flag = np.zeros(capacity, bool)
         return cls(np.zeros((capacity, points, 3), np.float32), np.zeros(capacity, np.int32), flag, flag.copy())
 
@@ -150,7 +150,7 @@ class TrafficElements:
 
     Attributes:
         position: (E, 3) centre in the ego frame, metres.
-        box: (E, 2, 2) top-left and bottom-right pixel corners in the front image; zeros where there is no image.
+        box: (E, 2, 2) top-left and bottom-right pixel corners in the front image; zeros without an image.
         category: (E,) 1 traffic light, 2 road sign.
         attribute: (E,) OpenLane-V2 attribute 0 to 12.
         lane: (N, E) element e governs lane n of the merged centerlines.
@@ -166,7 +166,7 @@ class TrafficElements:
 
     @classmethod
     def empty(cls, capacity: int, lanes: int) -> TrafficElements:
-        """Return a set with room for `capacity` elements and none valid."""
+        """Return `capacity` invalid elements for `lanes` lanes."""
         label = np.zeros(capacity, np.int32)
         return cls(
             position=np.zeros((capacity, 3), np.float32),
@@ -191,8 +191,8 @@ class LaneLines:
     """Lane lines in one front-view image: L lines of up to P points, from the horizon down.
 
     Attributes:
-        points: (L, P, 2) column u and row v as shares of the image's width and height, v ascending.
-        point_valid: (L, P) the line has this point; what stands at the others is arbitrary.
+        points: (L, P, 2) column u and row v as fractions of the image's width and height, v ascending.
+        point_valid: (L, P) the line has this point; others are padding.
         valid: (L,).
     """
 
@@ -202,7 +202,7 @@ class LaneLines:
 
     @classmethod
     def empty(cls, capacity: int, points: int) -> LaneLines:
-        """Return a set with room for `capacity` lines of `points` points and none valid."""
+        """Return `capacity` invalid lines of `points` points."""
         return cls(
             np.zeros((capacity, points, 2), np.float32), np.zeros((capacity, points), bool), np.zeros(capacity, bool)
         )

@@ -1,4 +1,4 @@
-"""What the sensors deliver in one frame: the bird's-eye-view raster and calibrated camera images."""
+"""Sensor data of one frame: the bird's-eye-view evidence raster and calibrated camera images."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class BevChannel(enum.IntEnum):
 
 @struct.dataclass
 class CameraViews:
-    """What V calibrated pinhole cameras see in one frame.
+    """Images of V calibrated pinhole cameras in one frame.
 
-    Camera 0 looks ahead, and traffic elements are labelled in its image.
-    All images have one size; a smaller one lies in the top-left corner of its array and the rest is padding.
+    Camera 0 is the front camera; traffic elements are labelled in its image. All image arrays have the same size; a
+    smaller image lies in the top-left corner of its array, and the rest is padding.
 
     Attributes:
         image: (V, H, W, 3) uint8, RGB, without lens distortion.
         size: (V, 2) width and height of each image, pixels.
         intrinsics: (V, 3, 3), pixels from the top-left corner of the image (see `geometry.cameras`).
-        camera_from_ego: (V, 4, 4).
+        camera_from_ego: (V, 4, 4) extrinsics, metres.
         valid: (V,) the camera delivered an image.
     """
 

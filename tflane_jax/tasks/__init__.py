@@ -1,4 +1,4 @@
-"""What is trained and evaluated, in one typed object each: `lane_graph` and `lane_shape`."""
+"""Tasks: model, loss, data and metrics in one typed object. `lane_graph` and `lane_shape` define the two."""
 
 from tflane_jax.tasks.base import Model, Task, spread
 

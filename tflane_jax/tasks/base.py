@@ -1,8 +1,8 @@
-"""What a task is: a model with its loss, its data, its numbers and its pictures, in one typed object.
+"""Base class of tasks: a model with its loss, data, metrics and pictures, in one typed object.
 
-A task is a frozen dataclass: its fields are settings, and jit takes it as a static argument. The training loop calls
-its learning part (`training.task.Trainable`), evaluation its predicting part (`evaluation.predict.Predictor`), and the
-program around them the rest.
+A task is a frozen dataclass: its fields are settings, and jit takes it as a static argument. The training loop uses its
+methods for learning (`training.task.Trainable`), evaluation those for prediction (`evaluation.predict.Predictor`), and
+the commands the others.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Prediction
 
 ExampleT = TypeVar("ExampleT")
-"""What the task learns from: `Example` or `RoadImage`."""
+"""Type of an example: `Example` or `RoadImage`."""
 DataT = TypeVar("DataT")
-"""A split as `load` returns it and `evaluate` takes it."""
+"""Type of a split, as returned by `load` and taken by `evaluate`."""
 
 Terms = dict[str, Float[Array, ""] | Params]
-"""Numbers to record of a loss; the entry `STATISTICS` holds new running statistics."""
+"""Numbers to record beside a loss; the entry `STATISTICS` holds the new running statistics."""
 Draw = Callable[[Path, int, Params], None]
-"""(run folder, step, averaged parameters) -> pictures in the run folder."""
+"""(run folder, step, averaged parameters) -> None; writes pictures to the run folder."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A trained model as comparisons and pictures take it.
+    """A trained model of a comparison.
 
     Attributes:
         task: model and losses.
-        params: of one seed.
+        params: parameters of one seed.
     """
 
     task: Task[Any, Any]
@@ -48,12 +48,12 @@ class Model:
 
 @dataclass(frozen=True)
 class Task(Generic[ExampleT, DataT]):
-    """Base of all tasks. `Source` below is what `data.source(split)` gives."""
+    """Base class of all tasks. The argument `source` below is the configuration returned by `data.source(split)`."""
 
     columns: ClassVar[tuple[str, ...]] = ()
-    """Of the evaluation's table, as far as an evaluation has them."""
+    """Columns of the evaluation's table; those that an evaluation lacks are left out."""
     compared: ClassVar[tuple[str, ...]] = ()
-    """Scores ("group/name") that a comparison tests, as far as all of its models have them."""
+    """Scores ("group/name") that a comparison tests; those that some model lacks are left out."""
     errors: ClassVar[tuple[str, ...]] = ()
     """Compared scores where lower is better."""
 
@@ -62,15 +62,15 @@ class Task(Generic[ExampleT, DataT]):
 
     @property
     def frames(self) -> int:
-        """Successive frames that training sees as one example; 1 for frames on their own."""
+        """Number of successive frames in a training example; 1 for single frames."""
         return 1
 
     def init(self, key: jax.Array, example: ExampleT) -> Params:
-        """Return fresh parameters; `example` gives shapes only."""
+        """Return initial parameters; only the shapes of `example` are used."""
         raise NotImplementedError
 
     def loss(self, params: Params, batch: ExampleT, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
-        """Return the loss of a batch (leading axis on every leaf) and what is recorded of it; `key` is for dropout."""
+        """Return the loss of a batch (leading axis on every leaf) and the numbers to record; `key` is for dropout."""
         raise NotImplementedError
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -78,11 +78,11 @@ class Task(Generic[ExampleT, DataT]):
 
     @property
     def streams(self) -> bool:
-        """Whether evaluation predicts the frames of a scene one after the other, with memory."""
+        """Whether evaluation predicts the frames of a scene in order, with memory."""
         return False
 
     def predict(self, params: Params, example: ExampleT) -> Prediction:
-        """Return the last decoder layer's prediction for one example, a frame on its own."""
+        """Return the last decoder layer's prediction for one example, without memory of earlier frames."""
         raise NotImplementedError
 
     def start(self) -> Any:
@@ -98,23 +98,23 @@ class Task(Generic[ExampleT, DataT]):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Fields of an example that training and evaluation read; empty where all are read."""
+        """Fields of an example that training and evaluation read; empty: all fields."""
         return ()
 
     def load(self, source: Any, *, progress: bool = True) -> DataT:
-        """Return a split, in memory or as a `Streamed` that reads it while it is used."""
+        """Return a split, in memory or as a `Streamed` that reads examples on demand."""
         raise NotImplementedError
 
     def examples(self, data: DataT) -> ExampleT | Streamed:
-        """Return what training looks at of a split, as `datasets.batches` takes it."""
+        """Return the training examples of a split, as `datasets.batches` takes them."""
         raise NotImplementedError
 
     def shapes(self, data: SplitData) -> ExampleT:
-        """Return shapes and types of one example, as far as can be told without its data."""
+        """Return shapes and types of one example without loading the data."""
         raise NotImplementedError
 
     def check(self, data: SplitData, train: DataT) -> None:
-        """Raise UserError where the training split shows that the model cannot learn from these data."""
+        """Raise UserError if the model cannot be trained on this training split."""
 
     def prepare(self, data: SplitData) -> Prepare | None:
         """Return the augmentation of training examples, None for none."""
@@ -132,7 +132,7 @@ class Task(Generic[ExampleT, DataT]):
         raise NotImplementedError
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
-        """Return the function that draws predictions for a few validation examples while training."""
+        """Return the function that draws predictions for a few validation examples during training."""
         raise NotImplementedError
 
     def draw_comparison(self, models: Mapping[str, Model], source: Any, data: DataT, path: Path) -> Path:
@@ -143,7 +143,7 @@ class Task(Generic[ExampleT, DataT]):
     # Comparing
 
     def inference_variants(self) -> dict[str, Task[ExampleT, DataT]]:
-        """Return further ways to use a trained model that a comparison lists, by what to add to its name."""
+        """Return variants of a trained model at inference, as further rows of a comparison, by suffix of its name."""
         return {}
 
     def remarks(self, params: Params) -> dict[str, str]:

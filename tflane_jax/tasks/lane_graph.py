@@ -1,4 +1,4 @@
-"""The task "predict what is around the vehicle": a host model with its loss, data, metrics and pictures."""
+"""The lane-graph task: lanes and traffic elements around the vehicle, with loss, data, metrics and pictures."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
 
     Attributes:
         model: the host, with or without priors.
-        losses: weights of the host's costs and losses.
-        clip: frames of a scene that training runs through with memory, one after the other; an example is then a clip,
-            a leading axis on every leaf, and evaluation streams through the scenes. 1: frames stand alone.
+        losses: weights of the host's matching costs and losses.
+        clip: number of successive frames that training processes with memory. A training example is then a clip, with a
+            leading axis on every leaf, and evaluation streams through the scenes. 1: single frames.
     """
 
     model: HostConfig = TopoNetConfig()
@@ -89,11 +89,11 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
 
     @property
     def frames(self) -> int:
-        """Frames of a clip."""
+        """Number of frames of a clip."""
         return self.clip
 
     def init(self, key: jax.Array, example: Example) -> Params:
-        """Return fresh parameters; `example`, or a clip, gives shapes only."""
+        """Return initial parameters; only the shapes of `example`, or of a clip, are used."""
         if self.clip > 1:
             example = jax.tree.map(lambda leaf: leaf[0], example)
         return joined_statistics(self.model.build().init(key, example))
@@ -123,12 +123,12 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
                 return (bev, updated), found
 
             frames = examples, observations, jax.random.split(key, self.clip)
-            # Unrolled: inside of a loop XLA compiles the gradient of a convolution to code 25 times slower on a CPU.
+            # Unrolled: inside a loop, XLA's gradient of a convolution is 25 times slower on a CPU.
             (_, updated), found = lax.scan(body, (start.bev, statistics), frames, unroll=self.clip)
             return found, updated
 
         if self.clip > 1 and start.bev is None:
-            # No frame needs what another one has learned.
+            # Without BEV memory, only the priors connect frames, and they have been observed already.
             batch, observations = _frames((batch, observations))
         through_clips = self.clip > 1 and start.bev is not None
         keys = jax.random.split(key, len(jax.tree.leaves(batch)[0]))
@@ -140,7 +140,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         return loss, report | updated
 
     def _observations(self, example: Example) -> ByPrior:
-        """Return what the priors observe in a frame, or in each frame of a clip; nothing in it is learned."""
+        """Return the priors' observations of a frame, or of each frame of a clip; they depend on no parameters."""
         priors = self.model.build_priors()
         return observe(priors, example, {})[0] if self.clip == 1 else observe_clip(priors, example)
 
@@ -149,11 +149,11 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
 
     @property
     def streams(self) -> bool:
-        """A model that is trained on clips is evaluated on streams."""
+        """Models trained on clips are evaluated on streams."""
         return self.clip > 1
 
     def predict(self, params: Params, example: Example) -> Prediction:
-        """Return the last decoder layer's prediction for one example, a frame on its own."""
+        """Return the last decoder layer's prediction for one example, without memory of earlier frames."""
         return self.step(params, None, example)[1]
 
     def start(self) -> HostMemory:
@@ -163,10 +163,10 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     def step(self, params: Params, memory: HostMemory | None, example: Example) -> tuple[HostMemory, Prediction]:
         """Return the memory for the next frame, and the prediction for this one.
 
-        The same for streams, `memory, answer = step(params, memory, example)`, and for sequences of examples with a
-        leading axis, `lax.scan(partial(task.step, params), task.start(), examples)`.
+        For live streams: `memory, prediction = step(params, memory, example)`. For examples with a leading axis:
+        `lax.scan(partial(task.step, params), task.start(), examples)`, with equal results.
         """
-        # Terms of parameters alone must stay inside a scan: hoisted out of it, they are rounded otherwise.
+        # The barrier keeps XLA from hoisting parameter-only terms out of a scan, which would change their rounding.
         params, example = lax.optimization_barrier((params, example))
         learned, statistics = split_statistics(params)
         module = self.model.build()
@@ -197,7 +197,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         return shapes_of(keep(sources.sample(data.source("train")), self.parts))
 
     def check(self, data: SplitData, train: Example | Streamed) -> None:
-        """Raise UserError where the ranges of model and data differ, or a camera sees more cells than it can serve."""
+        """Raise UserError if the ranges of model and data differ, or a camera sees more cells than `capacity`."""
         self._check_ranges(data.source("train").example)
         encoder, cameras = self.model.encoder, first_example(train).cameras
         if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
@@ -220,7 +220,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
             )
 
     def prepare(self, data: SplitData) -> Prepare | None:
-        """Return the photometric augmentation of the data, if they have one."""
+        """Return the photometric augmentation of the data, or None."""
         augmentation = getattr(data, "augmentation", None)
         return None if augmentation is None else partial(_augmented, augmentation)
 
@@ -228,12 +228,12 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     # Numbers and pictures
 
     def evaluate(self, params: Params, data: Example | Streamed, config: EvaluationConfig) -> Evaluation:
-        """Return the metrics of everything that the host predicts and the examples label."""
+        """Return the metrics of all parts that the host predicts and the examples label."""
         metrics = evaluate_lanes(self, params, data, config)
         return Evaluation(metrics.protocol, metrics.compute())
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
-        """Return the metrics of what the host predicts, by group, with those of traffic elements if it has them."""
+        """Return the names of the host's metrics by group, with those of traffic elements if it predicts them."""
         marked = data.source("val").example.markers is not None
         groups = Sightings.groups if marked else ()
         metrics = LaneGraphMetrics(config.versions, groups)
@@ -267,7 +267,10 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         return draw
 
     def draw_comparison(self, models: Mapping[str, Model], source: Any, data: Example | Streamed, path: Path) -> Path:
-        """Draw the test frames with the most hidden lanes (of streamed data, any), every model beside the truth."""
+        """Draw the test frames with the most occluded lanes, every model beside the ground truth.
+
+        Of streamed data, frames are spread evenly instead.
+        """
         from tflane_jax.plots import save_examples
 
         dataset = sources.open_dataset(source)
@@ -289,7 +292,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     # Comparing
 
     def inference_variants(self) -> dict[str, Task[Example, Example | Streamed]]:
-        """Return a model with traffic flow once more without any (TF-Lane, Table 7)."""
+        """Return the variant without traffic flow at inference, for models with it (TF-Lane, Table 7)."""
         if self.model.priors.traffic_flow is None:
             return {}
         return {"no traffic flow at inference": limit_instances(self, 0)}
@@ -300,9 +303,9 @@ def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int,
 
 
 def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
-    """Return the task with at most `count` instances of traffic flow, the heaviest; 0 is inference without.
+    """Return the task with at most `count` instances of traffic flow, those with the largest weights; 0 is without.
 
-    The parameters stay the same. Raises UserError where the model takes no traffic flow or has fewer slots.
+    Parameters stay the same. Raises UserError if the model takes no traffic flow or has fewer slots.
     """
     traffic = task.model.priors.traffic_flow
     if traffic is None:
@@ -328,5 +331,5 @@ def titles(dataset: Dataset, indices: list[int]) -> list[str]:
 
 
 def _frames(clips: T) -> T:
-    """Return the frames of a batch of clips, one after the other."""
+    """Return a batch of clips as a batch of frames: merge the two leading axes."""
     return jax.tree.map(lambda leaf: leaf.reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:]), clips)

@@ -1,4 +1,4 @@
-"""The task "find the lane lines of one image": the LSTR family (GTN paper), measured by TuSimple's metric."""
+"""The lane-shape task: lane lines in one image by the LSTR family (GTN paper), with TuSimple's metric."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, 
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 
-# The metric's image: rows and columns of TuSimple.
+# Image size of TuSimple's metric: rows and columns.
 HEIGHT, WIDTH = 720, 1280
 _COMPARED_EXAMPLES = 6
 _TIMED_FRAMES = 30
 
-# Table 1 of the GTN paper, on the 2,782 test images of TuSimple; percent, as our own rows.
+# Table 1 of the GTN paper, on the 2,782 test images of TuSimple: name, frames/s, accuracy, FP and FN in percent.
 _TABLE_1 = (
     ("SCNN", 7, 96.53, 6.17, 1.80),
     ("PINet", 30, 96.70, 2.94, 2.63),
@@ -55,7 +55,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
 
     Attributes:
         model: the network.
-        losses: weights of costs and losses.
+        losses: weights of matching costs and losses.
     """
 
     model: LstrConfig = LstrConfig()
@@ -66,12 +66,12 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
     errors: ClassVar[tuple[str, ...]] = ("all/FP", "all/FN")
 
     def init(self, key: jax.Array, example: RoadImage) -> Params:
-        """Return fresh parameters; `example` gives shapes only."""
+        """Return initial parameters; only the shapes of `example` are used."""
         image = normalise(example.image, example.image_valid)
         return joined_statistics(self.model.build().init(key, image, example.image_valid))
 
     def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
-        """Return the loss of a batch (leading axis on every leaf) and its terms; norms use the batch's statistics."""
+        """Return the loss of a batch (leading axis on every leaf) and its terms; norms use batch statistics."""
         learned, statistics = split_statistics(params)
         module, keys = self.model.build(), jax.random.split(key, len(batch.image))
 
@@ -89,7 +89,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         return loss, report | {STATISTICS: updated}
 
     def predict(self, params: Params, example: RoadImage) -> Prediction:
-        """Return the last decoder layer's prediction for one example; its lines are not looked at."""
+        """Return the last decoder layer's prediction for one example; its lane lines are not read."""
         learned, statistics = split_statistics(params)
         image = normalise(example.image, example.image_valid)
         layers = self.model.build().apply({"params": learned} | statistics, image, example.image_valid)
@@ -100,7 +100,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         return sources.load(source, progress=progress)
 
     def examples(self, data: LabelledImages) -> RoadImage:
-        """Return the images with their lines."""
+        """Return the images with their lane lines."""
         return data.images
 
     def shapes(self, data: SplitData) -> RoadImage:
@@ -151,7 +151,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         return draw
 
     def draw_comparison(self, models: Mapping[str, Model], source: Any, data: LabelledImages, path: Path) -> Path:
-        """Draw a few test images, every model beside the truth."""
+        """Draw a few test images, every model beside the ground truth."""
         from tflane_jax.plots.images import save_road_images
 
         images = data.images
@@ -160,7 +160,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         return save_road_images(path, examples, answers)
 
     def remarks(self, params: Params) -> dict[str, str]:
-        """Return how many images a second the model takes on this machine, one at a time."""
+        """Return the images per second of the model on this machine, at batch size 1."""
         return {"fps": f"{frames_per_second(self, params):.0f}", "source": "this run"}
 
     def quoted(self) -> list[dict[str, str]]:
@@ -185,7 +185,7 @@ def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
 
 
 def predict_curves(task: Predictor, params: Params, examples: RoadImage) -> CurvePrediction:
-    """Return the curves predicted for stacked images, numpy; raise ValueError for a task that predicts none."""
+    """Return the curves predicted for stacked images, as numpy arrays; raise ValueError for a task without them."""
     ((_, answer),) = predictions(task, params, examples, len(examples.image))
     if answer.curves is None:
         raise ValueError("this task predicts no lane shapes")
@@ -193,7 +193,7 @@ def predict_curves(task: Predictor, params: Params, examples: RoadImage) -> Curv
 
 
 def frames_per_second(task: Predictor, params: Params, height: int = INPUT_HEIGHT, width: int = INPUT_WIDTH) -> float:
-    """Return how many images a second a model takes one at a time, from uint8 image to curves, compilation apart."""
+    """Return the images per second at batch size 1, from uint8 image to curves, without compilation (median)."""
     image = np.random.default_rng(0).integers(0, 256, (1, height, width, 3), np.uint8)
     lines = jax.tree.map(lambda leaf: leaf[None], LaneLines.empty(1, 1))
     batch = jax.device_put(RoadImage(image, np.ones((1, height, width), bool), lines))

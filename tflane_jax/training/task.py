@@ -1,4 +1,4 @@
-"""What the training program asks of a model: fresh parameters, and a loss on a batch."""
+"""The protocol that the training program requires of a model: initial parameters, and the loss of a batch."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class Trainable(Protocol):
     """A model with its loss. Implementations are frozen dataclasses: jit takes them as static arguments."""
 
     def init(self, key: jax.Array, example: Any) -> Params:
-        """Return fresh parameters for examples shaped like `example`."""
+        """Return initial parameters for examples shaped like `example`."""
         ...
 
     def loss(self, params: Params, batch: Any, key: jax.Array) -> tuple[Float[Array, ""], dict[str, Any]]:
         """Return the loss of a batch (leading axis on every leaf) and named terms to record; `key` is for dropout.
 
-        A model with running statistics puts their new values among the terms, as the entry `STATISTICS`.
+        A model with running statistics returns their new values in the entry `STATISTICS` of the terms.
         """
         ...

@@ -1,1 +1,1 @@
-"""What each command takes, one file a group of commands. Nothing slow is imported here."""
+"""The options of each command, one file per group of commands. Nothing slow is imported here."""

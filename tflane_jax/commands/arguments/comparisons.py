@@ -10,8 +10,8 @@ _FILES = """Protocols and their files:
   openlane-v2.1-centerline, openlane-v1.0-centerline
       PREDICTIONS is the pickle of an OpenLane-V2 submission; GROUND_TRUTH the devkit's collected pickle, or the
       dataset's folder with SPLIT/SEGMENT/info/TIMESTAMP.json. The versions differ in TOP_ll and TOP_lt, by a factor
-      of about four: say which one you report. v2.1 is also that of devkit v1.1. Both sides may also be plain .npz or
-      .json files (docs/scoring.md), such as `tflane predict` writes; without traffic elements.
+      of about four: say which one you report. v2.1 is also the metric of devkit v1.1. Both files may also be plain .npz
+      or .json (docs/scoring.md), as written by `tflane predict`, without traffic elements.
   openlane-v2.1-lane-segment, lanesegnet
       The same files of the lane-segment task (TIMESTAMP-ls.json). The first gives the devkit's OLUS, the second the
       mAP of the LaneSegNet and TF-Lane papers.
@@ -20,8 +20,8 @@ _FILES = """Protocols and their files:
   maptr, maptrv2
       MapTR's nuscmap_results.json and the *_map_anns_val.json that its evaluation writes.
   tusimple, tusimple-lstr
-      Both files hold one JSON record a line: raw_file, lanes (x at every row, negative where there is none), h_samples
-      (the truth) or run_time in ms (predictions). tusimple-lstr allows 20 s an image instead of 200 ms, like LSTR."""
+      Both files have one JSON record per line: raw_file, lanes (x at every row, negative without a point), h_samples
+      (ground truth) or run_time in ms (predictions). tusimple-lstr allows 20 s per image instead of 200 ms, as LSTR."""
 
 
 def compare(commands) -> None:
@@ -38,10 +38,12 @@ def compare(commands) -> None:
         "configs",
         metavar="[NAME=]FILE[:ABLATION]",
         nargs="+",
-        help="config files; the first one is what the others are compared with",
+        help="config files; the others are compared with the first one",
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
-    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time, sharing the cores (default 1)")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="number of trainings at a time, which share the cores (default 1)"
+    )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/compare"), help="default runs/compare")
     parser.add_argument(
         "--test",
@@ -51,7 +53,7 @@ def compare(commands) -> None:
         help="evaluate on a further test set, for example --test rain='--data.world.severity 1'; may be repeated",
     )
     parser.add_argument(
-        "--retrain", action="store_true", help="delete runs of other configurations in --out, and train them anew"
+        "--retrain", action="store_true", help="delete runs of other configurations in --out, and train again"
     )
     parser.set_defaults(takes_overrides=True)
 
@@ -61,7 +63,7 @@ def sweep(commands) -> None:
     parser = command(
         commands,
         "sweep",
-        "evaluate trained models while a setting of their test data changes",
+        "evaluate trained models over values of a setting of their test data",
         module="sweep",
         function="run",
         epilog=OVERRIDES,
@@ -70,11 +72,13 @@ def sweep(commands) -> None:
         "runs",
         metavar="[NAME=]FOLDER",
         nargs="+",
-        help="run folders, or folders with one for each seed as compare leaves them",
+        help="run folders, or folders with one run per seed, as written by compare",
     )
-    parser.add_argument("--setting", required=True, help="dotted name, say data.world.severity")
-    parser.add_argument("--values", nargs="+", required=True, help="of the setting")
-    parser.add_argument("--metrics", nargs="+", help="to show, say all/DET_l gap/recall (default: as compare does)")
+    parser.add_argument("--setting", required=True, help="dotted name, such as data.world.severity")
+    parser.add_argument("--values", nargs="+", required=True, help="values of the setting")
+    parser.add_argument(
+        "--metrics", nargs="+", help="scores to show, such as all/DET_l gap/recall (default: those of compare)"
+    )
     parser.add_argument("--checkpoint", choices=("last", "best"), default="last", help="default last")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/sweep"), help="default runs/sweep")
     parser.set_defaults(takes_overrides=True)
@@ -96,14 +100,14 @@ def score(commands) -> None:
     parser.add_argument(
         "--by",
         choices=("scene", "distance", "occlusion"),
-        help="report parts as well; distance and occlusion: of centerlines",
+        help="also report parts; distance and occlusion are for centerlines only",
     )
     parser.add_argument(
         "--bootstrap",
         type=int,
         metavar="N",
         default=0,
-        help="95 percent intervals from N draws of whole scenes (some 200 are enough)",
+        help="95 percent intervals from N bootstrap samples of scenes (about 200 are enough)",
     )
     parser.add_argument(
         "--out", metavar="STEM", type=Path, default=Path("score"), help="write STEM.md and STEM.json (default score)"

@@ -9,9 +9,11 @@ from tflane_jax.commands.arguments.shared import OVERRIDES, SourceName, command,
 
 def data(commands) -> None:
     """Add `tflane data`."""
-    parser = commands.add_parser("data", help="look at datasets", description="Look at datasets.")
+    parser = commands.add_parser(
+        "data", help="show, check and convert datasets", description="Show, check and convert datasets."
+    )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
-    show = command(inner, "show", "draw samples of a dataset and count what is in it", module="data", function="show")
+    show = command(inner, "show", "draw samples of a dataset and count their content", module="data", function="show")
     show.add_argument("--config", metavar="FILE", help="config file whose data to show (default: the built-in world)")
     split_arguments(show, "train")
     show.add_argument("--count", type=int, default=8, help="examples (default 8)")
@@ -19,7 +21,7 @@ def data(commands) -> None:
         "--out", metavar="FILE", type=Path, default=Path("samples.png"), help="picture (default samples.png)"
     )
     check = command(
-        inner, "check", "count what is in a dataset's folder and list its faults", module="data", function="check"
+        inner, "check", "count the content of a dataset's folder and list its faults", module="data", function="check"
     )
     check.add_argument("root", metavar="PATH", help="folder of the dataset")
     check.add_argument(
@@ -43,25 +45,30 @@ def data(commands) -> None:
     export.add_argument(
         "--splits", choices=("train", "val", "test"), nargs="+", default=["train", "val"], help="default train val"
     )
-    export.add_argument("--images", choices=("jpg", "png"), default="jpg", help="jpg as official, png without loss")
+    export.add_argument(
+        "--images",
+        choices=("jpg", "png"),
+        default="jpg",
+        help="jpg like the official data, or lossless png (default jpg)",
+    )
     export.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
     export.set_defaults(takes_overrides=True)
     overlap = command(
         inner,
         "overlap",
-        "measure how much two splits show the same places",
+        "measure how much two splits overlap geographically",
         module="data",
         function="overlap_of_splits",
     )
     overlap.add_argument(
         "train", metavar="TRAIN", type=Path, help="folder of Argoverse 2 logs, or of OpenLane-V2 segments"
     )
-    overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same of the other split")
+    overlap.add_argument("validation", metavar="VALIDATION", type=Path, help="the same for the validation split")
     overlap.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
     build = command(
         inner,
         "build",
-        "make the built-in world's examples ahead of training",
+        "generate the built-in world's examples before training",
         module="data",
         function="build",
         epilog=OVERRIDES,

@@ -10,12 +10,12 @@ from tflane_jax.commands.arguments.shared import command
 def markers(commands) -> None:
     """Add `tflane markers`."""
     parser = commands.add_parser(
-        "markers", help="find fiducial markers, and store the lanes that they name", description="Fiducial markers."
+        "markers", help="detect fiducial markers, and write stores of their lanes", description="Fiducial markers."
     )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
     _marker_store(inner)
     detect = command(
-        inner, "detect", "find markers in photos of a calibrated camera", module="markers", function="find"
+        inner, "detect", "detect markers in photos of a calibrated camera", module="markers", function="find"
     )
     detect.add_argument("images", metavar="IMAGES", nargs="+", type=Path, help="photos, or folders of photos")
     detect.add_argument(
@@ -31,65 +31,86 @@ def markers(commands) -> None:
         metavar="K",
         nargs="+",
         type=float,
-        help="of the lens: OpenCV's K1 K2 P1 P2 [K3 [K4 K5 K6]]; default none",
+        help="lens distortion, OpenCV's K1 K2 P1 P2 [K3 [K4 K5 K6]]; default none",
     )
     detect.add_argument("--size", type=float, default=1.0, help="side of the black square, metres (default 1)")
-    detect.add_argument("--height", type=float, default=1.5, help="of the camera above ground, metres (default 1.5)")
-    detect.add_argument("--pitch", type=float, default=0.0, help="of the camera, downwards, degrees (default 0)")
+    detect.add_argument(
+        "--height", type=float, default=1.5, help="height of the camera above ground, metres (default 1.5)"
+    )
+    detect.add_argument("--pitch", type=float, default=0.0, help="downward pitch of the camera, degrees (default 0)")
     detect.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/markers"), help="default runs/markers")
     curves = command(
         inner,
         "curves",
-        "measure how detection and pose get worse with distance, in the built-in world",
+        "measure detection rate and pose error over distance, in the built-in world",
         module="markers",
         function="curves",
     )
     curves.add_argument(
-        "--distances", type=float, nargs="+", default=[5.0 * n for n in range(1, 13)], help="metres (default 5 to 60)"
+        "--distances",
+        type=float,
+        nargs="+",
+        default=[5.0 * n for n in range(1, 13)],
+        help="distances, metres (default 5 to 60)",
     )
     curves.add_argument(
-        "--scales", type=float, nargs="+", default=[1.0, 0.5], help="sizes of the images, 1 is native (default 1 0.5)"
+        "--scales",
+        type=float,
+        nargs="+",
+        default=[1.0, 0.5],
+        help="image sizes as fractions of the native size (default 1 0.5)",
     )
     curves.add_argument("--seeds", type=int, default=8, help="scenes, with three boards each (default 8)")
-    curves.add_argument("--severity", type=float, default=0.5, help="of weather and camera, 0 to 1 (default 0.5)")
     curves.add_argument(
-        "--sigma-d", type=float, default=40.0, help="of the paper's detection curve in the picture, metres (default 40)"
+        "--severity", type=float, default=0.5, help="severity of weather and camera, 0 to 1 (default 0.5)"
+    )
+    curves.add_argument(
+        "--sigma-d",
+        type=float,
+        default=40.0,
+        help="sigma_d of the paper's detection curve in the picture, metres (default 40)",
     )
     curves.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
     for parser, many in ((detect, False), (curves, True)):
-        parser.add_argument("--family", default="ARUCO_5X5_100", help="of the markers (default ARUCO_5X5_100)")
-        parser.add_argument("--enlarge", type=int, default=1, help="search images so many times larger (default 1)")
-        ways = ("pattern", "subpixel", "none")
+        parser.add_argument("--family", default="ARUCO_5X5_100", help="marker family (default ARUCO_5X5_100)")
+        parser.add_argument(
+            "--enlarge", type=int, default=1, help="factor by which images are enlarged before detection (default 1)"
+        )
+        methods = ("pattern", "subpixel", "none")
         if many:
             parser.add_argument(
                 "--corners",
-                choices=ways,
+                choices=methods,
                 nargs="+",
                 default=["pattern", "subpixel"],
-                help="how corners are found (default pattern subpixel)",
+                help="corner refinement (default pattern subpixel)",
             )
         else:
-            parser.add_argument("--corners", choices=ways, default="pattern", help="how corners are found")
+            parser.add_argument(
+                "--corners", choices=methods, default="pattern", help="corner refinement (default pattern)"
+            )
 
 
 def _marker_store(inner) -> None:
     store = command(
-        inner, "store", "write which lanes the markers of a log name", module="marker_store", function="run"
+        inner, "store", "write the lanes around the markers of a log", module="marker_store", function="run"
     )
     store.add_argument(
         "--log",
         metavar="SCENE|FOLDER",
         required=True,
-        help="number of a world scene, or an Argoverse 2 log, which gets virtual markers",
+        help="number of a scene of the built-in world, or an Argoverse 2 log, which gets virtual markers",
     )
     store.add_argument("--out", metavar="FILE", type=Path, default=Path("store.json"), help="default store.json")
-    store.add_argument("--radius", type=float, default=50.0, help="lanes so near to a marker, metres (default 50)")
+    store.add_argument(
+        "--radius", type=float, default=50.0, help="largest distance of lanes from their marker, metres (default 50)"
+    )
     store.add_argument(
         "--frame",
         choices=("marker", "survey"),
         default="marker",
-        help="of the lanes in the file: the marker's, or the map's (default marker)",
+        help="coordinate frame of the lanes in the file: marker or map (default marker)",
     )
     store.add_argument("--bike-lanes", choices=("include", "exclude"), default="include", help="default include")
     store.add_argument("--surveyed", metavar="YYYY-MM-DD", help="day of the survey")
-    store.add_argument("--expires", metavar="YYYY-MM-DD", help="first day on which the entries count no longer")
+    store.add_argument("--expires", metavar="YYYY-MM-DD", help="first day on which the entries are invalid")

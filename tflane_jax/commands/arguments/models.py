@@ -7,14 +7,14 @@ from pathlib import Path
 from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arguments, model_arguments
 
 _PREDICT = """Lane lines in photos of any size:
-  tflane predict RUN photo.jpg folder/          with a model that was trained here
+  tflane predict RUN photo.jpg folder/          with a model trained by tflane
   tflane predict --config FILE photo.jpg        with the published weights that the config file names
-Photos of another camera than TuSimple's are cut to its field of view where --focal and --horizon say how."""
+Photos of cameras other than TuSimple's are cropped to its field of view if --focal and --horizon are given."""
 
 
 def train(commands) -> None:
     """Add `tflane train`."""
-    # Its help is printed by the command itself, because with a config it lists that config's settings.
+    # The command prints its help itself, because with --config the help lists that configuration's settings.
     parser = command(
         commands, "train", "train a model", module="train", function="run", epilog=OVERRIDES, add_help=False
     )
@@ -26,7 +26,7 @@ def train(commands) -> None:
         action="store_const",
         const="resume",
         dest="start",
-        help="go on with the run in --out (its own configuration, --config not needed)",
+        help="continue the run in --out with its own configuration (without --config)",
     )
     start.add_argument(
         "--overwrite", action="store_const", const="overwrite", dest="start", help="delete the run in --out first"
@@ -54,12 +54,12 @@ def predict(commands) -> None:
     example_arguments(parser, "val")
     parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
     parser.add_argument(
-        "--threshold", type=float, default=0.3, help="least score of a lane in JSON and pictures (default 0.3)"
+        "--threshold", type=float, default=0.3, help="lowest score of a lane in JSON and pictures (default 0.3)"
     )
     parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
     parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
     parser.add_argument(
-        "--out", metavar="DIR", type=Path, default=Path("runs/predict"), help="where to write (default runs/predict)"
+        "--out", metavar="DIR", type=Path, default=Path("runs/predict"), help="folder to write (default runs/predict)"
     )
 
 
@@ -73,7 +73,7 @@ def convert(commands) -> None:
         "--weights",
         metavar="FILE",
         type=Path,
-        help="checkpoint, .pth, .pkl or .npz (default: the one that the config names)",
+        help="checkpoint, .pth, .pkl or .npz (default: that of the config)",
     )
     parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="run folder to write")
 
@@ -104,8 +104,8 @@ def summary(commands) -> None:
         epilog=OVERRIDES,
     )
     parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the default configuration)")
-    parser.add_argument("--depth", type=int, default=1, help="levels of parameter names (default 1)")
+    parser.add_argument("--depth", type=int, default=1, help="levels of parameter names in the table (default 1)")
     parser.add_argument("--no-compile", action="store_true", help="count operations only, which takes seconds")
-    parser.add_argument("--no-training", action="store_true", help="leave the training step out")
+    parser.add_argument("--no-training", action="store_true", help="omit the training step")
     parser.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
     parser.set_defaults(takes_overrides=True)

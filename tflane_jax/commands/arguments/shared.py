@@ -1,4 +1,4 @@
-"""Arguments that several commands share. Nothing slow is imported here."""
+"""Common arguments of several commands. Nothing slow is imported here."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ OVERRIDES = """Any setting of the configuration can be changed by its dotted nam
 
 
 class SourceName:
-    """Type of an argument that names a data source; the list of sources is imported only when it is needed.
+    """Type of an argument that names a data source; imports the list of sources only when it is needed.
 
     Args:
-        checked: take only sources whose folder can be checked.
+        checked: accept only sources whose folder can be checked.
     """
 
     def __init__(self, *, checked: bool = False):
         self._checked = checked
 
     def names(self) -> list[str]:
-        """Return the names that the argument takes."""
+        """Return the accepted names."""
         from tflane_jax.datasets.sources import SOURCES
 
         return [source.name for source in SOURCES if source.check is not None or not self._checked]
@@ -32,7 +32,7 @@ class SourceName:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose help lists the data sources: their import takes a second, so it waits until help is printed."""
+    """A parser whose help lists the data sources. It imports them, which takes a second, only to print help."""
 
     def format_help(self) -> str:
         """Return the help text."""
@@ -46,11 +46,11 @@ def command(commands, name: str, text: str, *, function: str, module: str, epilo
     """Add a command and return its parser.
 
     Args:
-        commands: what `add_subparsers` gave.
-        name: of the command.
-        text: for help, without capital and full stop.
-        function, module: that do it, `tflane_jax.commands.<module>.<function>`.
-        epilog: end of the help text, printed as it is.
+        commands: result of `add_subparsers`.
+        name: name of the command.
+        text: description for the help, without capital and full stop.
+        function, module: implementation, `tflane_jax.commands.<module>.<function>`.
+        epilog: end of the help text, printed verbatim.
         **more: see `argparse.ArgumentParser`.
     """
     parser = commands.add_parser(
@@ -86,26 +86,26 @@ def model_arguments(parser: argparse.ArgumentParser, inputs: str = "run folder")
         "--checkpoint",
         metavar="best|last|STEP",
         type=_checkpoint,
-        help="default best, or last where nothing was evaluated",
+        help="default best, or last without evaluations",
     )
 
 
 def example_arguments(parser: argparse.ArgumentParser, split: str) -> None:
-    """Add the arguments that name examples to predict, `split` being the default."""
+    """Add the arguments that select examples to predict; `split` is the default."""
     split_arguments(parser, split)
-    parser.add_argument("--max-instances", type=int, metavar="N", help="use at most N road users; 0 is no traffic flow")
+    parser.add_argument("--max-instances", type=int, metavar="N", help="use at most N road users; 0: no traffic flow")
 
 
 def split_arguments(parser: argparse.ArgumentParser, split: str) -> None:
-    """Add the arguments that name one split of the data, `split` being the default."""
-    # No default here: a split that was asked for is refused where the data have none, the default is not.
+    """Add the arguments that select one split of the data; `split` is the default."""
+    # No argparse default: an explicit --split is an error for data without splits, the default split is not.
     parser.add_argument("--split", choices=("train", "val", "test"), help=f"default {split}")
     parser.set_defaults(default_split=split)
     source_arguments(parser)
 
 
 def source_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that name a data source."""
+    """Add the arguments that select a data source."""
     parser.add_argument(
         "--data", metavar="NAME", type=SourceName(), help="use this data source instead of the configuration's"
     )

@@ -21,9 +21,9 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     counts = parameter_counts(params, options.depth)
     total = sum(counts.values())
     parts = [
-        {"part": name, "parameters": f"{count:,}", "share": f"{count / total:.1%}"} for name, count in counts.items()
+        {"part": name, "parameters": f"{count:,}", "fraction": f"{count / total:.1%}"} for name, count in counts.items()
     ]
-    parts.append({"part": "all", "parameters": f"{total:,}", "share": "100.0%"})
+    parts.append({"part": "all", "parameters": f"{total:,}", "fraction": "100.0%"})
     title = f"Parameters of {options.config or 'the default configuration'}"
     print(format_table(parts, title=title), flush=True)
 

@@ -36,13 +36,19 @@ class LaneGraphMetrics:
     Args:
         versions: versions of the OpenLane-V2 centerline metrics.
         frame_groups: names of the groups of frames, see `GroupedCenterlineMetrics`.
+        parts: predicted parts that are measured as long as no frame was seen.
     """
 
-    def __init__(self, versions: Sequence[Version] = ("v2.1",), frame_groups: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        versions: Sequence[Version] = ("v2.1",),
+        frame_groups: Sequence[str] = (),
+        parts: Sequence[str] = ("centerlines",),
+    ) -> None:
         self._centerlines = GroupedCenterlineMetrics(versions=versions, frame_groups=frame_groups)
         self._segments = {"segments": LaneSegmentMetrics("OpenLane-V2"), "lanesegnet": LaneSegmentMetrics("LaneSegNet")}
         self._lines = VectorMapMetrics()
-        self._measured: tuple[str, ...] = ()
+        self._measured = tuple(parts)
 
     @property
     def protocol(self) -> str:
@@ -105,11 +111,10 @@ class LaneGraphMetrics:
         return groups
 
     def _applied(self) -> dict[str, Any]:
-        """Return the accumulators that apply; before the first frame, that of centerlines."""
-        measured = self._measured or ("centerlines",)
-        applied: dict[str, Any] = {"centerlines": self._centerlines} if "centerlines" in measured else {}
-        applied |= self._segments if "segments" in measured else {}
-        return applied | ({"lines": self._lines} if "lines" in measured else {})
+        """Return the accumulators that apply, by the part that they measure."""
+        applied: dict[str, Any] = {"centerlines": self._centerlines} if "centerlines" in self._measured else {}
+        applied |= self._segments if "segments" in self._measured else {}
+        return applied | ({"lines": self._lines} if "lines" in self._measured else {})
 
 
 def _lines(lines: LinePrediction) -> MapDetections:

@@ -57,6 +57,8 @@ class HostConfig:
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
     truth: ClassVar[tuple[str, ...]] = ("lanes",)
     """Fields of `Example` that hold the ground truth of this host's loss and metrics."""
+    predicts: ClassVar[tuple[str, ...]] = ("centerlines",)
+    """Fields of `Prediction` with lanes that this host fills; traffic elements are a part of their own."""
     query_type: ClassVar[Literal["instance", "point"]] = "instance"
     """What a query represents, see `HostSpec.query_type`."""
 

@@ -236,7 +236,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         """Return the names of the host's metrics by group, with those of traffic elements if it predicts them."""
         marked = data.source("val").example.markers is not None
         groups = Sightings.groups if marked else ()
-        metrics = LaneGraphMetrics(config.versions, groups)
+        metrics = LaneGraphMetrics(config.versions, groups, self.model.predicts)
         names = set(Evaluation("", metrics.compute()).scores())
         if self.model.elements is not None:
             of_elements = ["OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
@@ -255,13 +255,15 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
         def draw(folder: Path, step: int, params: Params) -> None:
             if indices:
                 examples, answer = predict_examples(self, params, dataset, indices)
+                if answer.centerlines is None:
+                    return  # pictures of other lanes come with the hosts that predict them
                 path, names = folder / "pictures" / f"step_{step:08d}.png", titles(dataset, indices)
                 ground, view = source.example.ground, source.example.range
-                lanes = {f"step {step}": centerlines_of(answer)}
+                lanes = {f"step {step}": answer.centerlines}
                 save_examples(path, examples, lanes, titles=names, ground=ground, view=view)
                 if examples.cameras is not None:
                     path = path.with_stem(f"{path.stem}_cameras")
-                    lanes, elements = centerlines_of(answer), answer.elements
+                    lanes, elements = answer.centerlines, answer.elements
                     save_camera_views(path, examples, lanes, elements, titles=names, ground=ground, view=view)
 
         return draw

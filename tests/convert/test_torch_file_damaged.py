@@ -73,7 +73,7 @@ def test_other_files_are_named(tmp_path, content, message):
         read_state_dict(tmp_path / "w.pth")
 
 
-def test_files_that_are_not_there(tmp_path):
+def test_missing_files_are_named(tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*nowhere\.pth: No such file"):
         read_state_dict(tmp_path / "nowhere.pth")
     with pytest.raises(UserError, match=r"cannot read .*: Is a directory"):

@@ -53,7 +53,7 @@ def test_the_defaults_are_lstrs_recipe():
 
 
 @pytest.mark.parametrize("config", [NO_AUGMENTATION, replace(GEOMETRY, rotation=0.0, flip=0.0, crop=1.0)])
-def test_nothing_drawn_changes_no_bit(config):
+def test_without_augmentation_no_bit_changes(config):
     before = example()
     for seed in range(5):
         assert_same(augment(before, config, seed), before)

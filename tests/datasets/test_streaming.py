@@ -87,7 +87,7 @@ def test_an_error_in_a_worker_reaches_the_caller(threads):
         list(broken.stream(lambda number: Request(number, (0, 0, number)), 4))
 
 
-def test_what_is_not_needed_is_not_loaded():
+def test_unneeded_parts_are_not_loaded():
     loaded = []
 
     class Counting(FakeDataset):
@@ -106,7 +106,7 @@ def test_what_is_not_needed_is_not_loaded():
 
 
 @pytest.mark.parametrize("change", [{"threads": -1}, {"processes": -1}, {"ahead": 0}])
-def test_settings_that_cannot_work_are_named(change):
+def test_invalid_settings_are_named(change):
     source = dataclasses.replace(streamed(), config=StreamingConfig(**change))
     with pytest.raises(UserError, match=f"{next(iter(change))}="):
         next(source.stream(lambda number: Request(number, (0, 0, number)), 4))

@@ -121,7 +121,7 @@ def run(variables, query, features, reference, visible, capacity=None):
     return both(variables["params"], query, features, reference, jnp.asarray(visible), capacity)
 
 
-def test_enough_capacity_changes_nothing_and_too_little_is_told(variables):
+def test_enough_capacity_changes_nothing_and_too_little_is_reported(variables):
     query, features, reference, visible = scene()
     counts = visible.any(-1).sum(1)
     (dense, _), by_dense = run(variables, query, features, reference, visible)
@@ -137,7 +137,7 @@ def test_enough_capacity_changes_nothing_and_too_little_is_told(variables):
 
 
 @pytest.mark.parametrize("capacity", [None, 5])
-def test_cameras_have_no_order_and_unseen_places_no_say(variables, capacity):
+def test_camera_order_and_unseen_places_change_nothing(variables, capacity):
     query, features, reference, visible = scene()
     (out, _), gradients = run(variables, query, features, reference, visible, capacity)
     order = jnp.array([2, 0, 1])

@@ -195,7 +195,7 @@ def test_gradients_match_finite_differences():
 
 
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS)
-def test_nodes_that_nobody_speaks_to_have_finite_gradients(variant):
+def test_nodes_without_incoming_edges_have_finite_gradients(variant):
     """The reference divides 0 by 0 there."""
     adjacency = random_graphs(3, 3, 6, 6).at[:, 2].set(0.0).at[:, :, 2].set(0.0)
     model = GraphTransformer(4, layers=3, variant=variant)

@@ -89,7 +89,7 @@ _mix_all = jax.jit(lambda s, x, v: mix_relations(RELATIONS, s, x, v))
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6))
-def test_mixtures_keep_what_all_cells_share(seed):
+def test_mixtures_keep_a_constant(seed):
     """Rows sum to 1: a constant stays, whatever the shares and wherever there is padding."""
     valid = random_valid(seed)
     shares = jax.nn.softmax(3 * random_array(seed, len(RELATIONS), 2), axis=0)

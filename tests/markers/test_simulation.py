@@ -138,7 +138,7 @@ def test_road_users_and_buildings_hide_markers():
     assert simulate_detections(house, house.keyframes[0], placed, config).valid.tolist() == [True, False]
 
 
-def test_what_is_drawn_depends_on_seed_frame_and_id_alone():
+def test_random_draws_depend_on_seed_frame_and_id_only():
     placed, config = markers_at(10.0, 20.0, 30.0, 40.0), NOISY
     scene = standing(3, seed=9)
     together = simulate_detections(scene, scene.keyframes[1], placed, config)
@@ -171,7 +171,7 @@ def test_scores_come_from_their_range():
     assert 0.68 < drawn.max() <= 0.7
 
 
-def test_with_which_moment_the_residual_compares():
+def test_the_residual_compares_with_the_configured_moment():
     scene = standing(20)  # frames 0.1 s apart, each a key frame
     assert moment_before(scene, 12, 0.5).track_frame == 7
     assert moment_before(scene, 12, None).track_frame == 11

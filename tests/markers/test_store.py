@@ -83,7 +83,7 @@ def test_no_stored_point_lies_outside_the_circle(radius, x, y):
         np.testing.assert_allclose(marker.lanes[i, -1], marker.lanes[j, 0], atol=1e-9)
 
 
-def test_stores_of_nothing():
+def test_empty_stores():
     assert store_of(fork(), placed()).markers == {}
     empty = store_of({}, placed((0, 0, 3))).markers[0]
     assert empty.lanes.shape[0] == 0
@@ -153,7 +153,7 @@ def saved(tmp_path):
         (lambda r: r["markers"].append(3), "markers[2] is of type int"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_named(tmp_path, change, message):
+def test_faults_in_a_file_are_named(tmp_path, change, message):
     record = saved(tmp_path)
     change(record)
     path = tmp_path / "wrong.json"
@@ -163,7 +163,7 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path, change, message):
     assert str(path) in str(error.value)
 
 
-def test_files_that_are_none(tmp_path):
+def test_other_files_are_refused(tmp_path):
     with pytest.raises(UserError, match="cannot read"):
         load_store(tmp_path / "absent.json")
     (tmp_path / "half.json").write_text(json.dumps(saved(tmp_path))[:400])

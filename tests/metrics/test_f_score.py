@@ -139,7 +139,7 @@ def test_no_frames():
     assert evaluate([]) == {"frames": 0, "F_score": 0.0, "F_recall": 0.0, "F_precision": 0.0}
 
 
-def test_lines_that_cannot_be_measured():
+def test_lines_that_cannot_be_measured_are_errors():
     with pytest.raises(UserError, match="detections: line 0 has a coordinate that is not finite"):
         score([along((0, 9))], [along((0, np.inf))])
     with pytest.raises(UserError, match="truth: polyline 0 has no points"):

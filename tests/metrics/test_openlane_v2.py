@@ -198,7 +198,7 @@ def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6))
-def test_groups_share_out_lanes_vertices_and_detections(seed):
+def test_groups_partition_lanes_vertices_and_detections(seed):
     frames = [match_frame(*random_frame(seed + i)) for i in range(3)]
     for i, frame in enumerate(frames):
         occluded = np.asarray(random_frame(seed + i)[1].visibility) < 0.5
@@ -220,7 +220,7 @@ def test_perfect_detections():
     assert evaluate([(dataclasses.replace(perfect, points=shuffled), truth)])["TOP_ll"] < 1.0
 
 
-def test_nothing_at_all():
+def test_empty_input():
     none = LaneDetections(np.zeros((0, 11, 3)), np.zeros(0), np.zeros((0, 0)))
     empty = LaneTruth(np.zeros((0, 11, 3)), np.zeros((0, 0), bool), np.zeros(0))
     for metrics in (CenterlineMetrics().compute(), evaluate([(none, empty)])):

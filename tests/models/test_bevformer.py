@@ -86,7 +86,7 @@ def memory():
 POSE = yaw_pose(np.float32(1.5), np.float32(-0.3), np.float32(0.2)).astype(np.float32)
 
 
-def test_a_memory_tells_something_and_an_invalid_one_nothing(encode, variables, memory):
+def test_a_valid_memory_changes_the_features_and_an_invalid_one_does_not(encode, variables, memory):
     with_memory = encode(levels(), ring(), memory, POSE)
     nothing = encode(
         levels(), ring(), BevMemory(np.full((5, 10, 8), np.nan, np.float32), np.array(False)), POSE * np.nan

@@ -98,18 +98,18 @@ def soiled(example):
     )
 
 
-def test_what_stands_in_padding_changes_no_answer(fitted):
+def test_padding_content_changes_no_output(fitted):
     same(fitted.predict(make_camera_example(2)), fitted.predict(soiled(make_camera_example(2))))
 
 
-def test_what_stands_in_padding_changes_no_gradient(toponet):
+def test_padding_content_changes_no_gradient(toponet):
     key, clean, dirty = jax.random.key(0), make_camera_example(2), soiled(make_camera_example(2))
     results = [toponet.train(toponet.params, batch_of(e, make_camera_example(3)), key) for e in (clean, dirty)]
     same(*results)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(results[0]))
 
 
-def test_a_broken_camera_may_show_anything(fitted):
+def test_an_invalid_camera_changes_nothing(fitted):
     example = make_camera_example(4)
     for camera in (0, 1):
         valid = np.arange(2) != camera
@@ -198,7 +198,7 @@ def test_a_stream_equals_the_scan_over_its_sequence(toponet):
     assert not np.array_equal(answers[3].centerlines.points, toponet.predict(frames[3]).centerlines.points)
 
 
-def test_nobody_there_is_no_traffic_flow(toponet):
+def test_an_empty_scene_equals_no_traffic_flow(toponet):
     example = make_camera_example(10)
     absent = example.replace(traffic_flow=TrafficFlow.empty(*example.traffic_flow.valid.shape))
     answer = toponet.predict(absent)
@@ -208,7 +208,7 @@ def test_nobody_there_is_no_traffic_flow(toponet):
     same(answer, toponet.step(other, toponet.task.start(), absent)[1])
 
 
-def test_what_does_not_fit_is_an_error():
+def test_mismatched_parts_are_errors():
     task, key = TASKS["toponet"], jax.random.key(0)
     with pytest.raises(UserError, match="choose data with cameras"):
         jax.eval_shape(task.init, key, make_example())

@@ -144,7 +144,7 @@ def test_padding_changes_nothing(name):
 
 
 @every_config
-def test_nothing_valid_gives_nothing(name):
+def test_without_valid_cells_the_output_is_zero(name):
     nothing = jnp.full((*SHAPE, DIM), jnp.nan, jnp.float32)
     out, _, gradients = compiled(name)(nothing, nothing, jnp.zeros(SHAPE, bool))
     for leaf in jax.tree.leaves((out, gradients)):
@@ -152,7 +152,7 @@ def test_nothing_valid_gives_nothing(name):
 
 
 @every_config
-def test_it_does_not_matter_where_the_padding_is(name):
+def test_the_place_of_padding_changes_nothing(name):
     """A small map, and the same map anywhere within a padded one: the same memory and the same gradients."""
     features, position, _ = scene(shape=BLOCK)
     expected, _, (by_param, by_feature, _) = compiled(name)(features, position, jnp.ones(BLOCK, bool))
@@ -167,7 +167,7 @@ def test_it_does_not_matter_where_the_padding_is(name):
 
 
 @every_config
-def test_looking_inside(name):
+def test_intermediates_are_available(name):
     config, (_, seen, _) = CONFIGS[name], compiled(name)(*scene())
     for i in range(config.layers):
         layer = seen[f"layer_{i}"]["graph"]

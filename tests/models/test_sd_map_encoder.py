@@ -202,7 +202,7 @@ def test_paper_size_has_the_published_parameters():
     assert sizes[0] - sizes[1] == 8_458_688 - 7_667_648
 
 
-def test_a_map_is_where_its_coordinates_are():
+def test_map_coordinates_are_normalised_by_the_range_of_the_host():
     """The same road seen from two places is the same road: normalised by the range of the host."""
     wide = PerceptionRange((-20.0, 20.0), (-10.0, 10.0))
     encoder = SdMapEncoder(MODULE, wide)

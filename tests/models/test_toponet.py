@@ -68,7 +68,7 @@ def test_padding_may_hold_nan(fitted, name):
 
 
 @pytest.mark.parametrize("name", ["traffic", "every layer", "fixed"])
-def test_nobody_there_is_no_traffic_flow(fitted, name):
+def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
     _, params, predict = fitted[name]
     example = make_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
@@ -79,7 +79,7 @@ def test_nobody_there_is_no_traffic_flow(fitted, name):
     assert not np.array_equal(absent.points, predict(params, example).points)
 
 
-def test_baseline_never_looks_at_traffic(fitted):
+def test_baseline_does_not_depend_on_traffic(fitted):
     _, params, predict = fitted["baseline"]
     same(predict(params, make_example(5)), predict(params, make_example(5).replace(traffic_flow=None)))
 

@@ -51,7 +51,7 @@ def test_another_seed_gives_other_bits(whole, tmp_path):
     assert arrays(tmp_path / "run") != arrays(whole)
 
 
-def test_a_killed_run_goes_on_to_the_same_bits(whole, tmp_path):
+def test_a_killed_run_resumes_to_the_same_bits(whole, tmp_path):
     folder = tmp_path / "run"
     for start, kill, last in (("new", "evaluation:20", 14), ("resume", "checkpoint:28", 21)):
         command = [sys.executable, "-m", "tests.training.stub_run", str(folder), start, kill]
@@ -69,7 +69,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(whole, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_step_and_keeps_it(whole, tmp_path, number):
+def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
     def evaluate_and_signal(params):
         os.kill(os.getpid(), number)
         return score(params)
@@ -82,7 +82,7 @@ def test_a_signal_ends_the_step_and_keeps_it(whole, tmp_path, number):
     assert arrays(tmp_path / "run") == arrays(whole)
 
 
-def test_streamed_data_give_the_same_bits_and_go_on_where_they_were(whole, tmp_path):
+def test_streamed_data_give_the_same_bits_and_resume_at_their_position(whole, tmp_path):
     """The position is the step of the checkpoint: a resumed run asks for the batch that comes next."""
 
     def evaluate_and_stop(params):
@@ -118,7 +118,7 @@ def test_records_are_means_over_the_steps_between(whole, tmp_path):
     assert {"loss", "loss/fit", "loss/explosive", "grad_norm", "learning_rate"} < train_records[0].keys()
 
 
-def test_the_folder_tells_where_the_numbers_come_from(whole):
+def test_the_folder_records_provenance(whole):
     assert json.loads((whole / "config.json").read_text()) == RESOLVED
     start, *_ = json.loads((whole / "provenance.json").read_text())
     assert start["packages"]["jax"].startswith("0.1")
@@ -176,7 +176,7 @@ def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
     assert not np.array_equal(tuned[0], tuned[1])
 
 
-def test_parts_of_another_model_start_afresh_where_that_is_asked_for(whole, tmp_path, capsys):
+def test_parts_of_another_model_can_be_initialised_afresh(whole, tmp_path, capsys):
     config = dataclasses.replace(CONFIG, steps=1, init_from=str(whole))
     more = LineTask(second_layer=True)
     still = dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0)
@@ -213,7 +213,7 @@ def test_drawing_sees_every_evaluation(tmp_path):
     assert seen[-1][2] == len(read_records(tmp_path / "run" / "metrics.jsonl"))
 
 
-def test_folders_that_are_not_fit_are_refused(whole, tmp_path):
+def test_unsuitable_folders_are_refused(whole, tmp_path):
     with pytest.raises(UserError, match=r"already holds a run.*--resume.*--overwrite"):
         run(whole)
     with pytest.raises(UserError, match="holds no run to resume"):
@@ -261,7 +261,7 @@ def test_two_processes_never_share_a_folder(tmp_path):
         ({"seeds": (1, 1)}, "seeds"),
     ],
 )
-def test_settings_that_cannot_work_are_named(tmp_path, change, name):
+def test_invalid_settings_are_named(tmp_path, change, name):
     with pytest.raises(UserError, match=rf"training\.{name} is"):
         run(tmp_path / "run", config=dataclasses.replace(CONFIG, **change))
     assert not (tmp_path / "run").exists()

@@ -63,7 +63,7 @@ def test_first_update_is_adamw_with_clipping():
     np.testing.assert_allclose(updates["bias"], [0.0, -0.1], rtol=1e-4)
 
 
-def test_what_never_has_a_gradient_does_not_decay():
+def test_parameters_without_gradients_do_not_decay():
     params = {"frozen": {"kernel": jnp.ones((2, 2))}, "learned": {"kernel": jnp.ones((2, 2))}}
     grads = {"frozen": {"kernel": jnp.zeros((2, 2))}, "learned": {"kernel": jnp.array([[1.0, 0.0], [0.0, 0.0]])}}
     for decay in ("decoupled", "coupled"):
@@ -125,7 +125,7 @@ def test_new_settings_are_off_by_default():
         ({"restarts": RestartsConfig(floor=-0.1)}, r"restarts\.floor is -0\.1"),
     ],
 )
-def test_settings_that_cannot_work_are_named(change, message):
+def test_invalid_settings_are_named(change, message):
     for make in (make_optimizer, make_rate):
         with pytest.raises(UserError, match=message):
             make(OptimConfig(warmup_steps=0, **change), 10)

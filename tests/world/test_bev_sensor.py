@@ -33,7 +33,7 @@ def cell(x, y):
     return int((y + 25.6) / 0.512), int((x + 51.2) / 0.512)
 
 
-def test_nothing_there_is_nothing_seen():
+def test_an_empty_scene_gives_empty_evidence():
     image = render()
     assert image.shape == (100, 200, 4)
     assert image.dtype == np.uint8
@@ -67,7 +67,7 @@ def test_each_thing_is_in_its_channel():
     assert image[..., OBSTACLE].any()
 
 
-def test_what_stands_in_the_line_of_sight_leaves_no_evidence_behind_it():
+def test_occluders_leave_no_evidence_behind_them():
     behind = lane_map(segment(0, [(16.0, -1.75), (50.0, -1.75)], left=LineType.SOLID, right=LineType.NONE))
     assert render(behind)[..., PAINT].any()
     assert not render(behind, TRUCK)[..., PAINT].any()
@@ -131,7 +131,7 @@ def test_severity_scales_every_degradation():
     assert 0.0 < distance(0.3) < distance(1.0) < distance(2.0)
 
 
-def test_lost_and_invented_patches_cover_about_their_share():
+def test_lost_and_invented_patches_cover_about_their_fraction():
     clean = BevSensorConfig(lost=0.0, invented=0.0, noise=0.0, far_error=0.0)
     lossy = dataclasses.replace(clean, lost=0.25)
     inventive = dataclasses.replace(clean, invented=0.05)

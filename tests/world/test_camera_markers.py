@@ -171,7 +171,7 @@ def test_nothing_to_draw():
         ({"ids": [-1]}, "0 to 99"),
     ],
 )
-def test_what_means_nothing_is_refused(change, words):
+def test_invalid_arguments_are_refused(change, words):
     covered = change.pop("covered", 0.0)
     with pytest.raises(UserError, match=words):
         marker_bodies(markers(pose(9.0, 0.0, 2.0), **change), covered=covered)

@@ -32,7 +32,7 @@ def test_bodies_fill_their_box_and_stay_within_it(category, seed):
 
 
 @pytest.mark.parametrize("category", list(RoadUser))
-def test_looks_tell_them_apart(category):
+def test_vehicles_of_one_kind_vary_in_colour(category):
     colours = [np.concatenate([solid.colours for solid, _ in drawn(category, seed)[1]]) for seed in range(6)]
     assert len({array.tobytes() for array in colours}) > 1
 

@@ -155,7 +155,7 @@ def test_simplified_lines_stay_within_the_tolerance(seed, count, tolerance):
     np.testing.assert_array_equal(simplify(line, 0.0), line)
 
 
-def test_simplifying_drops_what_a_straight_line_says():
+def test_simplifying_drops_points_on_a_straight_line():
     line = np.stack([np.arange(9.0), np.zeros(9)], -1)
     np.testing.assert_array_equal(simplify(line, 0.1), line[[0, -1]])
     angle = np.linspace(0, 2 * np.pi, 49)

@@ -1,4 +1,4 @@
-"""The command line: train, resume, evaluate and predict on fake examples, and what it says when something is wrong."""
+"""The command line: train, resume, evaluate and predict on fake examples, and error messages."""
 
 import json
 import os

@@ -231,7 +231,7 @@ def test_shipped_configurations_load_by_name_from_any_folder(name, ablation, tmp
 
 
 def test_configurations_that_pages_name_exist():
-    """In commands and docstrings; braces and shell variables are left out."""
+    """Reads commands and docstrings; names with braces and shell variables are skipped."""
     texts = [
         path.read_text("utf-8") for path in [ROOT / "README.md", *ROOT.glob("docs/*.md"), *shipped_configs().values()]
     ]

@@ -1,4 +1,4 @@
-"""Every golden file has a test that claims it, or is named here."""
+"""Every golden file is claimed by a test; the others are named in a skip message."""
 
 from fnmatch import fnmatchcase
 

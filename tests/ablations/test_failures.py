@@ -1,4 +1,4 @@
-"""Comparisons of which a part fails, further test sets, and what the tables hold."""
+"""Comparisons in which a part fails, further test sets, and the contents of the tables."""
 
 import json
 import re
@@ -20,7 +20,7 @@ def compare(config, out, seeds, *arguments):
 
 
 def failing(monkeypatch, *endings):
-    """Let trainings fail whose folder ends so."""
+    """Let trainings fail whose folder has this ending."""
     train_run, trained = workers.train_run, []
 
     def train(config, folder, **options):
@@ -111,7 +111,7 @@ def test_test_sets_have_tables_of_their_own(tiny, tmp_path, capsys):
 
 @pytest.mark.parametrize("best", ["2", "4"])
 def test_every_table_has_the_last_and_the_best_checkpoint(tiny, tmp_path, monkeypatch, best):
-    """Which one is best is decided on the validation split."""
+    """The best checkpoint is chosen on the validation split."""
     from tflane_jax.tasks.lane_graph import LaneGraphSystem
 
     evaluate, counted = LaneGraphSystem.evaluate, []

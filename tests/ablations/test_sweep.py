@@ -1,4 +1,4 @@
-"""Trained models against a setting of the test data."""
+"""Sweeps: trained models evaluated while a setting of the test data changes."""
 
 import dataclasses
 import json

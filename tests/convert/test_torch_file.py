@@ -1,4 +1,4 @@
-"""PyTorch's checkpoints come out as arrays."""
+"""PyTorch's checkpoints are read as arrays."""
 
 import argparse
 import collections

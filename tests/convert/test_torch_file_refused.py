@@ -1,4 +1,4 @@
-"""What a checkpoint asks for beside tensors is refused, and nothing in it is run."""
+"""Anything in a checkpoint but tensors is refused and not executed."""
 
 import collections
 import importlib
@@ -133,7 +133,7 @@ WRITTEN_IN_C = (set, frozenset, complex, dict, list, collections.OrderedDict, ty
 
 
 def global_pickle(module, name, rest=b""):
-    """Return a pickle of one name, and of what is done with it."""
+    """Return a pickle of one global name, followed by instructions that use it."""
     return b"\x80\x02c" + f"{module}\n{name}\n".encode() + rest + b"."
 
 

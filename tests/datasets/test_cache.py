@@ -1,3 +1,5 @@
+"""The cache of generated examples: identity, damage, failed and simultaneous builds."""
+
 import ast
 import errno
 import json

@@ -1,4 +1,4 @@
-"""One moment of a log as an example."""
+"""Examples made from one moment of a log."""
 
 import dataclasses
 import math

@@ -1,3 +1,5 @@
+"""Front views of the built-in world as a dataset."""
+
 import pickle
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""OpenLane-V2's reader: images and boxes, what is left out, what is wrong, the system on top of it, real frames."""
+"""OpenLane-V2's reader: images and boxes, capacity, errors, training on it, real frames."""
 
 import json
 import shutil
@@ -217,7 +217,7 @@ def test_settings_that_do_not_fit_the_folder_are_named(whole, change, said):
 
 
 def test_streamed_frames_can_be_trained_on(whole):
-    """Through the system: streamed, augmented in the workers, shapes as announced."""
+    """Streamed and augmented by workers; shapes as announced."""
     data = OpenLaneV2Data(
         whole, val="train", subset="B", image=NATIVE, example=SIZES, loading=StreamingConfig(threads=2, ahead=2)
     )

@@ -1,4 +1,4 @@
-"""The split checker: near is near within one city only, and files of both kinds are read."""
+"""The overlap of splits: distances within one city only, for both file formats."""
 
 import json
 

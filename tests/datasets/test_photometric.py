@@ -1,4 +1,4 @@
-"""Colours change at random, everything else stays."""
+"""Photometric augmentation changes colours and nothing else."""
 
 import colorsys
 from dataclasses import replace
@@ -63,7 +63,7 @@ def test_brightness_adds_and_contrast_multiplies():
 
 @pytest.mark.parametrize("colour", [(180, 120, 90), (90, 60, 180), (180, 90, 95)])
 def test_saturation_and_hue_are_those_of_hsv(colour):
-    """The last colour lies next to where the circle of hues closes."""
+    """The last colour lies next to the wrap-around of hue."""
     pixel = np.array([[colour]], np.uint8)
     hue, saturation, value = colorsys.rgb_to_hsv(*pixel[0, 0] / 255)
     less = distorted(replace(ALWAYS, saturation=(0.5, 0.5)), image=pixel)[0, 0] / 255

@@ -1,3 +1,5 @@
+"""The built-in world as a dataset: splits, order of frames, determinism."""
+
 import pickle
 import re
 import sys

@@ -86,7 +86,7 @@ def test_data_of_a_run_lead_to_their_source(data, kind, names):
 
 
 def test_root_does_not_override_the_split(tmp_path, logs):
-    """TuSimple's --root took all training files whatever the split, Argoverse 2's all logs of all splits."""
+    """Regression: --root took all of TuSimple's training files, and all of Argoverse 2's logs, for every split."""
     for split in SPLITS:
         expected = TuSimpleConfig(str(tmp_path), split)
         assert chosen("--data", "tusimple", "--root", tmp_path, "--split", split, config=IMAGES) == expected

@@ -1,4 +1,4 @@
-"""Examples read while they are used: the same as from memory, whatever the workers."""
+"""Streamed examples equal those in memory, for any number of workers."""
 
 import dataclasses
 import threading
@@ -29,7 +29,7 @@ def in_memory():
 
 
 def shifted(example, key):
-    """Augment an example by where it stands: seed, step, place."""
+    """Augment an example by its seed, step and place in the batch."""
     seed, step, place = key
     lanes = example.lanes.replace(points=example.lanes.points + np.float32(100 * seed + 10 * step + place))
     return example.replace(lanes=lanes)

@@ -1,3 +1,5 @@
+"""TuSimple's label files and images as a dataset."""
+
 import json
 import shutil
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""From the scene's padded containers to what the metrics compare."""
+"""The scene's padded containers as inputs of the centerline metrics."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Training evaluates with every protocol that a prediction has parts for."""
+"""Every part of a prediction is measured by the protocols that apply to it."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ BOTH = EvaluationConfig(batch_size=2, versions=("v2.1", "v1.0"))
 
 
 def sure(flags):
-    """Return logits of near certainty."""
+    """Return logits whose probabilities are close to 0 or 1."""
     return np.where(flags, 9.0, -9.0).astype(np.float32)
 
 
@@ -51,7 +51,7 @@ def labelled(seed=0):
 
 @dataclass(frozen=True)
 class Oracle:
-    """Predicts the truth of the parts that it is asked for, or everything moved by `shift` metres."""
+    """Predicts the true values of the chosen parts, moved by `shift` metres."""
 
     parts: tuple[str, ...]
     shift: float = 0.0

@@ -1,4 +1,4 @@
-"""From lane segments, areas and elements of the scene to what the lane-segment metrics compare."""
+"""Lane segments, areas and elements as inputs of the lane-segment metrics."""
 
 import dataclasses
 

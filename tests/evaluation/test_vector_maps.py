@@ -1,4 +1,4 @@
-"""From lane segments and areas of the scene, or plain arrays, to what MapTR's metric compares."""
+"""Lane segments and areas, or plain arrays, as inputs of MapTR's metric."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Plain data comes out of a pickle as it went in; nothing else comes out, and nothing is run."""
+"""Plain data survive pickling; everything else is refused, and nothing is executed."""
 
 import collections
 import os

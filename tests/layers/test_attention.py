@@ -125,7 +125,7 @@ def test_queries_without_keys_are_exactly_zero():
     out, to_query, to_key, to_value = with_gradients(query, key, value, gradient, mask)
     assert not np.any(out[:, blind])
     assert not np.any(to_query[:, blind])
-    # They add nothing to the gradients of the others either.
+    # They contribute nothing to the gradients of keys and values.
     others = np.setdiff1d(np.arange(6), blind)
     rest = with_gradients(query[:, others], key, value, gradient[:, others], mask[others])
     np.testing.assert_allclose(to_key, rest[2], rtol=1e-5, atol=1e-6)

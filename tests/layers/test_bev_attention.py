@@ -129,7 +129,7 @@ def test_enough_capacity_changes_nothing_and_too_little_is_reported(variables):
     np.testing.assert_allclose(compact, dense, atol=1e-6)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), by_compact, by_dense)
     assert sown["overflow"] == (0,)
-    # The third query's share of what no camera sees is the bias alone.
+    # A query that no camera sees gets the bias of the projection alone.
     np.testing.assert_array_equal(dense[3], variables["params"]["output_proj"]["bias"])
     scarce = int(counts.max()) - 1
     (_, sown), _ = run(variables, query, features, reference, visible, scarce)

@@ -30,7 +30,7 @@ def test_pairs(queries, keys):
 @pytest.mark.parametrize(("lanes", "traffic"), [(4, 3), (1, 1), (0, 2), (3, 0)])
 @pytest.mark.parametrize("host", ["no mask", "own mask"])
 def test_spatial_mask_entry_by_entry(lanes, traffic, host):
-    """A lane sees what the host lets it see and valid instances; a valid instance sees all lanes and its like."""
+    """Lanes attend to the lanes of the host's mask and to valid instances; valid instances to lanes and each other."""
     valid = random_bool(2, traffic)
     lane_mask = random_bool(3, lanes, lanes) if host == "own mask" else None
     dense = np.asarray(SpatialMask.from_validity(lanes, valid, lane_mask).dense())

@@ -1,4 +1,4 @@
-"""Which BEV cells lanes run through, and the auxiliary loss on them."""
+"""BEV cells through which lanes pass, and the auxiliary loss on them."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The fitting loss: padding, permutations, gradients, and what the matcher is told."""
+"""The fitting loss: padding, permutations, gradients, and matching costs."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Curves over distance: the scenes are what they claim to be, and rows are what the sightings say."""
+"""Detection curves over distance: the scenes, and the summary rows of their sightings."""
 
 from dataclasses import replace
 

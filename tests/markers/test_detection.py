@@ -1,4 +1,4 @@
-"""Markers in drawn images: found where they are, scored as stated, whatever stands in padding."""
+"""Detection in rendered images: poses, scores, and independence of padding."""
 
 from dataclasses import replace
 

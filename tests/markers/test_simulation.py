@@ -34,14 +34,14 @@ def markers_at(*distances, facing=np.pi):
 
 
 def standing(frames=1, *, boxes=((-30.0, 0.0, 0.75),), vector_map=MAP, **other):
-    """A log of a vehicle that stands at the map's origin; key frames at all frames."""
+    """A log of a static vehicle at the map's origin; every frame is a key frame."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     recorded = tracks(np.tile(np.array(boxes, float).reshape(1, -1, 3), (frames, 1, 1)))
     return log(vector_map, recorded, poses, list(enumerate(poses)), **other)
 
 
 def copies(distance, count):
-    """Return markers with ids of their own in one place: what is drawn for each is independent."""
+    """Return markers with distinct ids at one place, so that their random draws are independent."""
     return PlacedMarkers(np.arange(count), np.repeat(markers_at(distance).pose, count, 0))
 
 

@@ -66,7 +66,7 @@ def test_lanes_within_the_radius_are_cut_at_the_circle():
 
 
 def test_lanes_are_in_the_frame_of_the_marker():
-    """In front of a marker is +z, to the right of one who looks at it +x, and the road lies below (-y)."""
+    """+z points out of the marker, +x to the right seen from the front, and the road lies below (-y)."""
     facing_x = PlacedMarkers(np.array([3]), marker_pose(np.array([[10.0, 5.0, 3.0]]), np.array([0.0])))
     lanes = lane_map(segment(1, [(12, 5), (30, 8)])).segments
     (line,) = store_of(lanes, facing_x, points=2).markers[3].lanes
@@ -199,7 +199,7 @@ def test_unknown_ids_give_no_prior_and_are_counted():
     assert len(caught) == 1
     assert looked.found == (None, store.markers[3], None)
     assert (looked.unknown, looked.stale) == (2, 0)
-    # Nothing to say where all are known, and Python shows the warning once.
+    # No warning if all ids are known; Python shows the warning once.
     look_up(store, [3])
     assert look_up(store, []).found == ()
     with warnings.catch_warnings(record=True) as shown:

@@ -100,7 +100,7 @@ def test_vertex_precision(edges, confidence, expected):
 
 
 def levels_by_loop(scores, taken):
-    """The cut-offs of docs/reference/metrics.md section 2.6, word by word (scores in descending order)."""
+    """The cut-offs of docs/reference/metrics.md, section 2.6, as a loop (scores in descending order)."""
     n, kept = len(scores), []
     found = np.cumsum(taken >= 0)
     for r in range(1, 11):

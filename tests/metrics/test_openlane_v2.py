@@ -50,7 +50,7 @@ def test_golden_totals(case, version):
 @pytest.mark.parametrize("versions", [("v2.1", "v1.0"), ("v1.0", "v2.1")])
 @pytest.mark.parametrize("case", CASES)
 def test_golden_versions_side_by_side(case, versions):
-    """One pass gives the official numbers of both versions, to the last bit those of a pass for each."""
+    """One pass gives the official numbers of both versions, bit-identical to one pass for each."""
     frames = [frame[:2] for frame in load_frames(case)]
     both = evaluate(frames, CenterlineMetrics(versions))
     first, second = (evaluate(frames, CenterlineMetrics((version,))) for version in versions)

@@ -19,8 +19,8 @@ KEYS: dict[Sampling, str] = {
     "as_given": "chamfer_no_pred_resampling",
 }
 CASES = list(expected_cases("maptr"))
-# Without resampling the official program needs one number of points for all detections, and nobody has computed what a
-# stable order gives where scores tie.
+# Without resampling the official program needs one number of points for all detections, and it gives no numbers for a
+# stable order of equal scores.
 TOTALS = [
     (case, sampling)
     for case, expected in expected_cases("maptr").items()

@@ -67,7 +67,7 @@ def levels(seed=0, cameras=3):
 @pytest.fixture(scope="module")
 def variables():
     fresh = jax.jit(lambda: MODEL.init(jax.random.key(0), levels(), ring(), None, jnp.eye(4)))()
-    # Away from the initial zeros: queries decide where they look and how much they take.
+    # Not the initial zeros, so that offsets and attention weights depend on the query.
     leaves, tree = jax.tree.flatten(fresh)
     rng = np.random.default_rng(1)
     return jax.tree.unflatten(tree, [leaf + 0.1 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves])
@@ -173,7 +173,7 @@ def test_levels_and_cameras_must_fit_the_configuration(variables):
 
 
 def test_smaller_images_lie_in_the_corner_of_their_array():
-    """In an array twice as wide and high, the same pixels lie at half the share of it."""
+    """In an array twice as wide and high, the same pixels have half the normalised coordinates."""
     views = ring()
     reference, visible = see_pillars(CONFIG, views)
     larger = views.replace(image=np.zeros((3, 96, 128, 3), np.uint8))

@@ -1,4 +1,4 @@
-"""TopoNet and BEVFormer-DETR on cameras: what must not matter does not, memory, dropout, losses."""
+"""TopoNet and BEVFormer-DETR on cameras: padding, memory, dropout, losses."""
 
 import dataclasses
 import functools
@@ -84,7 +84,7 @@ def test_predicts_lanes_elements_and_both_topologies(fitted):
 
 
 def soiled(example):
-    """Fill what is not valid: pixels beside the smaller image, elements, lanes."""
+    """Fill invalid pixels, elements and lanes with garbage."""
     elements, lanes, image = example.traffic_elements, example.lanes, example.cameras.image.copy()
     image[1, 48:], image[1, :, 80:] = 255, 255
     box = np.where(elements.valid[:, None, None], elements.box, np.nan)
@@ -170,7 +170,7 @@ def test_every_parameter_of_a_part_learns(toponet):
     # A frame on its own has no motion, and the first layer knows of no edges.
     graph = ("lane_lane/forward", "lane_lane/backward", "lane_element")
     expected = {"encoder/bev/motion/hidden/kernel"} | {f"layer_0/scene_graph/{name}/kernel" for name in graph}
-    # Softmax does not feel what is added to all its keys; rounding may.
+    # Softmax is invariant to a constant added to all logits, up to rounding.
     assert {name for name in silent if not name.endswith("/key/bias")} == expected
 
 
@@ -203,7 +203,7 @@ def test_an_empty_scene_equals_no_traffic_flow(toponet):
     absent = example.replace(traffic_flow=TrafficFlow.empty(*example.traffic_flow.valid.shape))
     answer = toponet.predict(absent)
     assert not np.array_equal(answer.centerlines.points, toponet.predict(example).centerlines.points)
-    # The part that nobody reaches does not matter.
+    # Parameters of the temporal encoder have no effect.
     other = {**toponet.params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, toponet.params["temporal_encoder"])}
     same(answer, toponet.step(other, toponet.task.start(), absent)[1])
 

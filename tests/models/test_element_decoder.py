@@ -1,4 +1,4 @@
-"""The traffic-element head against the reference's numbers, and what must not matter to it."""
+"""The traffic-element head against the reference's numbers, and independence of padding."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Graph encoders against explicit dense products, and what they promise about padding, sizes and looking inside."""
+"""Graph encoders against explicit dense products, and padding, sizes and intermediates."""
 
 import dataclasses
 from functools import cache, partial
@@ -127,7 +127,7 @@ def test_a_gtn_that_selects_similarity_is_the_transformers_attention(heads):
 
 @every_config
 def test_padding_changes_nothing(name):
-    """What stands in padded cells, NaN included, reaches neither outputs nor gradients."""
+    """The content of padded cells, NaN included, reaches neither outputs nor gradients."""
     run, (features, position, valid) = compiled(name), scene()
     fill = lambda value: [jnp.where(valid[..., None], x, value) for x in (features, position)]  # noqa: E731
     clean, dirty = run(*fill(0.0), valid), run(*fill(jnp.nan), valid)
@@ -182,7 +182,7 @@ def test_intermediates_are_available(name):
 
 @pytest.mark.parametrize("name", ["gtn structural", "gcn"])
 def test_flipped_maps_give_flipped_memories(name):
-    """Structure knows no left and right but by its selection weights; here those of both sides are equal."""
+    """The graph is symmetric if the selection weights of opposite directions are equal, as here."""
     config = dataclasses.replace(CONFIGS[name], layers=1)
     module, variables = built(config)
     variables = jax.tree.map(lambda leaf: leaf, variables)
@@ -208,7 +208,7 @@ def test_small_maps(name, shape):
 
 
 def test_dropout_is_seeded():
-    """In the frame that all graphs share."""
+    """Dropout of the encoder layer that all graphs have in common."""
     module, variables = built(dataclasses.replace(CONFIGS["gcn"], layers=1))
     apply = jax.jit(module.apply, static_argnames="deterministic")
     run = lambda seed: apply(variables, *scene(), deterministic=False, rngs={"dropout": jax.random.key(seed)})  # noqa: E731

@@ -1,4 +1,4 @@
-"""The image encoder: what it makes of views of several sizes, and its paper sizes from shapes alone."""
+"""The image encoder: views of several sizes, and parameter counts at the papers' sizes from shapes alone."""
 
 import jax
 import jax.numpy as jnp

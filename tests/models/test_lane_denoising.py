@@ -1,4 +1,4 @@
-"""Denoising queries: what noise does, whose lane a query is, and that nothing but the loss notices them."""
+"""Denoising queries: noise, the lane of each query, and no effect on predictions."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Marker fusion: tokens, gate, variants, and a host that must not notice markers that are not there."""
+"""Marker fusion: tokens, gate, variants, and a host that absent markers leave unchanged."""
 
 from dataclasses import replace
 from functools import partial
@@ -39,7 +39,7 @@ CONFIG = MarkerFusionConfig(
 
 
 def lanes_of(example):
-    """Return what the markers of a frame on its own tell."""
+    """Return the marker lanes of a frame without memory."""
     return CONFIG.build(BASELINE.spec).observe(example, None)[0]
 
 
@@ -81,7 +81,7 @@ def same(a, b):
 
 
 def without_markers(params):
-    """Return the parameters of the host that has none."""
+    """Return the parameters without those of marker fusion."""
     if not isinstance(params, dict):
         return params
     return {name: without_markers(value) for name, value in params.items() if not name.startswith("marker")}

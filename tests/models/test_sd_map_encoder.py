@@ -89,7 +89,7 @@ def test_padding_changes_nothing_and_lines_have_no_order(attend):
     np.testing.assert_allclose(turned, tokens[order], atol=1e-5)
     alone = small_map(np.array([True, False, False]))
     (_, (by_itself, _)), _ = run(alone)
-    # Lines look at each other only where they should.
+    # Lines attend to each other only if configured.
     assert (np.abs(by_itself[0] - tokens[0]).max() > 1e-3) == (attend == "lines")
 
 
@@ -181,7 +181,7 @@ def test_encoders_fuse_the_map_in_every_layer(make, layers):
     absent, gradients = run(params, small_map(np.zeros(3, bool), np.nan))
     assert np.abs(out - absent).max() > 0.05
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
-    # A host that never looked at a map, with the parameters that it would have.
+    # A host without a map, with the parameters that both have in common.
     without = jax.jit(lambda p: plain.apply(p, None, *inputs))(params)
     np.testing.assert_allclose(absent, without, atol=1e-5)
 

@@ -179,7 +179,7 @@ def check_constructer(case):
 
 
 def test_elements_of_the_public_batch_see_different_queries():
-    """Otherwise the batch bug of spatial attention would not be tested."""
+    """Otherwise the golden case would not exercise the batch bug of spatial attention."""
     for path in golden_modules("smerf_bev_constructer*"):
         case = load_module_case(path)
         config, views = bev_config(case), golden_views(case.inputs)

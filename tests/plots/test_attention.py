@@ -1,3 +1,5 @@
+"""Pictures of attention: lines from lanes to road users, matrices, masks."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Pictures from above: lanes, evidence, tracks and predictions, without padding."""
+
 import numpy as np
 import pytest
 

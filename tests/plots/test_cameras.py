@@ -1,3 +1,5 @@
+"""Pictures of camera images with projected lanes and boxes."""
+
 from dataclasses import replace as replaced
 
 import jax

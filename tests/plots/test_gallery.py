@@ -1,3 +1,5 @@
+"""Galleries of examples and models, and saving of pictures."""
+
 import sys
 
 import numpy as np

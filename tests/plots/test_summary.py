@@ -1,3 +1,5 @@
+"""Counts of the contents of a dataset."""
+
 import numpy as np
 
 from tests.fakes import empty_example, fake_example

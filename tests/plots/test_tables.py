@@ -1,3 +1,5 @@
+"""Markdown tables, and files of tables."""
+
 import json
 import math
 

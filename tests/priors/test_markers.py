@@ -1,4 +1,4 @@
-"""Marker observations become lanes with a confidence."""
+"""Marker observations as lanes with a confidence."""
 
 import jax
 import numpy as np

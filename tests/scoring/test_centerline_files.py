@@ -1,4 +1,4 @@
-"""`tflane score` on OpenLane-V2's own files: official numbers, and what it says of damaged files."""
+"""`tflane score` on OpenLane-V2's own files: official numbers, and errors for damaged files."""
 
 import dataclasses
 import json

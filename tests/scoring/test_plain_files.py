@@ -1,4 +1,4 @@
-"""`tflane score` on this project's own files, and lanes parted by distance and occlusion."""
+"""`tflane score` on this project's own files, and lanes grouped by distance and occlusion."""
 
 import json
 import re

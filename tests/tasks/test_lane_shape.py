@@ -28,7 +28,7 @@ ENCODERS = {
 
 
 class Fitted:
-    """A task with random parameters and its compiled programs: what they start from, prediction, one update."""
+    """A task with random parameters and its compiled programs: start, prediction, one update."""
 
     def __init__(self, task):
         optim = OptimConfig(lr=1e-2, warmup_steps=0, weight_decay=0.0)
@@ -39,7 +39,7 @@ class Fitted:
         self.update = make_update_step(task, optim, 10)
 
     def start(self, key=0):
-        """Return a fresh state, whose buffers nobody else has: an update consumes them."""
+        """Return a fresh state with buffers of its own, because an update donates them."""
         return self.init(jax.random.key(key), road_image(0))
 
     def updated(self, batch, key=0):
@@ -58,7 +58,7 @@ def fitted(request):
 
 
 def padded(example, fill):
-    """Hide the right third of the image and fill it, and every point that is not there, with something."""
+    """Mark the right third of the image as invalid; fill it and all invalid points with a value."""
     valid = example.image_valid.copy()
     valid[:, WIDTH * 2 // 3 :] = False
     there = example.lines.point_valid & example.lines.valid[:, None]

@@ -35,7 +35,7 @@ def verdicts(values, *, config=RULE, length=100, every=10, number=0, memory=None
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        # The first two of ten are in the grace; the third is the first best.
+        # The first two of ten lie in the grace period; the third is the first best value.
         ([1.0] * 10, "....RRRRR."),
         ([0.1, 0.1, 1.0, 0.95, 0.85, 0.84, 0.6, 0.5], "....E..."),  # 0.95 is no better by a tenth, 0.85 is
         ([9.0, 9.0, 1.0, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05, 0.04], "....E....."),  # late only; once only
@@ -141,7 +141,7 @@ def test_a_run_follows_its_evaluations_and_records_it(whole, tmp_path):
     run_cycles(tmp_path / "fixed", optim=fixed)
     other = curves(timeless(tmp_path / "fixed"))
     assert not [split for split, _ in other if split == "cycle"]
-    # The learning rate shows it: the same up to the first change, and another right after it.
+    # The learning rate is the same up to the first change and differs right after it.
     changed = (changes["extensions"][1] > 0) | (changes["magnitude"][1] < 1.0)
     first = changes["number"][0][np.argmax(changed)]
     rates, untouched = (one["train", "learning_rate"][1][:, 0] for one in (series, other))

@@ -1,4 +1,4 @@
-"""Checkpoints: the same bits back, and a clear message for everything that can be wrong with a folder."""
+"""Checkpoints: bit-identical round trips, and a clear message for every fault of a folder."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Training on clips and evaluating streams: time is a scan, and what is remembered changes the answer."""
+"""Training on clips and evaluating streams: memory goes from frame to frame and changes the prediction."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ CLIPS = replace(ALONE, clip=3)
 
 
 def scenes(count=2, length=3, sight=(True, False, False)):
-    """Return frames of some scenes in order, markers in sight in some of them."""
+    """Return frames of some scenes in order, some of them with visible markers."""
     return stack_examples(
         [
             seeing(observed(seed=s, valid=sight[i % len(sight)]), 10 * s + i, has_previous=np.asarray(i > 0))
@@ -56,7 +56,7 @@ def test_the_loss_of_clips_equals_that_of_their_frames_with_memory(params):
     key = jax.random.key(0)
     unseen = jax.tree.map(jnp.asarray, scenes(sight=(False,)))
     of_clips, of_frames = jax.jit(CLIPS.loss), jax.jit(ALONE.loss)
-    # Without a marker there is nothing to remember.
+    # Without a marker the memory stays empty.
     together, terms = of_clips(params, as_clips(unseen, 3), key)
     apart, each = of_frames(params, unseen, key)
     np.testing.assert_allclose(together, apart, rtol=1e-5)
@@ -118,7 +118,7 @@ def test_the_summary_of_a_task_of_clips_counts_whole_clips():
 
 
 def test_cameras_are_trained_on_clips_too():
-    """Batch statistics and the BEV memory go from frame to frame; shapes alone tell that they fit."""
+    """Batch statistics and the BEV memory go from frame to frame; shapes alone show that they fit."""
     task = LaneGraphTask(CAMERA_TOPONET, clip=2)
     clip = stack_examples([make_camera_example(i).replace(has_previous=np.asarray(i > 0)) for i in range(2)])
     params = jax.eval_shape(task.init, jax.random.key(0), clip)

@@ -1,4 +1,4 @@
-"""The training program: same bits on a rerun and after a kill, and a clean end for everything that can go wrong."""
+"""The training program: bit-identical reruns and resumes, and clean errors."""
 
 import dataclasses
 import json
@@ -83,7 +83,7 @@ def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
 
 
 def test_streamed_data_give_the_same_bits_and_resume_at_their_position(whole, tmp_path):
-    """The position is the step of the checkpoint: a resumed run asks for the batch that comes next."""
+    """The checkpoint's step is the position in the data: a resumed run starts with the next batch."""
 
     def evaluate_and_stop(params):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -138,7 +138,7 @@ def test_several_seeds_train_side_by_side(whole, tmp_path):
 
 
 def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, tmp_path):
-    # The largest value of the arrays comes in the batch of some step; the infinite term is met there.
+    # The term becomes infinite at the step whose batch holds the largest value of the arrays.
     limit = float(line_arrays()["x"].max()) - 1e-3
     folder = tmp_path / "run"
     with pytest.raises(UserError, match=r"step \d+, seed 0: .*loss/explosive = inf.*is not finite") as error:
@@ -146,7 +146,7 @@ def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, 
     kept = Checkpoints(folder / "checkpoints").steps()[-1]
     assert f"step {kept + 1}," in str(error.value)
     assert str(Checkpoints(folder / "checkpoints").path(kept)) in str(error.value)
-    # That state is the one of the run that never met it.
+    # The saved state equals that of a run without the infinite term.
     short = dataclasses.replace(CONFIG, checkpoint_every=1, eval_every=1000, keep_checkpoints=40)
     run(tmp_path / "other", config=short)
     assert arrays(folder, kept) == arrays(tmp_path / "other", kept)
@@ -189,7 +189,7 @@ def test_parts_of_another_model_can_be_initialised_afresh(whole, tmp_path, capsy
     best = Checkpoints(whole / "checkpoints", best_metric="score")
     start = Checkpoints(tmp_path / "run" / "checkpoints").params(1)
     np.testing.assert_allclose(start["line"]["kernel"], best.params(best.find("best"))["line"]["kernel"], rtol=1e-6)
-    # And back: what only the other run has is left out.
+    # The other direction: parameters that only the other run has are left out.
     run(tmp_path / "back", config=dataclasses.replace(partly, init_from=str(tmp_path / "run")), optim=still)
     assert "second are left out" in capsys.readouterr().err
     with pytest.raises(UserError, match=r"another model \(line/"):

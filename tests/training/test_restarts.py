@@ -1,4 +1,4 @@
-"""Cycles of the learning rate: Eq. (2) at its ends, exact restarts, the end of the run, and changes on the way."""
+"""Cycles of the learning rate: Eq. (2) at its ends, exact restarts, the end of the run, and changes during it."""
 
 import dataclasses
 
@@ -90,7 +90,7 @@ def test_restarts_have_no_schedule_by_step():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Changes on the way
+# Changes during a run
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

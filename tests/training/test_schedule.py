@@ -106,7 +106,7 @@ def test_new_settings_are_off_by_default():
     )
     optimizer = make_optimizer(config, 9)
     states = [optimizer.init(params), plain.init(params)]
-    # Also checkpoints written before there were such settings must fit.
+    # Checkpoints written before these settings existed must still load.
     assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
     for _ in range(4):
         (updates, states[0]), (expected, states[1]) = (
@@ -175,9 +175,9 @@ def test_warm_restarts_are_pytorchs(path):
 def test_one_cosine_is_pytorchs(path):
     expected = load_module_case(path).outputs["cosine_annealing_T20"]
     rates = rates_of(OptimConfig(lr=1e-3, warmup_steps=0, final_ratio=0.01), 20, 21)
-    # Beyond its end PyTorch's goes up again as it came down; no run of ours goes there.
+    # Beyond its end PyTorch's schedule rises again; our runs end before that.
     back = 20 - np.abs(np.arange(len(expected)) % 40 - 20)
-    # The peak's share of float32 rounding: this schedule is optax's, not made for the last digits near its end.
+    # Tolerance: float32 rounding relative to the peak, because optax's schedule is not exact near its end.
     np.testing.assert_allclose(rates[back], expected, rtol=1e-6, atol=1e-7 * 1e-3)
 
 

@@ -1,4 +1,4 @@
-"""The bird's-eye-view evidence: where it is, what hides it, how it degrades."""
+"""The bird's-eye-view evidence: geometry, occlusion and degradation."""
 
 import dataclasses
 
@@ -62,7 +62,7 @@ def test_each_thing_is_in_its_channel():
     image = render(lane_map(crossings=(ring,), road_boundaries=(edge,)), TRUCK)
     assert not image[..., PAINT].any()
     assert image[..., BevChannel.CROSSING][cell(7, 7)] == 255
-    # The truck stands between the sensor and nothing of the edge at x = 0.
+    # The truck occludes no part of the edge at x = 0.
     assert image[..., BevChannel.ROAD_EDGE][cell(0, -9)] > 200
     assert image[..., OBSTACLE].any()
 

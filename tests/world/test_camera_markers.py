@@ -1,4 +1,4 @@
-"""Markers in the world's images: where geometry puts them, as dark as their area, behind what hides them."""
+"""Markers in the world's images: projection, brightness by area, occlusion."""
 
 from dataclasses import replace
 
@@ -118,7 +118,7 @@ def test_a_marker_is_seen_from_its_face_only():
 
 
 def test_pictures_stay_with_their_polygons():
-    """Whatever bodies are joined, chosen and moved."""
+    """After bodies are joined, selected and moved."""
     some, more = (
         marker_bodies(markers(pose(9.0, 0.0, 2.5), pose(12.0, 1.0, 2.5))),
         marker_bodies(markers(pose(15.0, 2.0, 2.5), ids=[5])),

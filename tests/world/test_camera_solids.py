@@ -1,3 +1,5 @@
+"""Drawing of solid bodies in camera images: order, clipping, placement."""
+
 import numpy as np
 import pytest
 

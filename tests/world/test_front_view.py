@@ -1,3 +1,5 @@
+"""Front views: labels against projected lines, weather, determinism."""
+
 from dataclasses import replace
 
 import numpy as np

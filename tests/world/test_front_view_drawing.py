@@ -1,3 +1,5 @@
+"""Drawing of front views: camera, road coordinates, stripes, solids, noise."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -82,7 +84,7 @@ def test_the_road_has_its_configured_width():
 
 @pytest.mark.parametrize("period", [0.0, 6.0])
 def test_a_stripe_covers_its_own_area(period):
-    """The paint in a row is as wide as the stripe, however thin it is there, times the share of dashes."""
+    """Paint in a row is as wide as the stripe, also below a pixel; of dashed lines the painted fraction is filled."""
     scene = draw_front_scene(2)
     camera, road = scene.camera, scene.road
     ground = look_at_ground(camera, road.axis)

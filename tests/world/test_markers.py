@@ -1,4 +1,4 @@
-"""Where fiducial markers stand."""
+"""Placement of fiducial markers."""
 
 from dataclasses import fields, replace
 

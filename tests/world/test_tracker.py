@@ -1,4 +1,4 @@
-"""The tracker on hand-made actors: what it sees, what it loses, what it mixes up."""
+"""The tracker on hand-made actors: detection, loss and confusion of identities."""
 
 import math
 from dataclasses import replace

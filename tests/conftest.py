@@ -7,7 +7,7 @@ import shutil
 import tempfile
 
 # Tests compile many programs and run each a few times: unoptimised code halves the session, and XLA's older code
-# generator for fusions halves what is left, as it hands LLVM far less to do.
+# generator for fusions halves what is left, because it gives LLVM less to do.
 _FAST_COMPILE = (
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
     "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -25,5 +25,5 @@ _programs = tempfile.mkdtemp(prefix="tflane_tests_")
 atexit.register(shutil.rmtree, _programs, ignore_errors=True)
 jax.config.update("jax_compilation_cache_dir", _programs)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-# Tracing makes millions of objects, hardly any of them garbage: looking for it as often as by default costs a tenth.
+# Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.
 gc.set_threshold(100_000, 50, 100)

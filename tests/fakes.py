@@ -99,7 +99,7 @@ def empty_example() -> Example:
 
 
 def fake_prediction(seed: int = 0, *, queries: int = 6) -> CenterlinePrediction:
-    """Return a prediction whose first two lanes are sure and linked."""
+    """Return a prediction with two confident, connected lanes; the others have low scores."""
     rng = np.random.default_rng([seed, 1])
     logits = np.full((queries, 1), -4.0, np.float32)
     logits[:2] = 2.0
@@ -109,7 +109,7 @@ def fake_prediction(seed: int = 0, *, queries: int = 6) -> CenterlinePrediction:
 
 
 def fake_elements(seed: int = 0, *, elements: int = 3, queries: int = 6) -> ElementPrediction:
-    """Return a green light that governs the first two lanes, and two elements that are hardly there."""
+    """Return a green light that governs the first two lanes, and two elements of low score."""
     rng = np.random.default_rng([seed, 2])
     corner = rng.uniform(0, 50, (elements, 1, 2))
     box = np.concatenate([corner, corner + rng.uniform(5, 20, (elements, 1, 2))], 1).astype(np.float32)
@@ -156,7 +156,7 @@ class BrokenDataset(FakeDataset):
 
 
 class DeadlyDataset(FakeDataset):
-    """Kills the process that makes its last example, as the system does when memory runs out."""
+    """Kills the process that makes its last example, as the kernel does when memory runs out."""
 
     def example(self, index: int) -> Example:
         if index == len(self) - 1:

@@ -1,4 +1,4 @@
-"""Random parameters: a model's own initialisation compiles for longer than most of what a test compares."""
+"""Random parameters, because a model's own initialisation takes longer to compile than most tests."""
 
 import zlib
 
@@ -10,7 +10,7 @@ import numpy as np
 def random_params(init, *arguments, spread=0.3):
     """Return parameters shaped like those of `init(key, *arguments)`, none of them at a special value.
 
-    What has the same name and the same shape in two models has the same values in both. `spread` is the standard
+    Parameters with the same name and shape in two models have the same values. `spread` is the standard
     deviation of weights.
     """
     shapes = jax.eval_shape(init, jax.random.key(0), *arguments)

@@ -1,4 +1,4 @@
-"""The benchmarks' own arithmetic; no time is ever asserted."""
+"""The arithmetic of the benchmarks; no test asserts a time."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The command line: train, resume, evaluate and predict on fake examples, and what it says when something is wrong."""
+"""The command line: train, resume, evaluate and predict on fake examples, and error messages."""
 
 import json
 import os
@@ -118,7 +118,7 @@ def test_a_run_folder_holds_everything(trained):
     assert {"all/DET_l", "all/TOP_ll", "occluded/DET_l", "clear/DET_l"} < validation[0].keys()
 
 
-def test_training_again_needs_a_word(trained, config, capsys):
+def test_training_into_an_existing_run_needs_an_option(trained, config, capsys):
     before = sorted((trained / "checkpoints").rglob("*"))
     assert main(["train", "--config", str(config), "--out", str(trained)]) == 2
     said = capsys.readouterr().err
@@ -127,7 +127,7 @@ def test_training_again_needs_a_word(trained, config, capsys):
     assert sorted((trained / "checkpoints").rglob("*")) == before
 
 
-def test_resume_needs_the_folder_only(trained, capsys):
+def test_resume_needs_only_the_folder(trained, capsys):
     assert main(["train", "--resume", "--out", str(trained)]) == 0
     assert "4 steps" in capsys.readouterr().out
     assert main(["train", "--resume", "--out", str(trained), "--optim.lr", "1"]) == 2
@@ -230,7 +230,7 @@ def test_errors_are_one_line_without_a_traceback(arguments, message, config, tra
 @pytest.mark.parametrize(
     "arguments", [["evaluate"], ["eval", "run", "--splt", "val"], ["eval", "run", "--checkpoint", "x"]]
 )
-def test_unknown_words_exit_with_2(arguments, capsys):
+def test_unknown_arguments_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
         main(arguments)
     assert ended.value.code == 2
@@ -254,7 +254,7 @@ def test_every_command_has_help(capsys):
         assert capsys.readouterr().out.startswith(f"usage: tflane {command}")
 
 
-def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
+def test_ctrl_c_prints_the_command_to_resume(config, tmp_path, capsys, monkeypatch):
     import signal
 
     from tflane_jax.tasks import lane_graph
@@ -271,7 +271,7 @@ def test_ctrl_c_tells_how_to_go_on(config, tmp_path, capsys, monkeypatch):
     assert f"stopped by SIGINT after step 2; go on with: tflane train --resume --out {folder}" in said
 
 
-def test_a_comparison_trains_tests_and_is_not_done_twice(config, tmp_path, capsys):
+def test_a_comparison_trains_and_tests_and_does_not_repeat_finished_runs(config, tmp_path, capsys):
     out = tmp_path / "comparison"
     command = ["compare", f"baseline={config}:baseline", f"+TFM={config}", "--seeds", "0", "1", "--out", str(out)]
     command += FEW_PICTURES
@@ -296,7 +296,7 @@ def test_a_comparison_needs_different_names(config, tmp_path, capsys):
     assert "same name" in capsys.readouterr().err
 
 
-def test_the_worlds_cameras_can_be_looked_at(tmp_path, capsys):
+def test_data_show_draws_world_cameras(tmp_path, capsys):
     assert main(["data", "show", "--data", "world-cameras", "--count", "1", "--out", str(tmp_path / "world.png")]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"world.png", "world-cameras.png"}
     assert "traffic lights and signs" in capsys.readouterr().out

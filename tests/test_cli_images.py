@@ -82,7 +82,7 @@ def test_resume_is_bit_identical(trained, config, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, whole)
 
 
-def test_examples_come_out_in_tusimples_form(trained, tmp_path):
+def test_predictions_are_written_in_tusimple_format(trained, tmp_path):
     out = tmp_path / "predictions"
     assert main(["predict", str(trained), "--count", "2", "--out", str(out)]) == 0
     truth, found = read_truth(out / "truth.json"), read_predictions(out / "predictions.json")

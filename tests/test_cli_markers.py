@@ -42,7 +42,7 @@ def test_detect_writes_poses_and_pictures(photos, tmp_path, capsys):
     assert (cv2.imread(str(out / second["picture"])) == cv2.imread(str(photos / "b.png"))).all()
 
 
-def test_a_size_scales_the_distance(photos, tmp_path):
+def test_distance_is_proportional_to_marker_size(photos, tmp_path):
     assert main(["markers", "detect", str(photos / "a.png"), *INTRINSICS, "--size", "0.5", "--out", str(tmp_path)]) == 0
     (marker,) = json.loads((tmp_path / "detections.json").read_text())["photos"][0]["markers"]
     assert marker["position"][0] == pytest.approx(4.5, abs=0.02)
@@ -63,7 +63,7 @@ def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):
     assert words in capsys.readouterr().err
 
 
-def test_curves_refuse_what_means_nothing(tmp_path, capsys):
+def test_curves_refuse_invalid_settings(tmp_path, capsys):
     for change in (["--scales", "-1"], ["--seeds", "0"], ["--sigma-d", "0"]):
         assert main(["markers", "curves", "--out", str(tmp_path), *change]) == 2
         assert capsys.readouterr().err.startswith("tflane: ")

@@ -99,7 +99,7 @@ def test_text_is_one_line_per_setting():
 
 
 @pytest.mark.parametrize("value", [Outer(), Outer(Inner(), "b", 2.5, Path("p")), Outer(Other(3)), Outer(Inner(()))])
-def test_every_kind_of_setting_comes_back(value):
+def test_every_kind_of_setting_survives_json(value):
     assert from_json(Outer, json.loads(json.dumps(to_json(value)))) == value
 
 
@@ -139,7 +139,7 @@ def test_settings_that_a_file_lacks_take_their_defaults():
         (["--data.world.severity", "1"], {"data.world.severity": 1.0}),
     ],
 )
-def test_overrides_change_what_they_name(arguments, changed):
+def test_overrides_change_only_the_named_setting(arguments, changed):
     before, after = dict(settings(FLOW)), dict(settings(apply_overrides(FLOW, arguments)))
     differing = {k: v for k, v in after.items() if v != before[k] and not dataclasses.is_dataclass(v)}
     assert differing == changed
@@ -197,7 +197,7 @@ def test_settings_of_other_data_can_be_changed():
         (["--data", "OpenLaneV2Data"], "OpenLaneV2Data has no defaults for all of its settings"),
     ],
 )
-def test_overrides_that_are_wrong_are_named_in_a_line(arguments, message):
+def test_invalid_overrides_give_a_one_line_error(arguments, message):
     with pytest.raises(UserError, match=message) as error:
         apply_overrides(FLOW, arguments)
     assert "\n" not in str(error.value)
@@ -213,7 +213,7 @@ def test_overrides_that_are_wrong_are_named_in_a_line(arguments, message):
         ("def get_config(:", "line 1: SyntaxError"),
     ],
 )
-def test_config_files_that_are_wrong_are_named(tmp_path, content, message):
+def test_invalid_config_files_are_named(tmp_path, content, message):
     path = tmp_path / "broken.py"
     path.write_text(content)
     with pytest.raises(UserError, match=message) as error:
@@ -231,7 +231,7 @@ def test_shipped_configurations_load_by_name_from_any_folder(name, ablation, tmp
 
 
 def test_configurations_that_pages_name_exist():
-    """In commands and docstrings; braces and shell variables are left out."""
+    """Reads commands and docstrings; names with braces and shell variables are skipped."""
     texts = [
         path.read_text("utf-8") for path in [ROOT / "README.md", *ROOT.glob("docs/*.md"), *shipped_configs().values()]
     ]
@@ -243,7 +243,7 @@ def test_configurations_that_pages_name_exist():
         load_config(name)
 
 
-def test_a_file_comes_before_a_shipped_name(tmp_path, monkeypatch):
+def test_a_file_takes_precedence_over_a_shipped_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text("from tflane_jax.config import RunConfig\n\nget_config = RunConfig\n")
     assert load_config("own.py") == RunConfig()
@@ -264,13 +264,13 @@ def test_a_file_comes_before_a_shipped_name(tmp_path, monkeypatch):
         ("gtn_lane/lstr:xyz", r"has no function ablations\(\)"),
     ],
 )
-def test_references_that_are_wrong_are_answered_with_close_names(reference, message, tmp_path, monkeypatch):
+def test_unknown_references_suggest_similar_names(reference, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=message):
         load_config(reference)
 
 
-def test_config_files_that_are_not_there(tmp_path):
+def test_missing_config_files_are_errors(tmp_path):
     with pytest.raises(UserError, match="does not exist"):
         load_config(str(tmp_path / "nothing.py"))
     (tmp_path / "config.txt").touch()

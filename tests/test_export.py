@@ -29,14 +29,14 @@ def images(count):
 
 
 @pytest.mark.parametrize("batch", [1, 3])
-def test_gives_the_models_numbers_for_any_batch(model, exported, batch):
+def test_exported_program_equals_the_model_for_any_batch_size(model, exported, batch):
     expected = jax.jit(image_program(*model))(images(batch))
     answer = load_program(exported).call(images(batch))
     for name in ("logits", "curves"):
         np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
 
 
-def test_runs_in_a_process_that_does_not_know_this_package(model, exported, tmp_path):
+def test_exported_program_runs_without_this_package(model, exported, tmp_path):
     np.save(tmp_path / "images.npy", images(2))
     code = (
         "import sys, numpy as np; from jax import export\n"
@@ -52,7 +52,7 @@ def test_runs_in_a_process_that_does_not_know_this_package(model, exported, tmp_
             np.testing.assert_allclose(answer[name], expected[name], rtol=1e-5, atol=1e-6)
 
 
-def test_is_made_for_accelerators_too(exported):
+def test_export_targets_accelerators_too(exported):
     assert load_program(exported).platforms == ("cpu", "cuda")
 
 
@@ -72,7 +72,7 @@ def test_bad_files_are_named(exported, tmp_path):
             load_program(damaged)
 
 
-def test_nothing_half_written_where_writing_fails(model, tmp_path):
+def test_a_failed_write_leaves_no_partial_file(model, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot write"):
         export_model(*model, tmp_path / "file" / "m.stablehlo", height=HEIGHT, width=WIDTH)

@@ -1,4 +1,4 @@
-"""Every golden file has a test that claims it, or is named here."""
+"""Every golden file is claimed by a test; the others are named in a skip message."""
 
 from fnmatch import fnmatchcase
 
@@ -11,7 +11,7 @@ pytestmark = pytest.mark.golden
 
 
 @pytest.mark.parametrize("claim", CLAIMS)
-def test_claim_is_kept(claim):
+def test_every_claim_names_an_existing_test_and_golden_file(claim):
     shared_path("golden")
     assert (ROOT / CLAIMS[claim]).is_file(), f"{CLAIMS[claim]} is to check {claim} and does not exist"
     assert any(fnmatchcase(name, claim) for name in golden_entries()), f"nothing under golden/ matches {claim}"

@@ -1,4 +1,4 @@
-"""A wheel holds every module and the configurations, which load by name from any folder."""
+"""A wheel contains every module and configuration; configurations load by name from any folder."""
 
 import os
 import runpy

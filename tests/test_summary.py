@@ -1,4 +1,4 @@
-"""What a model costs is counted from shapes: parameters, operations, memory."""
+"""`tflane summary`: parameters, operations and memory, counted from shapes."""
 
 import json
 

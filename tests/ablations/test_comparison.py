@@ -38,7 +38,7 @@ def test_unequal_seeds_cannot_be_paired():
         summarise([variant("base", 0.1, 0.2), variant("prior", 0.2)], ["all/DET_l"])
 
 
-def test_of_errors_less_is_better():
+def test_lower_errors_are_better():
     variants = [variant("base", 0.1, 0.2, 0.3), variant("prior", 0.05, 0.1, 0.4)]
     (_, row) = summarise(variants, ["all/DET_l"], errors=["all/DET_l"])
     assert row["seeds better"] == "2 of 3"

@@ -1,4 +1,4 @@
-"""Comparisons of which a part fails, further test sets, and what the tables hold."""
+"""Comparisons in which a part fails, further test sets, and the contents of the tables."""
 
 import json
 import re
@@ -20,7 +20,7 @@ def compare(config, out, seeds, *arguments):
 
 
 def failing(monkeypatch, *endings):
-    """Let trainings fail whose folder ends so."""
+    """Let trainings fail whose folder has this ending."""
     train_run, trained = workers.train_run, []
 
     def train(config, folder, **options):

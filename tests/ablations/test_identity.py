@@ -118,7 +118,7 @@ def test_file_names_are_plain_where_they_can_be():
     assert file_names(["baseline", "+TFM", "2 x"]) == {"baseline": "baseline", "+TFM": "tfm", "2 x": "2_x"}
     both = file_names(["+TFM", "TFM", "++", "-"])
     assert len(set(both.values())) == 4
-    assert both["TFM"] == file_names(["TFM", "tfm"])["TFM"]  # whatever the others are
+    assert both["TFM"] == file_names(["TFM", "tfm"])["TFM"]  # independent of the other names
     assert all(both.values())
 
 
@@ -129,7 +129,7 @@ def job_of(config, folder, *arguments):
 
 
 def test_scores_belong_to_a_checkpoints_content(tiny, out, tmp_path):
-    """Not to a modification time, which a copy or a coarse clock can repeat."""
+    """A modification time would not do: a copy or a coarse clock can repeat it."""
     job = job_of(tiny, out / "base" / "seed_0")
     first = measure(job, job.config, "last")
     other = tmp_path / "other"

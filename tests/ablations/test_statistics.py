@@ -35,13 +35,13 @@ def test_one_seed_has_no_test():
     assert math.isnan(got.p_value)
 
 
-def test_equal_numbers_say_nothing():
+def test_differences_without_spread():
     assert paired_difference([1.0, 2.0], [1.0, 2.0]).p_value == 1.0
     assert paired_difference([2.0, 3.0], [1.0, 2.0]).p_value == 0.0
 
 
 @pytest.mark.parametrize(("a", "b"), [([], []), ([1.0], [1.0, 2.0])])
-def test_nothing_to_pair(a, b):
+def test_empty_or_unequal_numbers_cannot_be_paired(a, b):
     with pytest.raises(ValueError, match="as many numbers"):
         paired_difference(a, b)
 
@@ -64,7 +64,7 @@ def test_holm_rejects_what_the_step_down_procedure_rejects():
         assert {i for i, q in enumerate(holm(p)) if q <= 0.05} == rejected
 
 
-def test_tests_that_could_not_be_made_do_not_count():
+def test_missing_tests_do_not_count_in_the_correction():
     corrected = holm([0.01, math.nan, 0.04])
     assert math.isnan(corrected[1])
     assert [corrected[0], corrected[2]] == pytest.approx([0.02, 0.04])

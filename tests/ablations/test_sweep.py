@@ -1,4 +1,4 @@
-"""Trained models against a setting of the test data."""
+"""Sweeps: trained models evaluated while a setting of the test data changes."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
     return root
 
 
-def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
+def test_every_run_is_evaluated_at_every_value(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
     command = ["sweep", f"one={folder / 'one'}", str(folder / "other"), "--setting", "data.world.severity"]
     assert main([*command, "--values", "0", "1", "--out", str(tmp_path / "out")]) == 0
@@ -52,7 +52,7 @@ def test_every_run_meets_every_value(folder, tmp_path, monkeypatch, capsys):
     assert first == content["meta"]["scores"]["one"][0][0]
 
 
-def test_what_cannot_be_swept_is_said(folder, tmp_path):
+def test_settings_that_cannot_be_swept_are_refused(folder, tmp_path):
     with pytest.raises(UserError, match="give a setting of the data"):
         sweep({"other": folder / "other"}, "optim.lr", ["1"], tmp_path)
     with pytest.raises(UserError, match="is no run folder, and holds none"):

@@ -1,4 +1,4 @@
-"""Checkpoints of whole detectors: names of the fixtures, every tensor accounted for, nothing missing."""
+"""Checkpoints of whole detectors: every tensor is accounted for, and none is missing."""
 
 import numpy as np
 import pytest

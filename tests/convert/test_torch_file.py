@@ -1,4 +1,4 @@
-"""PyTorch's checkpoints come out as arrays."""
+"""PyTorch's checkpoints are read as arrays."""
 
 import argparse
 import collections
@@ -134,7 +134,7 @@ def test_any_view_inside_its_storage_is_numpys_and_any_other_is_refused(tmp_path
 
 
 @both_formats
-def test_what_wraps_a_tensor(tmp_path, write):
+def test_wrapped_tensors_are_read(tmp_path, write):
     one = of(GRID)
     utils, tag = "torch._utils", {"tag": 1}
     wrapped = Call(named(utils, "_rebuild_parameter"), one, True, collections.OrderedDict())
@@ -181,7 +181,7 @@ def test_training_checkpoints(tmp_path, write):
         read_state_dict(path, "scheduler")
 
 
-def test_where_weights_stand(tmp_path):
+def test_weights_are_found_under_known_names(tmp_path):
     weights = {"a": of(GRID)}
     for tree, entry in [
         (weights, ""),
@@ -206,7 +206,7 @@ def test_where_weights_stand(tmp_path):
             read_state_dict(write_zip(tmp_path / "w.pth", nothing))
 
 
-def test_a_file_that_holds_itself_ends(tmp_path):
+def test_a_file_that_contains_itself_terminates(tmp_path):
     tree = {"state_dict": {}, "a": {"b": {}}}
     tree["state_dict"]["model"] = tree["a"]["b"]["c"] = tree
     with pytest.raises(UserError, match="no tensors by name"):

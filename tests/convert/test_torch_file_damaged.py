@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged, or are none, are named."""
+"""Damaged checkpoints and other files give errors that name them."""
 
 import collections
 import contextlib
@@ -45,7 +45,7 @@ def test_a_flipped_byte_never_escapes(tmp_path_factory, place, change, write):
     data = bytearray(write(folder / "w.pth", state).read_bytes())
     data[place % len(data)] ^= change
     (folder / "w.pth").write_bytes(data)
-    # Some bytes do not matter, and some change a name or a number; nothing else may come of any.
+    # A changed byte may have no effect, or change a name or a number; anything else must be a UserError.
     with contextlib.suppress(UserError):
         got = read_state_dict(folder / "w.pth")
         assert all(array.size <= GRID.size for array in got.values())
@@ -73,7 +73,7 @@ def test_other_files_are_named(tmp_path, content, message):
         read_state_dict(tmp_path / "w.pth")
 
 
-def test_files_that_are_not_there(tmp_path):
+def test_missing_files_are_named(tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*nowhere\.pth: No such file"):
         read_state_dict(tmp_path / "nowhere.pth")
     with pytest.raises(UserError, match=r"cannot read .*: Is a directory"):

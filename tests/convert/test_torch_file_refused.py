@@ -1,4 +1,4 @@
-"""What a checkpoint asks for beside tensors is refused, and nothing in it is run."""
+"""Anything in a checkpoint but tensors is refused and not executed."""
 
 import collections
 import importlib
@@ -46,7 +46,7 @@ CLAIMS = {
 
 @both_formats
 @pytest.mark.parametrize("claim", CLAIMS)
-def test_a_tensor_cannot_claim_what_is_not_there(tmp_path, write, claim):
+def test_a_tensor_beyond_its_storage_is_refused(tmp_path, write, claim):
     options, message = CLAIMS[claim]
     path = write(tmp_path / "w.pth", {"fine": of(GRID), "a.weight": tensor(storage(GRID), **options)})
     with pytest.raises(UserError, match=rf"w\.pth: a\.weight: .*{message}"):
@@ -60,13 +60,13 @@ def test_many_tensors_made_of_one_element_are_refused(tmp_path):
 
 
 @both_formats
-def test_a_storage_cannot_claim_what_is_not_there(tmp_path, write):
+def test_a_storage_beyond_the_file_is_refused(tmp_path, write):
     path = write(tmp_path / "w.pth", {"a": tensor(storage(GRID, size=10**12), (10**7,))})
     with pytest.raises(UserError, match=r"a: has a storage that is cut short"):
         read_state_dict(path)
 
 
-def test_sorts_of_tensors_that_are_not_read(tmp_path):
+def test_unsupported_tensor_types_are_refused(tmp_path):
     utils = "torch._utils"
     layout = Call(named("torch.serialization", "_get_layout"), "torch.sparse_coo")
     sparse = Call(named(utils, "_rebuild_sparse_tensor"), layout, (of(GRID), of(GRID), (4, 6)))
@@ -133,7 +133,7 @@ WRITTEN_IN_C = (set, frozenset, complex, dict, list, collections.OrderedDict, ty
 
 
 def global_pickle(module, name, rest=b""):
-    """Return a pickle of one name, and of what is done with it."""
+    """Return a pickle of one global name, followed by instructions that use it."""
     return b"\x80\x02c" + f"{module}\n{name}\n".encode() + rest + b"."
 
 
@@ -157,7 +157,7 @@ def test_only_the_listed_names_are_reachable(tmp_path):
             read_state_dict(path)
 
 
-def test_what_is_listed_runs_nothing_and_cannot_be_changed(tmp_path):
+def test_listed_names_run_nothing_and_cannot_be_changed(tmp_path):
     """A pickle may set attributes of what it names: of `x`, `__call__` and `function` here."""
     names = (b"x", b"__call__", b"function", b"__init__")
     attributes = b"}(" + b"".join(b"U" + bytes([len(n)]) + n + b"U\x04evil" for n in names) + b"u"
@@ -171,7 +171,7 @@ def test_what_is_listed_runs_nothing_and_cannot_be_changed(tmp_path):
         assert before == (dict(vars(value)) if isinstance(value, type) else value)
 
 
-def test_instructions_that_reach_around_the_list_are_refused(tmp_path):
+def test_instructions_that_bypass_the_list_are_refused(tmp_path):
     path = tmp_path / "w.pkl"
     path.write_bytes(b"\x80\x02\x82\x01.")
     with pytest.raises(UserError, match=r"refused.*extension registry"):

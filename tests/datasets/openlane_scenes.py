@@ -1,4 +1,4 @@
-"""A small dataset with cameras, whose vehicle drives along lanes that stay where they are."""
+"""A small dataset with cameras: a vehicle that drives along static lanes."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class DriveConfig:
 
 
 class DriveDataset:
-    """Frames of scenes; lanes stand in another order in every frame."""
+    """Frames of scenes; the order of lanes differs between frames."""
 
     name = "drive"
 

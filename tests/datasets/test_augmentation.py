@@ -1,3 +1,5 @@
+"""Augmentation of road images: LSTR's recipe, geometry, colours, padding."""
+
 import math
 from dataclasses import replace
 
@@ -53,7 +55,7 @@ def test_the_defaults_are_lstrs_recipe():
 
 
 @pytest.mark.parametrize("config", [NO_AUGMENTATION, replace(GEOMETRY, rotation=0.0, flip=0.0, crop=1.0)])
-def test_nothing_drawn_changes_no_bit(config):
+def test_without_augmentation_no_bit_changes(config):
     before = example()
     for seed in range(5):
         assert_same(augment(before, config, seed), before)
@@ -74,7 +76,7 @@ def test_the_same_seed_gives_the_same_bits_and_others_differ():
 
 
 def test_colour_does_not_depend_on_geometry_being_drawn():
-    """Two streams: what one part draws moves nothing in the other."""
+    """Colour and geometry have separate random streams."""
     before = example()
     warped = augment(before, WARPS, 5)
     np.testing.assert_array_equal(augment(warped, COLOUR, 5).image, augment(before, ALWAYS, 5).image)

@@ -1,3 +1,5 @@
+"""The cache of generated examples: identity, damage, failed and simultaneous builds."""
+
 import ast
 import errno
 import json
@@ -89,11 +91,11 @@ def test_configuration_and_code_are_part_of_the_name(tmp_path, monkeypatch):
         ("def f(x):\n    return x + 2\n", False),
     ],
 )
-def test_only_what_the_code_does_counts(other, same):
+def test_the_digest_ignores_comments_and_docstrings(other, same):
     assert (cache._code("def f(x):\n    return x + 1\n") == cache._code(other)) is same
 
 
-def test_digest_covers_the_world_and_what_it_stands_on(monkeypatch):
+def test_digest_covers_the_world_and_its_imports(monkeypatch):
     read = []
     parse = ast.parse
 

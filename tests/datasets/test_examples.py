@@ -1,4 +1,4 @@
-"""One moment of a log as an example."""
+"""Examples made from one moment of a log."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ def seen_from(poses, points, yaw=0.0):
     return position, np.stack([np.full(len(points), yaw) - pose_yaw(p) for p in poses])
 
 
-def test_what_stands_still_stays_where_it_is_in_every_frame():
+def test_static_objects_keep_their_position_in_every_frame():
     points = np.array([[1010.0, -1995.0, 0.5], [990.0, -2010.0, 1.0]])
     position, yaw = seen_from(POSES, points, 2.5)
     moment = yaw_pose(1012.3, -1998.4, 1.9)
@@ -102,7 +102,7 @@ def test_a_log_of_one_frame_or_without_road_users_gives_a_valid_empty_flow(frame
     np.testing.assert_allclose(example.previous_from_ego, np.eye(4), atol=1e-12)
 
 
-def test_examples_have_one_shape_and_know_the_way_from_the_previous():
+def test_examples_have_one_shape_and_the_motion_since_the_previous_frame():
     recording = log(ROAD, tracks(np.full((30, 3, 3), 9.0)), POSES, [(5, POSES[5]), (10, POSES[10])])
     first, second = (make_example(recording, k, ExampleConfig()) for k in range(2))
     assert stack_examples([first, second]).bev.shape == (2, 100, 200, 4)
@@ -119,7 +119,7 @@ def test_same_log_same_bits():
         np.testing.assert_array_equal(a, b)
 
 
-def test_what_stands_in_invalid_slots_changes_nothing():
+def test_invalid_slots_change_nothing():
     valid = np.random.default_rng(0).random((30, 5)) < 0.6
     position = np.random.default_rng(1).uniform(-20.0, 20.0, (30, 5, 3))
     clean = tracks(position, valid=valid)
@@ -148,7 +148,7 @@ def test_a_building_hides_ground_and_lanes():
     assert walled.hidden[50, 180]
 
 
-def test_a_light_shows_its_state_at_the_key_frame():
+def test_a_light_has_its_state_of_the_key_frame():
     light = MapElement(np.array([1010.0, -2000.0, 4.0]), 0.0, 1, 1, (0,))
     sign = MapElement(np.array([1012.0, -2000.0, 2.0]), 0.0, 2, 4, (0,))
     pose = yaw_pose(1000.0, -2000.0, 0.0)

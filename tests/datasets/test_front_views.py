@@ -1,3 +1,5 @@
+"""Front views of the built-in world as a dataset."""
+
 import pickle
 from dataclasses import replace
 
@@ -38,7 +40,7 @@ def test_images_outside_the_split_are_refused(images, first):
 
 
 @pytest.mark.parametrize("index", [-1, 3])
-def test_there_is_nothing_outside(index):
+def test_indices_outside_the_dataset_are_errors(index):
     with pytest.raises(IndexError, match="front-views-val"):
         FrontViewDataset(SMALL).example(index)
 

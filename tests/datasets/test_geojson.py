@@ -38,7 +38,7 @@ def east_north(latitude, longitude, origin):
     st.floats(0, 2 * np.pi),
     st.sampled_from([(100.0, 3e-3), (1000.0, 0.3)]),
 )
-def test_places_are_as_exact_as_promised(latitude, longitude, bearing, reach):
+def test_projection_has_the_documented_accuracy(latitude, longitude, bearing, reach):
     distance, tolerance = reach
     origin = Origin(latitude, longitude)
     lat = latitude + np.degrees(distance * np.cos(bearing) / 6.37e6)

@@ -99,7 +99,7 @@ def test_nothing_in_range_and_no_map_at_all():
         assert not result.graph.successor.any()
 
 
-def test_visibility_is_the_share_that_nothing_hides():
+def test_visibility_is_the_unoccluded_fraction():
     wall = np.array([[10.0, 0.0, 2.0, 100.0, 0.0]])
     graph = crop(lane_map(segment(0, [(0.0, 0.0), (36.0, 0.0)])), buildings=wall).graph
     # All from the wall's near face at 9 m on is hidden: a quarter is seen.

@@ -1,3 +1,5 @@
+"""Examples as named arrays and back."""
+
 from dataclasses import fields, is_dataclass
 
 import jax

@@ -1,3 +1,5 @@
+"""Loading a dataset into memory: stacking, parts of examples, errors."""
+
 import jax
 import numpy as np
 import pytest

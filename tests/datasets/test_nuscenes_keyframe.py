@@ -53,7 +53,7 @@ def test_box_centres_are_where_they_are_labelled(keyframe, camera):
 
 
 def test_left_is_left(keyframe):
-    """What is ahead and to the left is seen by the front left camera, in metres of the ego frame."""
+    """A point ahead and to the left (ego frame, metres) is in the image of the front left camera."""
     _, record = keyframe
     point = np.array([[10.0, 12.0, 1.0]])
     seen = []

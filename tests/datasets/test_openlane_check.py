@@ -1,4 +1,4 @@
-"""What the check of an OpenLane-V2 folder finds."""
+"""Faults and counts that the check of an OpenLane-V2 folder reports."""
 
 import json
 import re

@@ -45,7 +45,7 @@ def same_lanes(got, expected, *, boundaries: bool) -> None:
 
 
 @pytest.mark.parametrize("index", [0, 4])
-def test_what_is_written_is_read_again(exported, index):
+def test_written_data_are_read_back(exported, index):
     made, dataset = DriveDataset(), opened(exported)
     assert len(dataset) == len(made)
     expected, got = made.example(index), dataset.example(index)
@@ -156,7 +156,7 @@ def test_a_line_whose_points_do_not_fit_in_is_resampled():
     np.testing.assert_allclose(dense(line)[[0, 100, 200], 0], [0, 4.5, 9])
 
 
-def test_what_cannot_be_written_is_said(tmp_path):
+def test_data_that_cannot_be_written_are_refused(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
     with pytest.raises(UserError, match="is not empty"):

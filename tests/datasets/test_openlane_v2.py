@@ -1,4 +1,4 @@
-"""OpenLane-V2's reader: images and boxes, what is left out, what is wrong, the system on top of it, real frames."""
+"""OpenLane-V2's reader: images and boxes, capacity, errors, training on it, real frames."""
 
 import json
 import shutil
@@ -131,7 +131,7 @@ def test_flavours_fill_their_own_part(whole, flavour, lanes, segments):
     np.testing.assert_allclose(example.traffic_elements.box[0], [[10, 4], [14, 12.5]])
 
 
-def test_what_finds_no_room_is_left_out_with_its_links(whole):
+def test_items_beyond_capacity_are_left_out_with_their_edges(whole):
     dataset = opened(whole, None, example=ExampleConfig(lanes=2, elements=1))
     with pytest.warns(TruncationWarning, match="more (lanes|elements)"):
         example = dataset.example(0)
@@ -196,7 +196,7 @@ def copied_image(folder):
         (shutil.rmtree, "there is no folder"),
     ],
 )
-def test_what_is_wrong_is_named(folder, damage, said):
+def test_faults_are_named(folder, damage, said):
     damage(folder)
     with pytest.raises(UserError, match=said):
         list(map(opened(folder).example, range(FRAMES)))
@@ -216,8 +216,8 @@ def test_settings_that_do_not_fit_the_folder_are_named(whole, change, said):
         opened(whole, **change).example(0)
 
 
-def test_it_is_training_data(whole):
-    """Through the system: streamed, augmented in the workers, shapes as announced."""
+def test_streamed_frames_can_be_trained_on(whole):
+    """Streamed and augmented by workers; shapes as announced."""
     data = OpenLaneV2Data(
         whole, val="train", subset="B", image=NATIVE, example=SIZES, loading=StreamingConfig(threads=2, ahead=2)
     )

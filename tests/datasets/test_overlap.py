@@ -1,4 +1,4 @@
-"""The split checker: near is near within one city only, and files of both kinds are read."""
+"""The overlap of splits: distances within one city only, for both file formats."""
 
 import json
 
@@ -17,7 +17,7 @@ def drive(name, *positions, area="PIT"):
     return Drive(name, area, np.array(positions, float).reshape(-1, 2))
 
 
-def test_distances_are_those_on_paper():
+def test_distances_by_hand():
     train = [drive("a", (0, 0), (10, 0)), drive("b", (100, 0))]
     found = overlap(train, [drive("x", (13, 4), (40, 0)), drive("y", (100, 12))])
     np.testing.assert_allclose(found.distances[0], [5, 30])

@@ -1,4 +1,4 @@
-"""Colours change at random, everything else stays."""
+"""Photometric augmentation changes colours and nothing else."""
 
 import colorsys
 from dataclasses import replace
@@ -43,7 +43,7 @@ def test_views_change_on_their_own_and_nothing_else_changes():
     assert after.intrinsics is views.intrinsics
 
 
-def test_no_change_where_nothing_may_happen():
+def test_zero_strength_changes_nothing():
     np.testing.assert_array_equal(distorted(NOTHING), IMAGE)
     np.testing.assert_allclose(distorted(ALWAYS), IMAGE, atol=1)  # to hue and back
 
@@ -63,7 +63,7 @@ def test_brightness_adds_and_contrast_multiplies():
 
 @pytest.mark.parametrize("colour", [(180, 120, 90), (90, 60, 180), (180, 90, 95)])
 def test_saturation_and_hue_are_those_of_hsv(colour):
-    """The last colour lies next to where the circle of hues closes."""
+    """The last colour lies next to the wrap-around of hue."""
     pixel = np.array([[colour]], np.uint8)
     hue, saturation, value = colorsys.rgb_to_hsv(*pixel[0, 0] / 255)
     less = distorted(replace(ALWAYS, saturation=(0.5, 0.5)), image=pixel)[0, 0] / 255
@@ -97,7 +97,7 @@ def test_a_grid_hides_squares_of_the_mean_colour(seed):
     assert draw_grid(NOTHING, np.random.default_rng(seed), 60, 80) is None
 
 
-def test_a_grid_comes_as_often_as_it_should():
+def test_a_grid_is_drawn_with_its_probability():
     config = PhotometricConfig(grid_mask=0.7)
     drawn = [draw_grid(config, np.random.default_rng(seed), 50, 50) for seed in range(300)]
     assert 0.62 < np.mean([grid is not None for grid in drawn]) < 0.78

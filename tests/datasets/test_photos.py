@@ -1,4 +1,4 @@
-"""Photographs of any size and camera become LSTR's view."""
+"""Photographs of any size and camera are fitted to LSTR's view."""
 
 import numpy as np
 import pytest

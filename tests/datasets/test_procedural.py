@@ -1,3 +1,5 @@
+"""The built-in world as a dataset: splits, order of frames, determinism."""
+
 import pickle
 import re
 import sys
@@ -58,7 +60,7 @@ def test_frames_of_a_scene_follow_each_other(dataset):
 
 
 @pytest.mark.parametrize("index", [-1, 2 * CONFIG.world.keyframes])
-def test_there_is_nothing_outside(dataset, index):
+def test_indices_outside_the_dataset_are_errors(dataset, index):
     with pytest.raises(IndexError, match="procedural-val"):
         dataset.example(index)
 

@@ -85,8 +85,8 @@ def test_data_of_a_run_lead_to_their_source(data, kind, names):
         assert (source.data, source.config, source.example) == (type(data), type(config), kind)
 
 
-def test_the_split_counts_where_root_is_given(tmp_path, logs):
-    """TuSimple's --root took all training files whatever the split, Argoverse 2's all logs of all splits."""
+def test_root_does_not_override_the_split(tmp_path, logs):
+    """Regression: --root took all of TuSimple's training files, and all of Argoverse 2's logs, for every split."""
     for split in SPLITS:
         expected = TuSimpleConfig(str(tmp_path), split)
         assert chosen("--data", "tusimple", "--root", tmp_path, "--split", split, config=IMAGES) == expected
@@ -106,7 +106,7 @@ def test_the_split_counts_where_root_is_given(tmp_path, logs):
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_the_split_counts_in_made_data(split):
+def test_the_split_is_used_for_generated_data(split):
     scenes = {"train": 2000, "val": 100, "test": 200}[split]
     assert chosen("--split", split) == ProceduralConfig(split, scenes=scenes)
     assert chosen("--data", "world-cameras", "--split", split).split == split
@@ -142,7 +142,7 @@ def test_a_split_that_logs_do_not_have_is_refused(logs):
         ([], replace(RunConfig(), data=FrontViewData()), "data are images, but its task takes lane graphs"),
     ],
 )
-def test_what_does_not_fit_is_refused(arguments, config, message):
+def test_unsuitable_data_sources_are_refused(arguments, config, message):
     with pytest.raises(UserError, match=message):
         chosen(*arguments, config=config)
 

@@ -1,4 +1,4 @@
-"""Examples read while they are used: the same as from memory, whatever the workers."""
+"""Streamed examples equal those in memory, for any number of workers."""
 
 import dataclasses
 import threading
@@ -29,7 +29,7 @@ def in_memory():
 
 
 def shifted(example, key):
-    """Augment an example by where it stands: seed, step, place."""
+    """Augment an example by its seed, step and place in the batch."""
     seed, step, place = key
     lanes = example.lanes.replace(points=example.lanes.points + np.float32(100 * seed + 10 * step + place))
     return example.replace(lanes=lanes)
@@ -87,7 +87,7 @@ def test_an_error_in_a_worker_reaches_the_caller(threads):
         list(broken.stream(lambda number: Request(number, (0, 0, number)), 4))
 
 
-def test_what_is_not_needed_is_not_loaded():
+def test_unneeded_parts_are_not_loaded():
     loaded = []
 
     class Counting(FakeDataset):
@@ -106,7 +106,7 @@ def test_what_is_not_needed_is_not_loaded():
 
 
 @pytest.mark.parametrize("change", [{"threads": -1}, {"processes": -1}, {"ahead": 0}])
-def test_settings_that_cannot_work_are_named(change):
+def test_invalid_settings_are_named(change):
     source = dataclasses.replace(streamed(), config=StreamingConfig(**change))
     with pytest.raises(UserError, match=f"{next(iter(change))}="):
         next(source.stream(lambda number: Request(number, (0, 0, number)), 4))

@@ -1,3 +1,5 @@
+"""TuSimple's label files and images as a dataset."""
+
 import json
 import shutil
 from dataclasses import replace
@@ -119,7 +121,7 @@ def test_labels_without_their_images_are_refused():
 
 
 @pytest.mark.parametrize("index", [-1, 4])
-def test_there_is_nothing_outside(root, index):
+def test_indices_outside_the_dataset_are_errors(root, index):
     dataset = dataset_of(root)
     for read in (dataset.example, dataset.truth, dataset.raw_file, dataset.info):
         with pytest.raises(IndexError, match="tusimple-all has 4 examples"):

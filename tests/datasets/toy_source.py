@@ -1,4 +1,4 @@
-"""A dataset as a newcomer writes it: one file. `test_sources` adds its one entry to the list of sources."""
+"""A complete new dataset in one file. `test_sources` adds its one entry to the list of sources."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""From the scene's padded containers to what the metrics compare."""
+"""The scene's padded containers as inputs of the centerline metrics."""
 
 import dataclasses
 
@@ -64,7 +64,7 @@ def test_padding_changes_no_metric():
     assert result(np.nan) == result(np.float32(0.0))
 
 
-def test_detections_come_best_first_with_their_topology():
+def test_detections_are_sorted_by_score_with_their_topology():
     prediction = make_prediction()
     detections = detections_from_prediction(prediction)
     np.testing.assert_allclose(detections.scores, 1 / (1 + np.exp([-3.0, -0.5, 1.0, 200.0])), rtol=1e-6, atol=1e-9)
@@ -73,7 +73,7 @@ def test_detections_come_best_first_with_their_topology():
     np.testing.assert_allclose(detections.successor[0, 3], expected, rtol=1e-6)
 
 
-def test_elements_come_best_first_and_know_their_lanes():
+def test_elements_are_sorted_by_score_with_their_lanes():
     rng = np.random.default_rng(2)
     logits = np.full((3, 13), -5.0, np.float32)
     logits[[0, 1, 2], [4, 2, 12]] = -1.0, 2.0, 0.5
@@ -109,7 +109,7 @@ def _sure(edges):
     return np.where(edges, 9.0, -9.0).astype(np.float32)
 
 
-def test_device_arrays_are_taken_too():
+def test_device_arrays_are_accepted():
     prediction = make_prediction()
     on_device = CenterlinePrediction(
         *(jnp.asarray(leaf) for leaf in (prediction.points, prediction.logits, prediction.successor_logits))

@@ -1,4 +1,4 @@
-"""Training evaluates with every protocol that a prediction has parts for."""
+"""Every part of a prediction is measured by the protocols that apply to it."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ BOTH = EvaluationConfig(batch_size=2, versions=("v2.1", "v1.0"))
 
 
 def sure(flags):
-    """Return logits of near certainty."""
+    """Return logits whose probabilities are close to 0 or 1."""
     return np.where(flags, 9.0, -9.0).astype(np.float32)
 
 
@@ -51,7 +51,7 @@ def labelled(seed=0):
 
 @dataclass(frozen=True)
 class Oracle:
-    """Predicts the truth of the parts that it is asked for, or everything moved by `shift` metres."""
+    """Predicts the true values of the chosen parts, moved by `shift` metres."""
 
     parts: tuple[str, ...]
     shift: float = 0.0
@@ -87,7 +87,7 @@ def measured(parts, shift=0.0, config=BOTH):
     return evaluate_lanes(Oracle(parts, shift), {}, stack_examples([labelled(i) for i in range(3)]), config)
 
 
-def test_an_oracle_has_full_marks_in_every_protocol():
+def test_an_oracle_gets_the_full_score_in_every_protocol():
     metrics = measured(("centerlines", "segments", "lines", "elements"))
     found = metrics.compute()
     assert {"all", "occluded", "clear", "segments", "lanesegnet", "lines"} <= set(found)
@@ -101,7 +101,7 @@ def test_an_oracle_has_full_marks_in_every_protocol():
 
 
 @pytest.mark.parametrize("part", ["centerlines", "segments", "lines"])
-def test_only_what_is_predicted_is_measured_and_errors_cost(part):
+def test_only_predicted_parts_are_measured_and_errors_lower_the_score(part):
     near, far = measured((part,)).compute(), measured((part,), shift=30.0).compute()
     names = {"centerlines": ("all", "DET_l"), "segments": ("lanesegnet", "AP_ls"), "lines": ("lines", "mAP")}
     group, name = names[part]
@@ -119,7 +119,7 @@ def test_a_second_version_adds_columns_and_changes_none():
     assert {name: two[name] for name in one} == one
 
 
-def test_lines_without_labels_of_their_own_follow_from_segments_and_areas():
+def test_map_lines_without_labels_are_derived_from_segments_and_areas():
     example = labelled().replace(map_lines=None)
     crossings = np.asarray(example.areas.category) == AreaType.PEDESTRIAN_CROSSING
     points = np.asarray(example.areas.points)[crossings & example.areas.valid]
@@ -129,7 +129,7 @@ def test_lines_without_labels_of_their_own_follow_from_segments_and_areas():
     assert metrics.compute()["lines"]["AP_ped_crossing"] == (1.0 if len(points) else 0.0)
 
 
-def test_a_prediction_without_topology_is_measured_without_it():
+def test_predictions_without_topology_are_measured():
     example = fake_example(1)
     lanes = example.lanes
     found = []

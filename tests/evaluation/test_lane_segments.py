@@ -1,4 +1,4 @@
-"""From lane segments, areas and elements of the scene to what the lane-segment metrics compare."""
+"""Lane segments, areas and elements as inputs of the lane-segment metrics."""
 
 import dataclasses
 
@@ -107,7 +107,7 @@ def perfect(garbage=0.0, successor=None):
     return (centre, points[0], points[1], classes, scores, edges), found, truth
 
 
-def test_detections_come_best_first_and_crossings_become_areas():
+def test_detections_are_sorted_by_score_and_crossings_become_areas():
     (centre, left, right, classes, scores, edges), elements, _ = perfect()
     found = segment_detections(centre, left, right, classes, scores, edges, elements=elements)
     np.testing.assert_array_equal(found.lanes.scores, [0.9, 0.6, 0.3])
@@ -152,7 +152,7 @@ def test_padding_and_invalid_queries_change_nothing():
     assert results[0] == results[1]
 
 
-def test_nothing_at_all():
+def test_empty_input():
     empty = segment_truth(LaneGraph.empty(3, 5), Areas.empty(2, 9), TrafficElements.empty(2, 3))
     line = np.zeros((0, 5, 3))
     none = segment_detections(line, line, line, np.zeros(0, int), np.zeros(0), np.zeros((0, 0)))

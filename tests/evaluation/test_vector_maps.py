@@ -1,4 +1,4 @@
-"""From lane segments and areas of the scene, or plain arrays, to what MapTR's metric compares."""
+"""Lane segments and areas, or plain arrays, as inputs of MapTR's metric."""
 
 import dataclasses
 
@@ -112,7 +112,7 @@ def test_padded_lines_become_truth():
     np.testing.assert_array_equal(truth.points, np.stack([straight(1), straight(2)])[..., :2])
 
 
-def test_nothing_at_all():
+def test_empty_input():
     truth = map_truth(LaneGraph.empty(2, 5), Areas.empty(2, 5))
     none = map_detections(np.zeros((0, 5, 2)), np.zeros(0, int), np.zeros(0))
     result = score(none, truth)

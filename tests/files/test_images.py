@@ -54,7 +54,7 @@ def test_other_depths_and_channels_become_8_bit_rgb(tmp_path, pixels, expected):
 
 
 def test_photos_stand_upright(tmp_path):
-    """EXIF orientation 6: the camera was turned, the stored rows are the photo's columns."""
+    """EXIF orientation 6: the stored rows are the columns of the upright photo."""
     from PIL import Image
 
     stored = np.zeros((16, 32, 3), np.uint8)

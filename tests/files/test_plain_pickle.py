@@ -1,4 +1,4 @@
-"""Plain data comes out of a pickle as it went in; nothing else comes out, and nothing is run."""
+"""Plain data survive pickling; everything else is refused, and nothing is executed."""
 
 import collections
 import os
@@ -71,7 +71,7 @@ def test_anything_else_is_refused_and_not_run(tmp_path, monkeypatch, thing, name
     assert os.listdir(tmp_path) == ["evil.pkl"]
 
 
-def test_an_array_cannot_ask_for_memory(tmp_path):
+def test_the_size_that_an_array_claims_is_ignored(tmp_path):
     class Huge:
         def __reduce__(self):
             return np.zeros(0).__reduce__()[0], (np.ndarray, (10**15,), b"b")

@@ -1,4 +1,4 @@
-"""Pinhole cameras against the written-out formulas, and there and back again."""
+"""Pinhole cameras against the written-out formulas, and round trips."""
 
 import jax
 import jax.numpy as jnp

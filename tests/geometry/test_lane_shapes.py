@@ -1,4 +1,4 @@
-"""The lane shape model: ground curve, camera, image curve, and that they say the same."""
+"""The lane shape model: ground curve, camera and image curve agree."""
 
 import jax
 import jax.numpy as jnp

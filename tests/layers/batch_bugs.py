@@ -1,8 +1,8 @@
 """Two batch bugs of the published BEVFormer code, around our modules, which take one example at a time.
 
 The published code (BEVFormer, TopoNet, LaneSegNet, MapTR; in part OpenLane-V2's baseline and SMERF) mixes the elements
-of a batch up. Golden cases with several elements hold what it computes, so the harness mixes them up likewise: run our
-module by `vmap(..., axis_name=EXAMPLES)` inside `like_the_reference`.
+of a batch up. Golden cases with several elements hold what it computes, so the harness mixes them up in the same
+way: run our module by `vmap(..., axis_name=EXAMPLES)` inside `like_the_reference`.
 """
 
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ EXAMPLES = "examples"
 
 @contextmanager
 def like_the_reference(*, mixed_history: bool = True):
-    """Let the BEV attentions of an example read what the published code reads of the others in its batch.
+    """Let the BEV attentions of an example read what the published code reads of other examples in the batch.
 
     Spatial cross-attention takes the queries that a camera serves from the mask of batch element 0, and divides by the
     number of cameras that see a query in its own element. Temporal self-attention (`mixed_history`; not in

@@ -118,14 +118,14 @@ def test_rows_with_keys_match_the_library():
 
 
 @pytest.mark.usefixtures("either_way")
-def test_queries_without_keys_are_exactly_nothing():
+def test_queries_without_keys_are_exactly_zero():
     query, key, value, gradient = arrays(3, 6, 5)
     blind = np.array([1, 4])
     mask = random_mask(7, 6, 5).at[:, 2].set(True).at[blind].set(False)
     out, to_query, to_key, to_value = with_gradients(query, key, value, gradient, mask)
     assert not np.any(out[:, blind])
     assert not np.any(to_query[:, blind])
-    # They add nothing to the gradients of the others either.
+    # They contribute nothing to the gradients of keys and values.
     others = np.setdiff1d(np.arange(6), blind)
     rest = with_gradients(query[:, others], key, value, gradient[:, others], mask[others])
     np.testing.assert_allclose(to_key, rest[2], rtol=1e-5, atol=1e-6)
@@ -232,7 +232,7 @@ def module():
     return module, jax.tree.map(lambda x: x + 0.1, params), query, key
 
 
-def test_module_over_nothing_is_zero(module):
+def test_module_without_keys_is_zero(module):
     module, params, query, key = module
     assert not np.any(module.apply(params, query, key[:0], key[:0]))
     assert not np.any(module.apply(params, query, key, key, jnp.zeros((6, 5), bool)))

@@ -41,7 +41,7 @@ def bump(x, y):
 
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (2.0, 0.5, 0.0), (0.0, 0.0, 0.4), (1.5, -0.7, -0.6)])
-def test_what_stands_still_stays_at_its_place_in_the_world(motion):
+def test_static_features_keep_their_place_in_the_world(motion):
     """A bump at p in the present frame was at pose(p) in the previous one; both alignments must bring it back."""
     pose = yaw_pose(*(np.float32(v) for v in motion)).astype(np.float32)
     now = np.array([3.0, 1.0, 0.0, 1.0])

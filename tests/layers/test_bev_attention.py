@@ -121,7 +121,7 @@ def run(variables, query, features, reference, visible, capacity=None):
     return both(variables["params"], query, features, reference, jnp.asarray(visible), capacity)
 
 
-def test_enough_capacity_changes_nothing_and_too_little_is_told(variables):
+def test_enough_capacity_changes_nothing_and_too_little_is_reported(variables):
     query, features, reference, visible = scene()
     counts = visible.any(-1).sum(1)
     (dense, _), by_dense = run(variables, query, features, reference, visible)
@@ -129,7 +129,7 @@ def test_enough_capacity_changes_nothing_and_too_little_is_told(variables):
     np.testing.assert_allclose(compact, dense, atol=1e-6)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), by_compact, by_dense)
     assert sown["overflow"] == (0,)
-    # The third query's share of what no camera sees is the bias alone.
+    # A query that no camera sees gets the bias of the projection alone.
     np.testing.assert_array_equal(dense[3], variables["params"]["output_proj"]["bias"])
     scarce = int(counts.max()) - 1
     (_, sown), _ = run(variables, query, features, reference, visible, scarce)
@@ -137,7 +137,7 @@ def test_enough_capacity_changes_nothing_and_too_little_is_told(variables):
 
 
 @pytest.mark.parametrize("capacity", [None, 5])
-def test_cameras_have_no_order_and_unseen_places_no_say(variables, capacity):
+def test_camera_order_and_unseen_places_change_nothing(variables, capacity):
     query, features, reference, visible = scene()
     (out, _), gradients = run(variables, query, features, reference, visible, capacity)
     order = jnp.array([2, 0, 1])

@@ -54,7 +54,7 @@ def test_few_queries(queries):
 
 
 def test_heads_look_around_their_own_points():
-    """With one reference point per head, a head's point far outside silences that head alone."""
+    """With one reference point for each head, a point far outside makes only that head zero."""
     module = DeformableAttention(4, heads=2, points=1)
     rng = np.random.default_rng(1)
     value, query = (jnp.asarray(rng.normal(size=(n, 4)).astype(np.float32)) for n in (36, 1))

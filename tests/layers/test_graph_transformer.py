@@ -1,4 +1,4 @@
-"""Graph Transformer Networks against the reference's numbers, and what its degree normalisation promises."""
+"""Graph Transformer Networks against the reference's numbers, and the properties of its degree normalisation."""
 
 from dataclasses import replace
 from functools import partial
@@ -195,8 +195,8 @@ def test_gradients_match_finite_differences():
 
 
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS)
-def test_nodes_that_nobody_speaks_to_have_finite_gradients(variant):
-    """The reference divides 0 by 0 there."""
+def test_nodes_without_incoming_edges_have_finite_gradients(variant):
+    """The reference divides 0 by 0 for such nodes."""
     adjacency = random_graphs(3, 3, 6, 6).at[:, 2].set(0.0).at[:, :, 2].set(0.0)
     model = GraphTransformer(4, layers=3, variant=variant)
     x = random_graphs(4, 6, 5)

@@ -26,7 +26,7 @@ def random_array(seed, *shape):
 
 
 def senders(relation, i, j, valid):
-    """The cells that cell (i, j) hears, without the rule for those that hear nobody."""
+    """Return the source cells of cell (i, j), without the self-loop of cells that have none."""
     height, width = valid.shape
     if relation in ("row", "column"):
         line = [(i, b) for b in range(width)] if relation == "row" else [(a, j) for a in range(height)]
@@ -89,8 +89,8 @@ _mix_all = jax.jit(lambda s, x, v: mix_relations(RELATIONS, s, x, v))
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6))
-def test_mixtures_keep_what_all_cells_share(seed):
-    """Rows sum to 1: a constant stays, whatever the shares and wherever there is padding."""
+def test_mixtures_keep_a_constant(seed):
+    """Rows sum to 1: a constant stays for all mixing weights and any padding."""
     valid = random_valid(seed)
     shares = jax.nn.softmax(3 * random_array(seed, len(RELATIONS), 2), axis=0)
     constant = jnp.where(valid[..., None], jnp.asarray([2.0, -1.0]), 0.0)

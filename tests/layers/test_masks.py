@@ -30,7 +30,7 @@ def test_pairs(queries, keys):
 @pytest.mark.parametrize(("lanes", "traffic"), [(4, 3), (1, 1), (0, 2), (3, 0)])
 @pytest.mark.parametrize("host", ["no mask", "own mask"])
 def test_spatial_mask_entry_by_entry(lanes, traffic, host):
-    """A lane sees what the host lets it see and valid instances; a valid instance sees all lanes and its like."""
+    """Lanes attend to the lanes of the host's mask and to valid instances; valid instances to lanes and each other."""
     valid = random_bool(2, traffic)
     lane_mask = random_bool(3, lanes, lanes) if host == "own mask" else None
     dense = np.asarray(SpatialMask.from_validity(lanes, valid, lane_mask).dense())
@@ -44,7 +44,7 @@ def test_spatial_mask_entry_by_entry(lanes, traffic, host):
             assert dense[i, j] == expected, (i, j)
 
 
-def test_spatial_mask_goes_through_vmap_and_takes_quadrants_of_ones_own():
+def test_spatial_mask_works_under_vmap_and_takes_custom_quadrants():
     valid = random_bool(4, 5, 3)
     batch = jax.vmap(lambda v: SpatialMask.from_validity(2, v))(valid)
     assert batch.lane_lane is None
@@ -57,7 +57,7 @@ def test_spatial_mask_goes_through_vmap_and_takes_quadrants_of_ones_own():
     np.testing.assert_array_equal(swapped.dense()[:2, 2:], near)
 
 
-def test_no_quadrant_that_nobody_uses_is_built():
+def test_unused_quadrants_are_not_built():
     """4,000 x 4,000 lanes without a mask of the host's own must not cost 16 MB."""
     mask = SpatialMask.from_validity(4000, random_bool(6, 30))
     assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 2 * 30
@@ -65,7 +65,7 @@ def test_no_quadrant_that_nobody_uses_is_built():
 
 @settings(deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.5, 20.0))
-def test_a_place_sees_the_lines_that_pass_within_reach(seed, radius):
+def test_a_place_attends_to_lines_within_the_radius(seed, radius):
     rng = np.random.default_rng(seed)
     places, lines, valid = rng.uniform(-20, 20, (6, 2)), rng.uniform(-20, 20, (4, 5, 2)), np.arange(4) < 3
     expected = np.array(

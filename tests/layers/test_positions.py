@@ -38,7 +38,7 @@ def test_sine_encoding_matches_the_reference(path, variant):
 
 @pytest.mark.golden
 @pytest.mark.parametrize("path", golden_modules("pe_sine2d*"), ids=case_id)
-def test_every_variant_of_the_encoding_is_known(path):
+def test_every_golden_variant_of_the_encoding_is_supported(path):
     assert load_module_case(path).outputs.keys() <= VARIANTS.keys() | {"learned"}
 
 

@@ -113,7 +113,7 @@ def test_each_view_has_its_own_value_as_if_mapped():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
-def test_a_place_that_is_none_gives_nothing_and_stops_no_gradient(bad):
+def test_non_finite_places_give_zero_and_finite_gradients(bad):
     value, locations, weights = arrays()
     spoiled = locations.at[2, 1, 0, 1].set(bad).at[4].set(bad)
     masked = weights.at[2, 1, 0, 1].set(0.0).at[4].set(0.0)

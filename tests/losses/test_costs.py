@@ -38,7 +38,7 @@ def test_box_costs(path):
     corners = np.stack([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], 1)
     iou = jax.jit(lambda a, b: generalised_iou(a[:, None], b[None]))(corners, truth)
     np.testing.assert_allclose(-iou, case.outputs["giou"], rtol=2e-5, atol=2e-5)
-    # Elements on an image of one pixel: boxes are shares of it, and the two other terms are switched off.
+    # Elements on an image of one pixel: boxes are fractions of it, and the two other terms are switched off.
     count = len(truth)
     logits = np.zeros((1, *case.inputs["cls_pred"].shape), np.float32)
     prediction = ElementPrediction(corners[None], logits, np.zeros((1, 1, 1)))

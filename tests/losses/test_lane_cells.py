@@ -1,4 +1,4 @@
-"""Which BEV cells lanes run through, and the auxiliary loss on them."""
+"""BEV cells through which lanes pass, and the auxiliary loss on them."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def test_a_lane_fills_the_cells_that_it_runs_through():
     np.testing.assert_allclose(cells.direction[expected], [[1.0, 0.0]] * 4, atol=1e-6)
 
 
-def test_cells_beside_a_lane_say_where_it_is():
+def test_cells_beside_a_lane_hold_the_offset_to_it():
     cells = lane_cells(graph([[0.0, 1.75, 0], [8.0, 1.75, 0]]), SHAPE, RANGE)
     np.testing.assert_array_equal(cells.near, [[True] * 8] * 3 + [[False] * 8])
     np.testing.assert_allclose(cells.offset[:3, :, 1], np.repeat([[1.25], [0.25], [-0.75]], 8, 1), atol=1e-6)
@@ -48,7 +48,7 @@ def test_offsets_are_in_cells_and_directions_in_metres():
     np.testing.assert_allclose(cells.offset[1, 0], [0.2, -0.1], atol=1e-6)
 
 
-def test_the_nearer_of_two_lanes_speaks_and_those_outside_fill_nothing():
+def test_the_nearer_of_two_lanes_counts_and_lanes_outside_fill_no_cell():
     cells = lane_cells(
         graph([[0.0, 0.5, 0], [8.0, 0.5, 0]], [[8.0, 3.0, 0], [0.0, 3.0, 0]], [[0.0, 4.5, 0], [-3.0, -1.0, 0]]),
         SHAPE,
@@ -70,7 +70,7 @@ def test_padding_changes_nothing():
 
 
 @pytest.mark.parametrize("lanes", [graph(), graph(capacity=0)], ids=["none valid", "no room"])
-def test_no_lane_is_learned_too(lanes):
+def test_a_scene_without_lanes_has_a_gradient(lanes):
     said = jnp.zeros((*SHAPE, CELL_CHANNELS))
     assert lane_cell_loss(said, lanes, RANGE) == pytest.approx(0.5 * np.log(2.0))
     assert (jax.grad(lane_cell_loss)(said, lanes, RANGE)[..., 0] > 0).all()

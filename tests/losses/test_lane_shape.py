@@ -1,4 +1,4 @@
-"""The fitting loss: padding, permutations, gradients, and what the matcher is told."""
+"""The fitting loss: padding, permutations, gradients, and matching costs."""
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ def test_padding_changes_nothing():
     jax.tree.map(np.testing.assert_array_equal, clean, soiled)
 
 
-def test_a_line_without_points_is_none():
+def test_a_line_without_points_is_no_target():
     truth = lines(count=3)
     without = truth.replace(valid=truth.valid.at[:, 2].set(False))
     pointless = truth.replace(point_valid=truth.point_valid.at[:, 2].set(False))
@@ -89,7 +89,7 @@ def test_gradient_is_that_of_finite_differences():
     )
 
 
-def test_a_perfect_prediction_costs_nothing_but_doubt():
+def test_a_perfect_prediction_costs_only_its_class_loss():
     truth = lines(batch=1, count=2)
     slopes = [(truth.points[0, i, -1] - truth.points[0, i, 0])[0] / 0.55 for i in range(2)]
     curves = np.zeros((1, 1, QUERIES, 8), np.float32)
@@ -105,7 +105,7 @@ def test_a_perfect_prediction_costs_nothing_but_doubt():
     assert float(terms["matching/lanes"]) == 2
 
 
-def test_lines_share_the_highest_row_where_asked():
+def test_lines_share_the_highest_row_if_configured():
     truth = lines()
     shared, own = (lane_shape_targets(truth, shared_horizon=flag).extent for flag in (True, False))
     assert (np.ptp(shared[:, :3, 0], axis=1) == 0).all()

@@ -139,7 +139,7 @@ def test_padding_changes_nothing():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(clean))
 
 
-def test_control_points_are_compared_where_asked_for():
+def test_control_points_are_compared_if_configured():
     prediction, lanes, _ = make_elements(4, (0, 0, 0), related=LAYERS)
     one = jax.tree.map(lambda leaf: leaf[0], (prediction.centerlines, lanes))
     config = TopoNetLossConfig(class_weight=0.0, points_weight=1.0)

@@ -1,4 +1,4 @@
-"""Curves over distance: the scenes are what they claim to be, and rows are what the sightings say."""
+"""Detection curves over distance: the scenes, and the summary rows of their sightings."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def test_boards_are_found_at_their_places_by_each_detector():
     assert all(tag.found for tag in tags)
 
 
-def test_rows_say_what_the_sightings_say():
+def test_rows_summarise_the_sightings():
     here = [
         Sighting(0, 0.0, 10.0, True, 50.0, np.array([3.0, 4.0, 0.0]), 1.0, 30.0, 0.1, 0.2),
         Sighting(0, 0.0, 10.0, True, 70.0, np.array([-1.0, 0.0, 0.0]), 40.0, 2.0, 0.3, 0.9),
@@ -71,7 +71,7 @@ def test_rows_say_what_the_sightings_say():
         replace(SMALL, mounts=()),
     ],
 )
-def test_configs_that_mean_nothing_are_refused(config):
+def test_invalid_configs_are_refused(config):
     with pytest.raises(UserError, match="markers are measured"):
         measure([config])
 

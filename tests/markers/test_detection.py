@@ -1,4 +1,4 @@
-"""Markers in drawn images: found where they are, scored as stated, whatever stands in padding."""
+"""Detection in rendered images: poses, scores, and independence of padding."""
 
 from dataclasses import replace
 
@@ -105,7 +105,7 @@ def test_an_id_outside_the_family_is_refused(marker_id):
 
 @pytest.mark.parametrize("family", [ARUCO, APRILTAG])
 @pytest.mark.parametrize("place", [(6.0, -1.5, 2.4, 0.0), (12.0, 2.0, 3.0, 30.0), (20.0, -3.0, 3.0, -50.0)])
-def test_a_marker_is_found_where_it_is(family, place):
+def test_a_marker_is_found_at_its_pose(family, place):
     truth = pose(*place)
     found = detect(views((AHEAD, photo(AHEAD, {42: truth}, family))), DetectorConfig(family=family, capacity=3))
     assert found.valid.tolist() == [True, False, False]
@@ -164,7 +164,7 @@ def test_padding_and_missing_views_change_nothing():
     assert set(find_markers(image[0]).marker_id) == {8, 9}
 
 
-def test_the_best_scores_stay_where_there_is_no_room():
+def test_the_best_scores_stay_when_capacity_is_short():
     places = {5: pose(30.0, 4.0, 2.5), 6: pose(8.0, -2.0, 2.5), 7: pose(18.0, 0.0, 2.0)}
     frame = views((AHEAD, photo(AHEAD, places)))
     whole, short = detect(frame), detect(frame, DetectorConfig(capacity=2))
@@ -175,7 +175,7 @@ def test_the_best_scores_stay_where_there_is_no_room():
 
 
 @pytest.mark.parametrize("shape", [(0, 0, 3), (1, 1, 3), (7, 900, 3), (60, 60, 3), (60, 60)])
-def test_nothing_is_found_where_nothing_is(shape):
+def test_images_without_markers_give_no_detections(shape):
     found = find_markers(np.full(shape, 90, np.uint8))
     assert [len(column) for column in found] == [0, 0, 0]
     assert found.corners.shape == (0, 4, 2)
@@ -257,7 +257,7 @@ def test_the_prior_decides_where_both_poses_fit():
     assert doubtful > 0
 
 
-def test_refinement_finds_its_way_back_and_stays_where_there_is_no_pattern():
+def test_refinement_corrects_moved_corners_and_stays_without_a_pattern():
     truth = pose(12.0, 0.3, 2.0, 25.0)
     grey = photo(AHEAD, {21: truth}).mean(-1).astype(np.uint8)
     expected = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
@@ -269,7 +269,7 @@ def test_refinement_finds_its_way_back_and_stays_where_there_is_no_pattern():
     assert np.abs(refine_corners(noise, guess, cells) - guess).max() < 0.6 * 10.5  # cells, pixels of a cell
 
 
-def test_what_hides_a_part_of_the_board_moves_the_corners_little():
+def test_partial_occlusion_moves_the_corners_little():
     """A post before the right margin, as dark as the square."""
     truth = pose(12.0, 0.3, 2.0)
     image = photo(AHEAD, {21: truth})
@@ -308,13 +308,13 @@ def test_outline_is_upper_left_first():
         {"turn": -1.0},
     ],
 )
-def test_settings_that_mean_nothing_are_refused(change):
+def test_invalid_settings_are_refused(change):
     with pytest.raises(UserError, match=next(iter(change))):
         find_markers(np.zeros((60, 60), np.uint8), DetectorConfig(**change))
 
 
 @pytest.mark.parametrize("x", [4.0, 15.0, 39.7])
-def test_a_marker_straight_before_the_camera_has_a_pose(x):
+def test_a_marker_that_exactly_faces_the_camera_has_a_pose(x):
     """Seen exactly from the front, where OpenCV's solution is not a number."""
     truth = pose(x, 0.0, 1.5)
     corners = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)

@@ -40,7 +40,7 @@ def rows_of(markers):
     return {int(i): row for row, i in enumerate(markers.marker_id) if markers.valid[row]}
 
 
-def test_lanes_lie_where_the_pose_says():
+def test_lanes_are_placed_by_the_pose():
     """The vehicle at the map's origin, and one that is elsewhere and sees the same."""
     here = observe(detect(PLACED.pose), STORE, RANGE, **SIZES).markers
     here.validate()
@@ -70,7 +70,7 @@ def test_a_successor_needs_the_joint_in_range():
     assert not shifted.successor.any()
 
 
-def test_no_room():
+def test_beyond_capacity_the_farthest_are_dropped():
     detected = detect(PLACED.pose)
     all_ = observe(detected, STORE, RANGE, **SIZES)
     assert (all_.markers_dropped, all_.lanes_dropped) == (0, 0)
@@ -108,7 +108,7 @@ def test_unknown_ids_are_left_out_and_counted():
         assert not observe(detect(PLACED.pose), MarkerStore({}), RANGE, **SIZES).markers.valid.any()
 
 
-def test_of_one_id_seen_twice_the_better_counts():
+def test_the_better_of_two_detections_of_one_id_counts():
     poses = np.stack([PLACED.pose[0], PLACED.pose[1], PLACED.pose[0]])
     observed = observe(detect(poses, (5, 5, 5), score=[0.2, 0.9, 0.3]), STORE, RANGE, **SIZES).markers
     assert observed.valid.tolist() == [True, False, False]
@@ -166,7 +166,7 @@ def test_a_marker_without_lanes_has_the_residual_of_its_place():
 
 @given(st.floats(-60, 60), st.floats(-60, 60), st.floats(-np.pi, np.pi))
 @settings(max_examples=40, deadline=None)
-def test_whatever_the_pose_lanes_stay_in_range(x, y, yaw):
+def test_lanes_stay_in_range_for_any_pose(x, y, yaw):
     move = yaw_pose(np.array([x]), np.array([y]), np.array([yaw]))
     markers = observe(detect(move @ PLACED.pose), STORE, RANGE, **SIZES).markers
     markers.validate()

@@ -34,14 +34,14 @@ def markers_at(*distances, facing=np.pi):
 
 
 def standing(frames=1, *, boxes=((-30.0, 0.0, 0.75),), vector_map=MAP, **other):
-    """A log of a vehicle that stands at the map's origin; key frames at all frames."""
+    """A log of a static vehicle at the map's origin; every frame is a key frame."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     recorded = tracks(np.tile(np.array(boxes, float).reshape(1, -1, 3), (frames, 1, 1)))
     return log(vector_map, recorded, poses, list(enumerate(poses)), **other)
 
 
 def copies(distance, count):
-    """Return markers with ids of their own in one place: what is drawn for each is independent."""
+    """Return markers with distinct ids at one place, so that their random draws are independent."""
     return PlacedMarkers(np.arange(count), np.repeat(markers_at(distance).pose, count, 0))
 
 
@@ -138,7 +138,7 @@ def test_road_users_and_buildings_hide_markers():
     assert simulate_detections(house, house.keyframes[0], placed, config).valid.tolist() == [True, False]
 
 
-def test_what_is_drawn_depends_on_seed_frame_and_id_alone():
+def test_random_draws_depend_on_seed_frame_and_id_only():
     placed, config = markers_at(10.0, 20.0, 30.0, 40.0), NOISY
     scene = standing(3, seed=9)
     together = simulate_detections(scene, scene.keyframes[1], placed, config)
@@ -171,7 +171,7 @@ def test_scores_come_from_their_range():
     assert 0.68 < drawn.max() <= 0.7
 
 
-def test_with_which_moment_the_residual_compares():
+def test_the_residual_compares_with_the_configured_moment():
     scene = standing(20)  # frames 0.1 s apart, each a key frame
     assert moment_before(scene, 12, 0.5).track_frame == 7
     assert moment_before(scene, 12, None).track_frame == 11

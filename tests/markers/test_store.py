@@ -66,7 +66,7 @@ def test_lanes_within_the_radius_are_cut_at_the_circle():
 
 
 def test_lanes_are_in_the_frame_of_the_marker():
-    """In front of a marker is +z, to the right of one who looks at it +x, and the road lies below (-y)."""
+    """+z points out of the marker, +x to the right seen from the front, and the road lies below (-y)."""
     facing_x = PlacedMarkers(np.array([3]), marker_pose(np.array([[10.0, 5.0, 3.0]]), np.array([0.0])))
     lanes = lane_map(segment(1, [(12, 5), (30, 8)])).segments
     (line,) = store_of(lanes, facing_x, points=2).markers[3].lanes
@@ -83,7 +83,7 @@ def test_no_stored_point_lies_outside_the_circle(radius, x, y):
         np.testing.assert_allclose(marker.lanes[i, -1], marker.lanes[j, 0], atol=1e-9)
 
 
-def test_stores_of_nothing():
+def test_empty_stores():
     assert store_of(fork(), placed()).markers == {}
     empty = store_of({}, placed((0, 0, 3))).markers[0]
     assert empty.lanes.shape[0] == 0
@@ -153,7 +153,7 @@ def saved(tmp_path):
         (lambda r: r["markers"].append(3), "markers[2] is of type int"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_named(tmp_path, change, message):
+def test_faults_in_a_file_are_named(tmp_path, change, message):
     record = saved(tmp_path)
     change(record)
     path = tmp_path / "wrong.json"
@@ -163,7 +163,7 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path, change, message):
     assert str(path) in str(error.value)
 
 
-def test_files_that_are_none(tmp_path):
+def test_other_files_are_refused(tmp_path):
     with pytest.raises(UserError, match="cannot read"):
         load_store(tmp_path / "absent.json")
     (tmp_path / "half.json").write_text(json.dumps(saved(tmp_path))[:400])
@@ -199,7 +199,7 @@ def test_unknown_ids_give_no_prior_and_are_counted():
     assert len(caught) == 1
     assert looked.found == (None, store.markers[3], None)
     assert (looked.unknown, looked.stale) == (2, 0)
-    # Nothing to say where all are known, and Python shows the warning once.
+    # No warning if all ids are known; Python shows the warning once.
     look_up(store, [3])
     assert look_up(store, []).found == ()
     with warnings.catch_warnings(record=True) as shown:

@@ -57,7 +57,7 @@ def hand_frame() -> tuple[LaneDetections, LaneTruth]:
 
 
 def random_frame(seed: int, lanes: int = 6, detections: int = 12) -> tuple[LaneDetections, LaneTruth]:
-    """Return ragged lanes within 40 m and detections of which about half lie near one of them."""
+    """Return ragged lanes within 40 m and detections about half of which lie near a lane."""
     rng = np.random.default_rng(seed)
 
     def line(near=None):

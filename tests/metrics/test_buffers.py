@@ -41,7 +41,7 @@ def test_by_hand(a, b, expected):
     assert touch(a, b) == expected
 
 
-def test_pairs_are_told_apart():
+def test_pairs_are_independent():
     lines = np.array([[(0, 0), (10, 0)], [(0, 30), (10, 30)], [(0, 3), (10, 3)]], float)
     i, j = np.nonzero(np.ones((3, 3)))
     expected = [[True, False, True], [False, True, False], [True, False, True]]

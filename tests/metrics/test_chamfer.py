@@ -74,7 +74,7 @@ def test_twins_are_resampled_alike_to_the_last_bit():
     np.testing.assert_array_equal(points[0], points[2])
 
 
-def test_nothing_and_what_cannot_be_measured():
+def test_empty_and_invalid_input():
     none = PaddedLines.of([], "none", 2)
     one = PaddedLines.of([np.zeros((3, 2))], "one", 2)
     assert [len(x) for x in near_pairs(none, one, 1.0)] == [0, 0]

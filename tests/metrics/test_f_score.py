@@ -30,12 +30,12 @@ def test_golden(case):
     result = evaluate([frame[:2] for frame in load_frames(case)])["F_score"]
     low, high = expected["F_score_range_over_equal_cost_matchings"]
     assert low - 1e-9 <= result <= high + 1e-9
-    if high - low < 1e-9:  # elsewhere several pairings cost the same, and the official solver's choice is its own
+    if high - low < 1e-9:  # other cases have pairings of equal cost, of which the official solver picks another
         assert result == pytest.approx(expected["v2_1"]["F_score"], abs=1e-9)
 
 
 def by_loop(detections, truth):
-    """The rules of docs/reference/metrics.md section 2.7, word by word."""
+    """The rules of docs/reference/metrics.md, section 2.7, as plain loops."""
     samples = np.arange(-50, 50)
 
     def sampled(lines):
@@ -139,7 +139,7 @@ def test_no_frames():
     assert evaluate([]) == {"frames": 0, "F_score": 0.0, "F_recall": 0.0, "F_precision": 0.0}
 
 
-def test_lines_that_cannot_be_measured():
+def test_lines_that_cannot_be_measured_are_errors():
     with pytest.raises(UserError, match="detections: line 0 has a coordinate that is not finite"):
         score([along((0, 9))], [along((0, np.inf))])
     with pytest.raises(UserError, match="truth: polyline 0 has no points"):

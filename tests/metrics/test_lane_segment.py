@@ -208,13 +208,13 @@ def test_arrays_may_be_reused_after_an_update():
     assert metrics.compute() == expected
 
 
-def test_nothing_at_all():
+def test_empty_input():
     assert evaluate([])["DET_l"] == 1.0
     assert evaluate([frame([], [], [])])["DET_a"] == 1.0
     assert "OLUS" not in evaluate([])
 
 
-def test_what_does_not_fit_is_named():
+def test_mismatched_shapes_are_named():
     detections, truth = frame([0.0], [0.0], [0.9])
     with pytest.raises(UserError, match="detections: 1 centerlines, 0 left lines, 1 right lines"):
         evaluate([(dataclasses.replace(detections, left=[]), truth)])

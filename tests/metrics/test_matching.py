@@ -35,7 +35,7 @@ def test_greedy_match_equals_the_loop(seed, count):
     np.testing.assert_array_equal(greedy_match(distance < threshold, nearest, scores), match_by_loop(*args))
 
 
-def test_no_second_choice():
+def test_a_detection_is_matched_with_its_nearest_truth_only():
     taken = greedy_match(np.array([0.1, 0.2, 1.0]) < 1.0, np.array([0, 0, 1]), np.array([0.5, 0.9, 0.7]))
     np.testing.assert_array_equal(taken, [-1, 0, -1])
 
@@ -100,7 +100,7 @@ def test_vertex_precision(edges, confidence, expected):
 
 
 def levels_by_loop(scores, taken):
-    """The cut-offs of docs/reference/metrics.md section 2.6, word by word (scores in descending order)."""
+    """The cut-offs of docs/reference/metrics.md, section 2.6, as a loop (scores in descending order)."""
     n, kept = len(scores), []
     found = np.cumsum(taken >= 0)
     for r in range(1, 11):

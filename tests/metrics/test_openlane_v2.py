@@ -50,7 +50,7 @@ def test_golden_totals(case, version):
 @pytest.mark.parametrize("versions", [("v2.1", "v1.0"), ("v1.0", "v2.1")])
 @pytest.mark.parametrize("case", CASES)
 def test_golden_versions_side_by_side(case, versions):
-    """One pass gives the official numbers of both versions, to the last bit those of a pass for each."""
+    """One pass gives the official numbers of both versions, bit-identical to one pass for each."""
     frames = [frame[:2] for frame in load_frames(case)]
     both = evaluate(frames, CenterlineMetrics(versions))
     first, second = (evaluate(frames, CenterlineMetrics((version,))) for version in versions)
@@ -198,7 +198,7 @@ def test_merge_equals_one_pass_and_order_of_detections_is_free(seed, version):
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6))
-def test_groups_share_out_lanes_vertices_and_detections(seed):
+def test_groups_partition_lanes_vertices_and_detections(seed):
     frames = [match_frame(*random_frame(seed + i)) for i in range(3)]
     for i, frame in enumerate(frames):
         occluded = np.asarray(random_frame(seed + i)[1].visibility) < 0.5
@@ -220,7 +220,7 @@ def test_perfect_detections():
     assert evaluate([(dataclasses.replace(perfect, points=shuffled), truth)])["TOP_ll"] < 1.0
 
 
-def test_nothing_at_all():
+def test_empty_input():
     none = LaneDetections(np.zeros((0, 11, 3)), np.zeros(0), np.zeros((0, 0)))
     empty = LaneTruth(np.zeros((0, 11, 3)), np.zeros((0, 0), bool), np.zeros(0))
     for metrics in (CenterlineMetrics().compute(), evaluate([(none, empty)])):

@@ -128,7 +128,7 @@ def test_the_order_of_lanes_does_not_matter(seed, g, p):
     assert shuffled == pytest.approx(expected, abs=1e-12)
 
 
-def test_merged_accumulators_are_one():
+def test_merged_accumulators_equal_one_pass():
     rng = np.random.default_rng(0)
     frames = [(RowLanes(rng.uniform(0, 99, (3, 10))), RowLanes(rng.uniform(0, 99, (4, 10)), ROWS)) for _ in range(5)]
     whole, a, b = TuSimpleMetrics(), TuSimpleMetrics(), TuSimpleMetrics()
@@ -149,7 +149,7 @@ def test_merged_accumulators_are_one():
         (upright(1), upright(1), None, "h_samples"),
     ],
 )
-def test_what_does_not_fit_is_named(found, true, rows, message):
+def test_mismatched_shapes_are_named(found, true, rows, message):
     with pytest.raises(UserError, match=message):
         score_image(RowLanes(found), RowLanes(true, rows))
 

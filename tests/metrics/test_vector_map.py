@@ -19,8 +19,8 @@ KEYS: dict[Sampling, str] = {
     "as_given": "chamfer_no_pred_resampling",
 }
 CASES = list(expected_cases("maptr"))
-# Without resampling the official program needs one number of points for all detections, and nobody has computed what a
-# stable order gives where scores tie.
+# Without resampling the official program needs one number of points for all detections, and it gives no numbers for a
+# stable order of equal scores.
 TOTALS = [
     (case, sampling)
     for case, expected in expected_cases("maptr").items()
@@ -112,7 +112,7 @@ def test_classes_do_not_mix():
     assert (result["mAP"], result["mAP@0.5"]) == pytest.approx((1 / 3, 1 / 2))
 
 
-def test_no_second_choice():
+def test_a_detection_is_matched_with_its_nearest_truth_only():
     # Both detections are nearest to the first line (0.1 and 0.2 m); the other line is 0.3 m from the second.
     result = evaluate([frame([line(0), line(0.5)], [line(-0.1), line(0.2)], [0.9, 0.8])])
     assert result["AP_divider@0.5"] == 0.5
@@ -126,7 +126,7 @@ def test_pieces_end_to_end_are_not_compared():
     assert evaluate([beside])["AP_divider@1.5"] == 1.0
 
 
-def test_points_vanish_and_lines_without_length_stay():
+def test_single_points_are_dropped_and_lines_without_length_stay():
     point, still = line(0, (5.0,)), line(0, (5.0, 5.0))
     assert evaluate([frame([line(0)], [point, line(0)], [0.9, 0.8])])["AP_divider"] == 1.0
     assert evaluate([frame([line(0)], [still, line(0)], [0.9, 0.8])])["AP_divider"] == 0.5
@@ -170,7 +170,7 @@ def test_order_is_free_and_parts_merge(seed, sampling):
         assert evaluate([one], sampling) == evaluate([other], sampling)
 
 
-def test_nothing_at_all():
+def test_empty_input():
     none = frame([], [], [])
     for result in (evaluate([]), evaluate([none])):
         assert result["mAP"] == 0.0

@@ -67,7 +67,7 @@ def levels(seed=0, cameras=3):
 @pytest.fixture(scope="module")
 def variables():
     fresh = jax.jit(lambda: MODEL.init(jax.random.key(0), levels(), ring(), None, jnp.eye(4)))()
-    # Away from the initial zeros: queries decide where they look and how much they take.
+    # Not the initial zeros, so that offsets and attention weights depend on the query.
     leaves, tree = jax.tree.flatten(fresh)
     rng = np.random.default_rng(1)
     return jax.tree.unflatten(tree, [leaf + 0.1 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves])
@@ -86,7 +86,7 @@ def memory():
 POSE = yaw_pose(np.float32(1.5), np.float32(-0.3), np.float32(0.2)).astype(np.float32)
 
 
-def test_a_memory_tells_something_and_an_invalid_one_nothing(encode, variables, memory):
+def test_a_valid_memory_changes_the_features_and_an_invalid_one_does_not(encode, variables, memory):
     with_memory = encode(levels(), ring(), memory, POSE)
     nothing = encode(
         levels(), ring(), BevMemory(np.full((5, 10, 8), np.nan, np.float32), np.array(False)), POSE * np.nan
@@ -173,7 +173,7 @@ def test_levels_and_cameras_must_fit_the_configuration(variables):
 
 
 def test_smaller_images_lie_in_the_corner_of_their_array():
-    """In an array twice as wide and high, the same pixels lie at half the share of it."""
+    """In an array twice as wide and high, the same pixels have half the normalised coordinates."""
     views = ring()
     reference, visible = see_pillars(CONFIG, views)
     larger = views.replace(image=np.zeros((3, 96, 128, 3), np.uint8))

@@ -1,4 +1,4 @@
-"""TopoNet and BEVFormer-DETR on cameras: what must not matter does not, memory, dropout, losses."""
+"""TopoNet and BEVFormer-DETR on cameras: padding, memory, dropout, losses."""
 
 import dataclasses
 import functools
@@ -84,7 +84,7 @@ def test_predicts_lanes_elements_and_both_topologies(fitted):
 
 
 def soiled(example):
-    """Fill what is not valid: pixels beside the smaller image, elements, lanes."""
+    """Fill invalid pixels, elements and lanes with garbage."""
     elements, lanes, image = example.traffic_elements, example.lanes, example.cameras.image.copy()
     image[1, 48:], image[1, :, 80:] = 255, 255
     box = np.where(elements.valid[:, None, None], elements.box, np.nan)
@@ -98,18 +98,18 @@ def soiled(example):
     )
 
 
-def test_what_stands_in_padding_changes_no_answer(fitted):
+def test_padding_content_changes_no_output(fitted):
     same(fitted.predict(make_camera_example(2)), fitted.predict(soiled(make_camera_example(2))))
 
 
-def test_what_stands_in_padding_changes_no_gradient(toponet):
+def test_padding_content_changes_no_gradient(toponet):
     key, clean, dirty = jax.random.key(0), make_camera_example(2), soiled(make_camera_example(2))
     results = [toponet.train(toponet.params, batch_of(e, make_camera_example(3)), key) for e in (clean, dirty)]
     same(*results)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(results[0]))
 
 
-def test_a_broken_camera_may_show_anything(fitted):
+def test_an_invalid_camera_changes_nothing(fitted):
     example = make_camera_example(4)
     for camera in (0, 1):
         valid = np.arange(2) != camera
@@ -170,7 +170,7 @@ def test_every_parameter_of_a_part_learns(toponet):
     # A frame on its own has no motion, and the first layer knows of no edges.
     graph = ("lane_lane/forward", "lane_lane/backward", "lane_element")
     expected = {"encoder/bev/motion/hidden/kernel"} | {f"layer_0/scene_graph/{name}/kernel" for name in graph}
-    # Softmax does not feel what is added to all its keys; rounding may.
+    # Softmax is invariant to a constant added to all logits, up to rounding.
     assert {name for name in silent if not name.endswith("/key/bias")} == expected
 
 
@@ -198,17 +198,17 @@ def test_a_stream_equals_the_scan_over_its_sequence(toponet):
     assert not np.array_equal(answers[3].centerlines.points, toponet.predict(frames[3]).centerlines.points)
 
 
-def test_nobody_there_is_no_traffic_flow(toponet):
+def test_an_empty_scene_equals_no_traffic_flow(toponet):
     example = make_camera_example(10)
     absent = example.replace(traffic_flow=TrafficFlow.empty(*example.traffic_flow.valid.shape))
     answer = toponet.predict(absent)
     assert not np.array_equal(answer.centerlines.points, toponet.predict(example).centerlines.points)
-    # The part that nobody reaches does not matter.
+    # Parameters of the temporal encoder have no effect.
     other = {**toponet.params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, toponet.params["temporal_encoder"])}
     same(answer, toponet.step(other, toponet.task.start(), absent)[1])
 
 
-def test_what_does_not_fit_is_an_error():
+def test_mismatched_parts_are_errors():
     task, key = TASKS["toponet"], jax.random.key(0)
     with pytest.raises(UserError, match="choose data with cameras"):
         jax.eval_shape(task.init, key, make_example())

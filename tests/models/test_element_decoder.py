@@ -1,4 +1,4 @@
-"""The traffic-element head against the reference's numbers, and what must not matter to it."""
+"""The traffic-element head against the reference's numbers, and independence of padding."""
 
 import jax
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ def check(case):
         np.testing.assert_array_equal(by_query, case.outputs[f"pos_assigned_gt_inds.{layer}.{image}"])
 
 
-def test_what_shows_padding_changes_nothing():
+def test_features_of_padding_change_nothing():
     config = ElementDecoderConfig(dim=16, heads=2, levels=2, encoder_layers=1, layers=2, queries=3, hidden=16)
     rng = np.random.default_rng(0)
     levels = [rng.normal(size=(h, w, 16)).astype(np.float32) for h, w in ((8, 12), (4, 6))]

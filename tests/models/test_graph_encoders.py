@@ -1,4 +1,4 @@
-"""Graph encoders against explicit dense products, and what they promise about padding, sizes and looking inside."""
+"""Graph encoders against explicit dense products, and padding, sizes and intermediates."""
 
 import dataclasses
 from functools import cache, partial
@@ -127,7 +127,7 @@ def test_a_gtn_that_selects_similarity_is_the_transformers_attention(heads):
 
 @every_config
 def test_padding_changes_nothing(name):
-    """What stands in padded cells, NaN included, reaches neither outputs nor gradients."""
+    """The content of padded cells, NaN included, reaches neither outputs nor gradients."""
     run, (features, position, valid) = compiled(name), scene()
     fill = lambda value: [jnp.where(valid[..., None], x, value) for x in (features, position)]  # noqa: E731
     clean, dirty = run(*fill(0.0), valid), run(*fill(jnp.nan), valid)
@@ -144,7 +144,7 @@ def test_padding_changes_nothing(name):
 
 
 @every_config
-def test_nothing_valid_gives_nothing(name):
+def test_without_valid_cells_the_output_is_zero(name):
     nothing = jnp.full((*SHAPE, DIM), jnp.nan, jnp.float32)
     out, _, gradients = compiled(name)(nothing, nothing, jnp.zeros(SHAPE, bool))
     for leaf in jax.tree.leaves((out, gradients)):
@@ -152,7 +152,7 @@ def test_nothing_valid_gives_nothing(name):
 
 
 @every_config
-def test_it_does_not_matter_where_the_padding_is(name):
+def test_the_place_of_padding_changes_nothing(name):
     """A small map, and the same map anywhere within a padded one: the same memory and the same gradients."""
     features, position, _ = scene(shape=BLOCK)
     expected, _, (by_param, by_feature, _) = compiled(name)(features, position, jnp.ones(BLOCK, bool))
@@ -167,7 +167,7 @@ def test_it_does_not_matter_where_the_padding_is(name):
 
 
 @every_config
-def test_looking_inside(name):
+def test_intermediates_are_available(name):
     config, (_, seen, _) = CONFIGS[name], compiled(name)(*scene())
     for i in range(config.layers):
         layer = seen[f"layer_{i}"]["graph"]
@@ -182,7 +182,7 @@ def test_looking_inside(name):
 
 @pytest.mark.parametrize("name", ["gtn structural", "gcn"])
 def test_flipped_maps_give_flipped_memories(name):
-    """Structure knows no left and right but by its selection weights; here those of both sides are equal."""
+    """The graph is symmetric if the selection weights of opposite directions are equal, as here."""
     config = dataclasses.replace(CONFIGS[name], layers=1)
     module, variables = built(config)
     variables = jax.tree.map(lambda leaf: leaf, variables)
@@ -208,7 +208,7 @@ def test_small_maps(name, shape):
 
 
 def test_dropout_is_seeded():
-    """In the frame that all graphs share."""
+    """Dropout of the encoder layer that all graphs have in common."""
     module, variables = built(dataclasses.replace(CONFIGS["gcn"], layers=1))
     apply = jax.jit(module.apply, static_argnames="deterministic")
     run = lambda seed: apply(variables, *scene(), deterministic=False, rngs={"dropout": jax.random.key(seed)})  # noqa: E731

@@ -1,4 +1,4 @@
-"""The image encoder: what it makes of views of several sizes, and its paper sizes from shapes alone."""
+"""The image encoder: views of several sizes, and parameter counts at the papers' sizes from shapes alone."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def test_normalisation_is_that_of_imagenet_and_leaves_padding_at_zero():
     assert not out[~shown].any()
 
 
-def test_what_lies_outside_of_an_image_changes_nothing(variables):
+def test_pixels_outside_the_image_change_nothing(variables):
     run = jax.jit(lambda cameras: ImageEncoder(SMALL).apply(variables, cameras))
     cameras = views(valid=(True, False))
     other = cameras.image.copy()

@@ -1,4 +1,4 @@
-"""Denoising queries: what noise does, whose lane a query is, and that nothing but the loss notices them."""
+"""Denoising queries: noise, the lane of each query, and no effect on predictions."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def curve(count=3, capacity=5, garbage=np.nan):
     return lanes
 
 
-def test_without_noise_a_lane_stays_and_the_others_lie_in_the_range():
+def test_without_noise_lanes_stay_and_other_queries_lie_in_the_range():
     lines = np.asarray(noised_lanes(KEY, curve(), 6, RANGE, QUIET))
     np.testing.assert_allclose(lines[:3], curve().points[:3], atol=1e-5)
     middle = lines[3:].mean(1)
@@ -93,7 +93,7 @@ HOSTS = {
 
 
 @pytest.mark.parametrize("name", HOSTS)
-def test_only_the_loss_notices(name):
+def test_denoising_changes_only_the_loss(name):
     plain, noisy = (LaneGraphTask(replace(HOSTS[name], denoising=noise)) for noise in (None, DenoisingConfig()))
     params = random_params(noisy.init, make_example())
     without = {key: value for key, value in params.items() if key != "noised"}

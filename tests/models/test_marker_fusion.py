@@ -1,4 +1,4 @@
-"""Marker fusion: tokens, gate, variants, and a host that must not notice markers that are not there."""
+"""Marker fusion: tokens, gate, variants, and a host that absent markers leave unchanged."""
 
 from dataclasses import replace
 from functools import partial
@@ -39,7 +39,7 @@ CONFIG = MarkerFusionConfig(
 
 
 def lanes_of(example):
-    """Return what the markers of a frame on its own tell."""
+    """Return the marker lanes of a frame without memory."""
     return CONFIG.build(BASELINE.spec).observe(example, None)[0]
 
 
@@ -81,13 +81,13 @@ def same(a, b):
 
 
 def without_markers(params):
-    """Return the parameters of the host that has none."""
+    """Return the parameters without those of marker fusion."""
     if not isinstance(params, dict):
         return params
     return {name: without_markers(value) for name, value in params.items() if not name.startswith("marker")}
 
 
-def test_who_never_sees_a_marker_is_the_host_without_markers(params, step):
+def test_without_markers_in_sight_the_host_is_unchanged(params, step):
     expected = jax.jit(PLAIN.step)(without_markers(params), PLAIN.start(), make_example(0))[1]
     for markers in (None, observed(valid=False), observed(valid=False, garbage=np.nan), observed(lanes=0)):
         same(step(params, HOST.start(), seeing(markers, has_previous=np.asarray(False)))[1], expected)
@@ -117,7 +117,7 @@ def test_every_layer_of_the_bev_encoder_has_a_fusion_of_its_own():
     assert {f"{prior}_{layer}" for prior in ("markers", "sd_map") for layer in (0, 1)} <= shapes["encoder"].keys()
 
 
-def test_traffic_markers_and_a_map_guide_one_model_together():
+def test_traffic_flow_markers_and_sd_map_work_in_one_model():
     rng = np.random.default_rng(3)
     sd_map = SdMap(rng.uniform(-20, 20, (3, 11, 2)).astype(np.float32), np.zeros(3, np.int32), np.ones(3, bool))
     every = LaneGraphTask(
@@ -148,7 +148,7 @@ def test_padding_may_hold_nan(params, step):
     assert np.abs(first["marker_tokens"]["lines"]["embed"]["kernel"]).max() > 0
 
 
-def test_stream_equals_scan_and_any_pattern_of_sight_is_one_program(params):
+def test_stream_equals_scan_and_visibility_causes_no_retrace(params):
     traces = []
 
     @jax.jit
@@ -172,7 +172,7 @@ def test_stream_equals_scan_and_any_pattern_of_sight_is_one_program(params):
     assert len(traces) == 1
 
 
-def test_a_gap_is_bridged_as_long_as_the_bank_remembers(params, step):
+def test_memory_bridges_a_gap_up_to_the_length_of_the_bank(params, step):
     gap = [seeing(None, i, has_previous=np.asarray(True)) for i in range(1, 4)]
     memory = step(params, HOST.start(), seeing(observed()))[0]
     differs = []
@@ -220,7 +220,7 @@ def test_the_gate_is_the_confidence_and_its_variants():
     assert not np.array_equal(out, fused(CONFIG, far, bev, position)[0])
 
 
-def test_a_fusion_that_begins_silent_leaves_the_host_as_it_was_trained():
+def test_a_zero_initialised_fusion_leaves_the_trained_host_unchanged():
     module = MarkerFusion(replace(CONFIG, norm="query", width=16))
     bev, position, tokens = (jnp.asarray(np.random.default_rng(i).normal(size=(5, 8)), jnp.float32) for i in range(3))
     arguments = bev, position, tokens, jnp.ones((1, 5), bool)
@@ -231,7 +231,7 @@ def test_a_fusion_that_begins_silent_leaves_the_host_as_it_was_trained():
     np.testing.assert_allclose(half, change / 2, rtol=1e-4, atol=1e-6)
 
 
-def test_cells_out_of_reach_of_all_lanes_stay_as_they_are():
+def test_cells_beyond_the_radius_of_all_lanes_are_unchanged():
     guide, config = lanes_of(seeing(observed())), replace(CONFIG, radius=1.0, norm="query")
     start = guide.points[int(np.argmax(guide.valid)), 0]
     mask = fusion_mask(guide, guide.valid, jnp.stack([start, start + 500.0]), config)

@@ -89,7 +89,7 @@ def test_padding_changes_nothing_and_lines_have_no_order(attend):
     np.testing.assert_allclose(turned, tokens[order], atol=1e-5)
     alone = small_map(np.array([True, False, False]))
     (_, (by_itself, _)), _ = run(alone)
-    # Lines look at each other only where they should.
+    # Lines attend to each other only if configured.
     assert (np.abs(by_itself[0] - tokens[0]).max() > 1e-3) == (attend == "lines")
 
 
@@ -181,7 +181,7 @@ def test_encoders_fuse_the_map_in_every_layer(make, layers):
     absent, gradients = run(params, small_map(np.zeros(3, bool), np.nan))
     assert np.abs(out - absent).max() > 0.05
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
-    # A host that never looked at a map, with the parameters that it would have.
+    # A host without a map, with the parameters that both have in common.
     without = jax.jit(lambda p: plain.apply(p, NO_MAP, *inputs))(params)
     np.testing.assert_allclose(absent, without, atol=1e-5)
 
@@ -202,7 +202,7 @@ def test_paper_size_has_the_published_parameters():
     assert sizes[0] - sizes[1] == 8_458_688 - 7_667_648
 
 
-def test_a_map_is_where_its_coordinates_are():
+def test_map_coordinates_are_normalised_by_the_range_of_the_host():
     """The same road seen from two places is the same road: normalised by the range of the host."""
     wide = PerceptionRange((-20.0, 20.0), (-10.0, 10.0))
     encoder = SdMapEncoder(MODULE, wide)

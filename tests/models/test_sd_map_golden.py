@@ -178,8 +178,8 @@ def check_constructer(case):
     assert [row["tensor"] for row in converted.table] == list(case.params)
 
 
-def test_elements_of_the_public_batch_differ_in_what_they_see():
-    """Otherwise the batch bug of spatial attention would not be tested."""
+def test_elements_of_the_public_batch_see_different_queries():
+    """Otherwise the golden case would not exercise the batch bug of spatial attention."""
     for path in golden_modules("smerf_bev_constructer*"):
         case = load_module_case(path)
         config, views = bev_config(case), golden_views(case.inputs)

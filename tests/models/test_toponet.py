@@ -1,4 +1,4 @@
-"""TopoNet's lane branch with and without the TFM: what must not matter does not, bit for bit."""
+"""TopoNet's lane branch with and without the TFM: padding, order and absent inputs change no bit."""
 
 import dataclasses
 
@@ -68,18 +68,18 @@ def test_padding_may_hold_nan(fitted, name):
 
 
 @pytest.mark.parametrize("name", ["traffic", "every layer", "fixed"])
-def test_nobody_there_is_no_traffic_flow(fitted, name):
+def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
     _, params, predict = fitted[name]
     example = make_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
     same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
-    # An untrained-on-empty temporal encoder must not leak in either: its parameters do not matter.
+    # The parameters of the temporal encoder must have no effect in an empty scene.
     other = {**params, "temporal_encoder": jax.tree.map(lambda x: x + 1.0, params["temporal_encoder"])}
     same(absent, predict(other, example.replace(traffic_flow=None)))
     assert not np.array_equal(absent.points, predict(params, example).points)
 
 
-def test_baseline_never_looks_at_traffic(fitted):
+def test_baseline_does_not_depend_on_traffic(fitted):
     _, params, predict = fitted["baseline"]
     same(predict(params, make_example(5)), predict(params, make_example(5).replace(traffic_flow=None)))
 

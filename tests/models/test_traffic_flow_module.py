@@ -1,4 +1,4 @@
-"""The TFM by itself: lane queries in, lane queries out."""
+"""The traffic-flow module alone, on lane queries."""
 
 import dataclasses
 from functools import partial

@@ -1,7 +1,7 @@
 """A prior in one file, for tests: pedestrian crossings, into BEV features and into queries, with a memory.
 
-Together with the line of `tests.models.test_priors.WithToy`, which is what a new prior adds to `PriorsConfig`, this is
-all that a prior costs.
+Together with the line of `tests.models.test_priors.WithToy`, the line that a new prior adds to `PriorsConfig`, this
+file is the whole prior.
 """
 
 from __future__ import annotations

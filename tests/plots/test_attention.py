@@ -1,3 +1,5 @@
+"""Pictures of attention: lines from lanes to road users, matrices, masks."""
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ def ax():
     return new_figure()[1][0, 0]
 
 
-def test_lines_join_lanes_and_the_road_users_they_look_at(ax):
+def test_lines_join_lanes_and_attended_road_users(ax):
     example = fake_example(padding=np.nan)
     weights = np.asarray([[0.0, 0.6, 0.9], [0.3, 0.01, np.nan]])
     # Token 0 is road user 1 and token 1 is road user 0; token 2 is padding.

@@ -1,3 +1,5 @@
+"""Pictures from above: lanes, evidence, tracks and predictions, without padding."""
+
 import numpy as np
 import pytest
 
@@ -67,7 +69,7 @@ def test_lanes_lie_where_they_are_and_show_their_visibility(ax):
     np.testing.assert_allclose(colours[0, :3], 0.25 * np.asarray(clear) + 0.75 * np.asarray(hidden), atol=0.01)
 
 
-def test_evidence_has_least_x_left_and_least_y_below(ax):
+def test_evidence_is_drawn_with_its_origin_at_the_lower_left(ax):
     bev = np.zeros((10, 20, 4), np.uint8)
     bev[0, 0, 0] = 255
     draw_evidence(ax, bev)
@@ -105,7 +107,7 @@ def test_box_corners_turn_with_the_heading():
     np.testing.assert_allclose(corners[0], [[9, 7], [9, 3], [11, 3], [11, 7]], atol=1e-12)
 
 
-def test_prediction_shows_sure_lanes_and_their_links(ax):
+def test_confident_lanes_and_their_connections_are_drawn(ax):
     prediction = fake_prediction()
     draw_prediction(ax, prediction, threshold=0.3)
     shown = lines(ax)
@@ -116,7 +118,7 @@ def test_prediction_shows_sure_lanes_and_their_links(ax):
 
 
 @pytest.mark.parametrize("queries", [0, 1])
-def test_few_queries_are_drawn(ax, queries):
+def test_predictions_with_few_queries_are_drawn(ax, queries):
     logits = np.full((queries, 1), 3.0, np.float32)
     points = np.zeros((queries, POINTS, 3), np.float32)
     draw_prediction(ax, CenterlinePrediction(points, logits, np.full((queries, queries), -1.0)))

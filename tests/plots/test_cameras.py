@@ -1,3 +1,5 @@
+"""Pictures of camera images with projected lanes and boxes."""
+
 from dataclasses import replace as replaced
 
 import jax
@@ -28,7 +30,7 @@ def test_two_rows_for_each_example_with_truth_or_predictions(tmp_path):
     assert (truth != found).any()
 
 
-def test_lines_lie_where_geometry_projects_them():
+def test_drawn_lines_match_the_projection():
     """Every drawn piece ends on the projection of the line, and what lies behind the camera is left out."""
     views = fake_views()
     _, axes = new_figure()
@@ -53,7 +55,7 @@ def test_only_chosen_boxes_are_drawn():
     assert [text.get_text() for text in axes[0, 0].texts] == ["red"]
 
 
-def test_what_does_not_fit_is_named(tmp_path):
+def test_mismatched_shapes_are_named(tmp_path):
     with pytest.raises(UserError, match=r"ExampleConfig\.cameras"):
         save_camera_views(tmp_path / "a.png", replaced(EXAMPLES, cameras=None))
     with pytest.raises(ValueError, match="'titles': 1"):

@@ -1,3 +1,5 @@
+"""Curves of recorded numbers over steps and seeds."""
+
 import numpy as np
 import pytest
 

@@ -1,3 +1,5 @@
+"""Galleries of examples and models, and saving of pictures."""
+
 import sys
 
 import numpy as np
@@ -48,7 +50,7 @@ def test_many_models_take_further_lines(tmp_path):
 
 
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (1, 4), (5, 3)])
-def test_contact_sheet_shows_no_more_than_there_is(tmp_path, size, count):
+def test_contact_sheet_is_limited_to_the_available_examples(tmp_path, size, count):
     out = show_dataset(FakeDataset(FakeConfig(size=size)), count, tmp_path / "sheet.png")
     assert colours(out) > 100
 

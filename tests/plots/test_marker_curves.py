@@ -1,4 +1,4 @@
-"""The picture of marker detection over distance."""
+"""The figure of marker detection over distance."""
 
 import numpy as np
 import pytest

@@ -1,3 +1,5 @@
+"""Counts of the contents of a dataset."""
+
 import numpy as np
 
 from tests.fakes import empty_example, fake_example
@@ -43,6 +45,6 @@ def test_examples_without_a_quantity_do_not_count_in_its_mean():
     assert summary(empty_example())["- frames of each"]["mean"] is None
 
 
-def test_what_a_dataset_does_not_offer_has_no_row():
+def test_quantities_that_a_dataset_lacks_have_no_row():
     bare = fake_example().replace(hidden=None, traffic_flow=None, traffic_elements=None)
     assert not {"road users", "share of ground out of sight", "traffic lights and signs"} & set(summary(bare))

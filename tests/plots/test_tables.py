@@ -1,3 +1,5 @@
+"""Markdown tables, and files of tables."""
+
 import json
 import math
 
@@ -12,7 +14,7 @@ ROWS = [
 ]
 
 
-def test_columns_are_aligned_and_numbers_stand_to_the_right():
+def test_columns_are_aligned_with_numbers_right_aligned():
     assert format_table(ROWS, title="OpenLane-V2 v2.1") == "\n".join(
         [
             "OpenLane-V2 v2.1",
@@ -37,7 +39,7 @@ def test_cells_without_a_number(value, shown):
     assert format_table([{"x": value}]).splitlines()[-1].strip("| ") == shown
 
 
-def test_no_rows_is_a_table_without_rows():
+def test_without_rows_the_table_has_a_header_only():
     assert format_table([], ["a"]) == "| a   |\n| --- |"
     assert format_table([]).count("\n") == 1
 

@@ -46,7 +46,7 @@ def run(frames, config=CONFIG, poses=None, starts=()):
     return memory, out
 
 
-def test_a_trusted_frame_speaks_for_itself():
+def test_a_trusted_frame_does_not_use_the_bank():
     _, (first, second) = run([seen(0.9, at=5.0), seen(0.6, at=7.0)])
     for used, trust, at in ((first, 0.9, 5.0), (second, 0.6, 7.0)):
         assert used.gate == pytest.approx(trust)
@@ -68,14 +68,14 @@ def test_a_gap_is_filled_from_the_bank_with_decayed_confidence():
         assert used.gate == pytest.approx(max(0.9 * 0.5**now, 0.4 * 0.5 ** (now - 1)))
 
 
-def test_a_distrusted_frame_asks_the_bank_too_and_stays_in_it():
+def test_a_distrusted_frame_uses_the_bank_and_is_stored_in_it():
     _, out = run([seen(0.9), seen(0.1, at=3.0), NOTHING])
     assert out[1].gate == pytest.approx(0.45)
     np.testing.assert_allclose(out[1].weight.reshape(4, LANES)[:2, 0], np.sqrt([0.1, 0.45]), rtol=1e-6)
     np.testing.assert_allclose(out[2].weight.reshape(4, LANES)[1:3, 0], np.sqrt([0.05, 0.225]), rtol=1e-6)
 
 
-def test_of_a_long_union_the_heaviest_lanes_guide_with_their_connectivity():
+def test_a_long_union_keeps_its_heaviest_lanes_with_their_connectivity():
     pair = seen(0.9)
     pair.successor[0, 1] = True
     frames = [pair, seen(0.4, lanes=1, at=2.0), NOTHING]
@@ -113,7 +113,7 @@ def test_remembered_lanes_stay_where_they_are_on_the_ground():
     np.testing.assert_array_equal(out[1].points.reshape(4, LANES, POINTS, 2)[1, 0, 0], [5.0, 0.0])
 
 
-def test_without_decay_nothing_fades_and_the_gate_may_be_left_to_the_tokens():
+def test_without_decay_confidence_stays_and_the_gate_can_be_one():
     frames = [seen(0.9)] + [NOTHING] * 3
     _, out = run(frames, replace(CONFIG, decay=1.0))
     assert out[3].gate == pytest.approx(0.9)

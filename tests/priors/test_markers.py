@@ -1,4 +1,4 @@
-"""Marker observations become lanes with a confidence."""
+"""Marker observations as lanes with a confidence."""
 
 import jax
 import numpy as np
@@ -43,7 +43,7 @@ def test_confidence_is_equation_two():
 
 @given(st.floats(0, 200), st.floats(0, 200), st.floats(0.1, 50), st.floats(0.1, 50))
 @settings(max_examples=50, deadline=None)
-def test_farther_or_less_steady_is_trusted_less(distance, residual, more, shake):
+def test_confidence_falls_with_distance_and_residual(distance, residual, more, shake):
     config = MarkerPriorConfig()
     here = confidence(np.array([distance]), np.array([residual]), config)
     assert confidence(np.array([distance + more]), np.array([residual]), config) < here
@@ -70,7 +70,7 @@ def test_lanes_are_thinned_keep_their_ends_and_come_in_order_of_trust():
     np.testing.assert_allclose(lanes.frame_confidence, expected[0][0], rtol=1e-5)
 
 
-def test_without_room_the_least_trusted_are_left_out():
+def test_beyond_capacity_the_least_trusted_are_left_out():
     markers = observations()
     many, few = (select_marker_lanes(markers, MarkerPriorConfig(3, lanes=count)) for count in (7, 2))
     for name in ("points", "confidence", "valid"):
@@ -106,7 +106,7 @@ def test_no_markers_and_no_lanes(sizes):
     assert lanes.frame_confidence >= 0
 
 
-def test_the_raw_score_counts_where_it_is_asked_for():
+def test_the_raw_score_counts_if_configured():
     markers = observations(markers=1)
     plain, scored = (select_marker_lanes(markers, MarkerPriorConfig(3, use_score=use)) for use in (False, True))
     np.testing.assert_allclose(scored.confidence, plain.confidence * markers.score, rtol=1e-6)

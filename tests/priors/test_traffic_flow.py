@@ -38,7 +38,7 @@ def make_flow(seed: int = 0, instances: int = 12, frames: int = 20, capacity: in
 
 
 def loop_selection(flow: TrafficFlow, config: TrafficFlowPriorConfig) -> list[int]:
-    """Which instances should be chosen, by plain loops from the paper's words."""
+    """Return the selected instances by plain loops, after the paper's description."""
     ranked = []
     for k in range(len(flow.category)):
         frames = [

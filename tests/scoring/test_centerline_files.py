@@ -1,4 +1,4 @@
-"""`tflane score` on OpenLane-V2's own files: official numbers, and what it says of damaged files."""
+"""`tflane score` on OpenLane-V2's own files: official numbers, and errors for damaged files."""
 
 import dataclasses
 import json
@@ -156,7 +156,7 @@ def test_a_damaged_submission_is_named_to_the_frame(files, capsys, damage):
     assert not (files / "out.json").exists()
 
 
-def test_a_pickle_that_runs_things_is_refused(files, capsys):
+def test_a_pickle_that_runs_code_is_refused(files, capsys):
     class Evil:
         def __reduce__(self):
             return os.system, ("true",)

@@ -1,4 +1,4 @@
-"""`tflane score maptr` on MapTR's own files: official numbers, and what it says of damaged ones."""
+"""`tflane score maptr` on MapTR's own files: official numbers, and errors for damaged files."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""`tflane score` on this project's own files, and lanes parted by distance and occlusion."""
+"""`tflane score` on this project's own files, and lanes grouped by distance and occlusion."""
 
 import json
 import re
@@ -107,7 +107,7 @@ def test_arrays_with_empty_slots_give_the_hand_made_numbers(tmp_path):
     assert [row["lanes"] for row in rows] == [9, 6, 3]
 
 
-def test_distances_share_out_all_lanes(tmp_path):
+def test_every_lane_is_in_one_distance_group(tmp_path):
     write_npz(tmp_path)
     rows = run(tmp_path, "npz", "--by", "distance")[1]
     # A touches the ego, B begins 10 m ahead, C is 4 m aside.
@@ -140,7 +140,7 @@ def test_no_visibility_is_named(tmp_path, capsys):
     assert "no visibility" in capsys.readouterr().err
 
 
-def test_what_cannot_be_parted_is_named(tmp_path, capsys):
+def test_unsupported_groupings_are_named(tmp_path, capsys):
     assert main(["score", "tusimple", "a", "b", "--by", "distance"]) == 2
     assert "tusimple cannot be reported by distance" in capsys.readouterr().err
 

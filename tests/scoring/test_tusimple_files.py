@@ -1,4 +1,4 @@
-"""`tflane score tusimple` on label files: official numbers, and what it says of damaged files."""
+"""`tflane score tusimple` on label files: official numbers, and errors for damaged files."""
 
 import json
 import re

@@ -28,7 +28,7 @@ ENCODERS = {
 
 
 class Fitted:
-    """A task with random parameters and its compiled programs: what they start from, prediction, one update."""
+    """A task with random parameters and its compiled programs: start, prediction, one update."""
 
     def __init__(self, task):
         optim = OptimConfig(lr=1e-2, warmup_steps=0, weight_decay=0.0)
@@ -39,7 +39,7 @@ class Fitted:
         self.update = make_update_step(task, optim, 10)
 
     def start(self, key=0):
-        """Return a fresh state, whose buffers nobody else has: an update consumes them."""
+        """Return a fresh state with buffers of its own, because an update donates them."""
         return self.init(jax.random.key(key), road_image(0))
 
     def updated(self, batch, key=0):
@@ -58,7 +58,7 @@ def fitted(request):
 
 
 def padded(example, fill):
-    """Hide the right third of the image and fill it, and every point that is not there, with something."""
+    """Mark the right third of the image as invalid; fill it and all invalid points with a value."""
     valid = example.image_valid.copy()
     valid[:, WIDTH * 2 // 3 :] = False
     there = example.lines.point_valid & example.lines.valid[:, None]
@@ -89,7 +89,7 @@ def test_predicts_one_class_and_one_curve_for_each_query(fitted):
     assert not np.array_equal(answer.logits, fitted.predict(fitted.params, road_image(1)).curves.logits)
 
 
-def test_what_stands_in_padding_changes_nothing(fitted):
+def test_padding_content_changes_nothing(fitted):
     clean, soiled = (padded(road_image(0), fill) for fill in (0, 200))
     answer = fitted.predict(fitted.params, clean)
     jax.tree.map(np.testing.assert_array_equal, answer, fitted.predict(fitted.params, soiled))
@@ -110,7 +110,7 @@ def test_an_image_of_nothing_but_padding_stays_finite(fitted):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((numbers(state), metrics)))
 
 
-def test_training_moves_everything_that_learns_and_the_statistics(fitted):
+def test_training_changes_every_learned_parameter_and_the_statistics(fitted):
     batch = jax.device_put(road_images(2))
     state, losses = fitted.start(), []
     before = jax.tree.map(np.asarray, state.params)
@@ -149,7 +149,7 @@ def test_padding_is_sampled_at_the_first_pixel_of_a_cell():
     assert nearest(mask[:1, :1], 1, 1).shape == (1, 1)
 
 
-def test_anchored_heads_say_where_the_straight_part_crosses_two_rows():
+def test_anchored_heads_predict_where_the_straight_part_crosses_two_rows():
     anchors, rng = (0.4, 0.9), np.random.default_rng(0)
     queries = jnp.asarray(rng.normal(size=(2, 3, 8)).astype(np.float32))
     heads = LaneShapeHeads(8, anchors)
@@ -203,5 +203,5 @@ def curves_of(**options):
 
 
 @pytest.mark.parametrize("changes", [{"shrink": 2}, {"located": True}, {"anchors": (0.4, 1.0)}])
-def test_options_predict_something_else(changes):
+def test_options_change_the_prediction(changes):
     assert not np.array_equal(curves_of().curves, curves_of(**changes).curves)

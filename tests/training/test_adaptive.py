@@ -35,7 +35,7 @@ def verdicts(values, *, config=RULE, length=100, every=10, number=0, memory=None
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
-        # The first two of ten are in the grace; the third is the first best.
+        # The first two of ten lie in the grace period; the third is the first best value.
         ([1.0] * 10, "....RRRRR."),
         ([0.1, 0.1, 1.0, 0.95, 0.85, 0.84, 0.6, 0.5], "....E..."),  # 0.95 is no better by a tenth, 0.85 is
         ([9.0, 9.0, 1.0, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05, 0.04], "....E....."),  # late only; once only
@@ -48,7 +48,7 @@ def test_rule_within_the_first_cycle(values, expected):
     assert verdicts(values)[0] == expected
 
 
-def test_more_can_be_better():
+def test_a_metric_to_maximise():
     values = [1.0, 1.0, 1.0, 1.2, 1.5, 1.2, 1.1]
     config = dataclasses.replace(RULE, mode="max")
     assert verdicts(values, config=config)[0] == "....E.R"
@@ -99,7 +99,7 @@ def test_no_restart_near_the_end_of_the_run(left, verdict):
         {"shrink": 1.1},
     ],
 )
-def test_settings_that_cannot_work_are_named(change):
+def test_invalid_settings_are_named(change):
     check_adaptive(RULE)
     with pytest.raises(UserError, match=rf"adaptive\.{next(iter(change))} is"):
         check_adaptive(dataclasses.replace(RULE, **change))
@@ -141,7 +141,7 @@ def test_a_run_follows_its_evaluations_and_records_it(whole, tmp_path):
     run_cycles(tmp_path / "fixed", optim=fixed)
     other = curves(timeless(tmp_path / "fixed"))
     assert not [split for split, _ in other if split == "cycle"]
-    # The learning rate shows it: the same up to the first change, and another right after it.
+    # The learning rate is the same up to the first change and differs right after it.
     changed = (changes["extensions"][1] > 0) | (changes["magnitude"][1] < 1.0)
     first = changes["number"][0][np.argmax(changed)]
     rates, untouched = (one["train", "learning_rate"][1][:, 0] for one in (series, other))
@@ -150,7 +150,7 @@ def test_a_run_follows_its_evaluations_and_records_it(whole, tmp_path):
 
 
 @pytest.mark.parametrize("stop", [6, 18])
-def test_a_resumed_run_goes_on_to_the_same_bits(whole, tmp_path, stop):
+def test_a_resumed_run_gives_the_same_bits(whole, tmp_path, stop):
     folder, evaluations = tmp_path / "run", iter(range(3, 31, 3))
 
     def evaluate_and_signal(params):
@@ -193,7 +193,7 @@ def test_seeds_have_cycles_of_their_own(whole, tmp_path):
     assert len(checkpoints.manifest(30).progress["cycles"]) == 2
 
 
-def test_a_metric_that_is_not_there_is_named(tmp_path):
+def test_a_missing_metric_is_named(tmp_path):
     with pytest.raises(UserError, match=r"adaptive\.metric is loss, which .* choose one of score$"):
         run_cycles(tmp_path / "run", evaluate=score)
     with pytest.raises(UserError, match="needs evaluations"):
@@ -201,7 +201,7 @@ def test_a_metric_that_is_not_there_is_named(tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_runs_without_it_carry_nothing_of_it(tmp_path):
+def test_runs_without_the_rule_have_no_state_of_it(tmp_path):
     run(tmp_path / "run", config=dataclasses.replace(CONFIG, steps=10))
     assert "cycles" not in Checkpoints(tmp_path / "run" / "checkpoints").manifest(10).progress
     assert not any("magnitude" in name for name in arrays(tmp_path / "run", 10))

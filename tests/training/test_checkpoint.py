@@ -1,4 +1,4 @@
-"""Checkpoints: the same bits back, and a clear message for everything that can be wrong with a folder."""
+"""Checkpoints: bit-identical round trips, and a clear message for every fault of a folder."""
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ def test_round_trip_is_exact(tmp_path, seeds):
     )
 
 
-def test_the_last_ones_and_the_best_are_kept(tmp_path, state):
+def test_the_last_and_best_checkpoints_are_kept(tmp_path, state):
     scores = [(1, 0.5), (2, 0.9), (3, 0.9), (4, 0.1), (5, None), (6, None)]
     checkpoints = saved(tmp_path, state, scores, keep=2)
     assert checkpoints.steps() == [2, 5, 6]
@@ -84,12 +84,12 @@ def test_leftovers_of_a_killed_write_are_no_checkpoint(tmp_path, state):
     ("which", "message"),
     [("best", "ask for `last`"), (7, "no checkpoint of step 7, only 4")],
 )
-def test_asking_for_what_is_not_there(tmp_path, state, which, message):
+def test_a_missing_checkpoint_is_an_error(tmp_path, state, which, message):
     with pytest.raises(UserError, match=message):
         saved(tmp_path, state, [(4, None)]).find(which)
 
 
-def test_asking_an_empty_run(tmp_path):
+def test_a_run_without_checkpoints_is_an_error(tmp_path):
     with pytest.raises(UserError, match="holds no checkpoint"):
         Checkpoints(tmp_path / "nothing").find("last")
 
@@ -133,7 +133,7 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path, state):
         checkpoints.restore(1, wider)
 
 
-def test_a_layout_of_the_future_is_refused(tmp_path, state):
+def test_a_newer_layout_is_refused(tmp_path, state):
     checkpoints = saved(tmp_path, state, [(1, None)])
     manifest = checkpoints.path(1) / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"version": 1', '"version": 2'))

@@ -1,4 +1,4 @@
-"""Training on clips and evaluating streams: time is a scan, and what is remembered changes the answer."""
+"""Training on clips and evaluating streams: memory goes from frame to frame and changes the prediction."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ CLIPS = replace(ALONE, clip=3)
 
 
 def scenes(count=2, length=3, sight=(True, False, False)):
-    """Return frames of some scenes in order, markers in sight in some of them."""
+    """Return frames of some scenes in order, some of them with visible markers."""
     return stack_examples(
         [
             seeing(observed(seed=s, valid=sight[i % len(sight)]), 10 * s + i, has_previous=np.asarray(i > 0))
@@ -52,11 +52,11 @@ def test_clips_keep_the_order_and_stay_within_scenes():
     as_clips(scenes(length=4), 2)
 
 
-def test_the_loss_of_clips_is_that_of_their_frames_with_what_was_remembered(params):
+def test_the_loss_of_clips_equals_that_of_their_frames_with_memory(params):
     key = jax.random.key(0)
     unseen = jax.tree.map(jnp.asarray, scenes(sight=(False,)))
     of_clips, of_frames = jax.jit(CLIPS.loss), jax.jit(ALONE.loss)
-    # Without a marker there is nothing to remember.
+    # Without a marker the memory stays empty.
     together, terms = of_clips(params, as_clips(unseen, 3), key)
     apart, each = of_frames(params, unseen, key)
     np.testing.assert_allclose(together, apart, rtol=1e-5)
@@ -65,7 +65,7 @@ def test_the_loss_of_clips_is_that_of_their_frames_with_what_was_remembered(para
     assert abs(float(of_clips(params, as_clips(seen, 3), key)[0] - of_frames(params, seen, key)[0])) > 1e-4
 
 
-def test_gradients_reach_the_encoder_through_what_is_remembered(params):
+def test_gradients_reach_the_encoder_through_memory(params):
     # Nothing but the memory shows the last two frames a marker; the first frame's loss is taken away.
     examples = scenes(count=1)
     examples.lanes.valid[0] = False
@@ -89,7 +89,7 @@ def test_evaluation_streams_through_scenes(params, batch_size):
     assert differs == [False, True, True] * 2
 
 
-def test_single_frames_of_a_stream_are_drawn_with_what_is_remembered(params):
+def test_single_frames_of_a_stream_are_drawn_with_memory(params):
     frames = scenes()
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], frames) for i in range(6)]
     (found,) = [answer.centerlines.points for _, answer in predictions(CLIPS, params, frames, 6)]
@@ -118,7 +118,7 @@ def test_the_summary_of_a_task_of_clips_counts_whole_clips():
 
 
 def test_cameras_are_trained_on_clips_too():
-    """Batch statistics and the BEV memory go from frame to frame; shapes alone tell that they fit."""
+    """Batch statistics and the BEV memory go from frame to frame; shapes alone show that they fit."""
     task = LaneGraphTask(CAMERA_TOPONET, clip=2)
     clip = stack_examples([make_camera_example(i).replace(has_previous=np.asarray(i > 0)) for i in range(2)])
     params = jax.eval_shape(task.init, jax.random.key(0), clip)
@@ -129,7 +129,7 @@ def test_cameras_are_trained_on_clips_too():
     assert all(jax.tree.leaves(same))
 
 
-def test_frames_are_shared_out_by_what_is_known_of_markers(params):
+def test_frames_are_grouped_by_marker_visibility(params):
     sightings = Sightings()
     frames = [(False, False), (True, True), (False, True), (True, True), (False, True), (False, False), (True, False)]
     told = [sightings.next(seen, has_previous) for seen, has_previous in frames]

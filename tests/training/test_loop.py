@@ -1,4 +1,4 @@
-"""The training program: same bits on a rerun and after a kill, and a clean end for everything that can go wrong."""
+"""The training program: bit-identical reruns and resumes, and clean errors."""
 
 import dataclasses
 import json
@@ -51,7 +51,7 @@ def test_another_seed_gives_other_bits(whole, tmp_path):
     assert arrays(tmp_path / "run") != arrays(whole)
 
 
-def test_a_killed_run_goes_on_to_the_same_bits(whole, tmp_path):
+def test_a_killed_run_resumes_to_the_same_bits(whole, tmp_path):
     folder = tmp_path / "run"
     for start, kill, last in (("new", "evaluation:20", 14), ("resume", "checkpoint:28", 21)):
         command = [sys.executable, "-m", "tests.training.stub_run", str(folder), start, kill]
@@ -69,7 +69,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(whole, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_step_and_keeps_it(whole, tmp_path, number):
+def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
     def evaluate_and_signal(params):
         os.kill(os.getpid(), number)
         return score(params)
@@ -82,8 +82,8 @@ def test_a_signal_ends_the_step_and_keeps_it(whole, tmp_path, number):
     assert arrays(tmp_path / "run") == arrays(whole)
 
 
-def test_streamed_data_give_the_same_bits_and_go_on_where_they_were(whole, tmp_path):
-    """The position is the step of the checkpoint: a resumed run asks for the batch that comes next."""
+def test_streamed_data_give_the_same_bits_and_resume_at_their_position(whole, tmp_path):
+    """The checkpoint's step is the position in the data: a resumed run starts with the next batch."""
 
     def evaluate_and_stop(params):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -118,7 +118,7 @@ def test_records_are_means_over_the_steps_between(whole, tmp_path):
     assert {"loss", "loss/fit", "loss/explosive", "grad_norm", "learning_rate"} < train_records[0].keys()
 
 
-def test_the_folder_tells_where_the_numbers_come_from(whole):
+def test_the_folder_records_provenance(whole):
     assert json.loads((whole / "config.json").read_text()) == RESOLVED
     start, *_ = json.loads((whole / "provenance.json").read_text())
     assert start["packages"]["jax"].startswith("0.1")
@@ -138,7 +138,7 @@ def test_several_seeds_train_side_by_side(whole, tmp_path):
 
 
 def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, tmp_path):
-    # The largest value of the arrays comes in the batch of some step; the infinite term is met there.
+    # The term becomes infinite at the step whose batch holds the largest value of the arrays.
     limit = float(line_arrays()["x"].max()) - 1e-3
     folder = tmp_path / "run"
     with pytest.raises(UserError, match=r"step \d+, seed 0: .*loss/explosive = inf.*is not finite") as error:
@@ -146,7 +146,7 @@ def test_a_loss_that_is_not_finite_is_named_and_the_last_good_state_kept(whole, 
     kept = Checkpoints(folder / "checkpoints").steps()[-1]
     assert f"step {kept + 1}," in str(error.value)
     assert str(Checkpoints(folder / "checkpoints").path(kept)) in str(error.value)
-    # That state is the one of the run that never met it.
+    # The saved state equals that of a run without the infinite term.
     short = dataclasses.replace(CONFIG, checkpoint_every=1, eval_every=1000, keep_checkpoints=40)
     run(tmp_path / "other", config=short)
     assert arrays(folder, kept) == arrays(tmp_path / "other", kept)
@@ -176,7 +176,7 @@ def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
     assert not np.array_equal(tuned[0], tuned[1])
 
 
-def test_parts_of_another_model_start_afresh_where_that_is_asked_for(whole, tmp_path, capsys):
+def test_parts_of_another_model_can_be_initialised_afresh(whole, tmp_path, capsys):
     config = dataclasses.replace(CONFIG, steps=1, init_from=str(whole))
     more = LineTask(second_layer=True)
     still = dataclasses.replace(OPTIM, lr=0.0, warmup_steps=0)
@@ -189,7 +189,7 @@ def test_parts_of_another_model_start_afresh_where_that_is_asked_for(whole, tmp_
     best = Checkpoints(whole / "checkpoints", best_metric="score")
     start = Checkpoints(tmp_path / "run" / "checkpoints").params(1)
     np.testing.assert_allclose(start["line"]["kernel"], best.params(best.find("best"))["line"]["kernel"], rtol=1e-6)
-    # And back: what only the other run has is left out.
+    # The other direction: parameters that only the other run has are left out.
     run(tmp_path / "back", config=dataclasses.replace(partly, init_from=str(tmp_path / "run")), optim=still)
     assert "second are left out" in capsys.readouterr().err
     with pytest.raises(UserError, match=r"another model \(line/"):
@@ -213,7 +213,7 @@ def test_drawing_sees_every_evaluation(tmp_path):
     assert seen[-1][2] == len(read_records(tmp_path / "run" / "metrics.jsonl"))
 
 
-def test_folders_that_are_not_fit_are_refused(whole, tmp_path):
+def test_unsuitable_folders_are_refused(whole, tmp_path):
     with pytest.raises(UserError, match=r"already holds a run.*--resume.*--overwrite"):
         run(whole)
     with pytest.raises(UserError, match="holds no run to resume"):
@@ -261,7 +261,7 @@ def test_two_processes_never_share_a_folder(tmp_path):
         ({"seeds": (1, 1)}, "seeds"),
     ],
 )
-def test_settings_that_cannot_work_are_named(tmp_path, change, name):
+def test_invalid_settings_are_named(tmp_path, change, name):
     with pytest.raises(UserError, match=rf"training\.{name} is"):
         run(tmp_path / "run", config=dataclasses.replace(CONFIG, **change))
     assert not (tmp_path / "run").exists()

@@ -1,4 +1,4 @@
-"""Cycles of the learning rate: Eq. (2) at its ends, exact restarts, the end of the run, and changes on the way."""
+"""Cycles of the learning rate: Eq. (2) at its ends, exact restarts, the end of the run, and changes during it."""
 
 import dataclasses
 
@@ -90,12 +90,12 @@ def test_restarts_have_no_schedule_by_step():
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Changes on the way
+# Changes during a run
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.integers(1, 400), st.integers(1, 400), st.floats(0.0, 3.0), st.integers(0, 900))
-def test_an_extension_keeps_the_rate_and_lasts_as_it_says(elapsed, left, extend, run_left):
+def test_an_extension_keeps_the_rate_and_has_the_configured_length(elapsed, left, extend, run_left):
     config, steps = RestartsConfig(elapsed + left, floor=0.2), elapsed + run_left
     cycle = jax.device_get(first_cycle(config, 0, steps))._replace(count=np.int32(elapsed))
     longer = extended_cycle(cycle, extend, steps)
@@ -155,7 +155,7 @@ def test_each_seed_is_judged_by_its_own_loss():
         np.testing.assert_allclose(rates[14:30, seed], cosine(np.arange(16), 16, 0.5), rtol=1e-6)
 
 
-def test_together_is_as_alone():
+def test_seeds_together_equal_each_seed_alone():
     losses = {3: [1.0, 2.0], 5: [0.9, 2.0], 12: [0.8, 1.5], 20: [0.1, 1.5]}
     together = rates_with(losses, count=40)
     for seed in range(2):
@@ -164,13 +164,13 @@ def test_together_is_as_alone():
     assert (together[:, 0] != together[:, 1]).any()
 
 
-def test_an_evaluation_at_the_end_of_a_cycle_leaves_it_be():
+def test_an_evaluation_at_the_end_of_a_cycle_changes_nothing():
     np.testing.assert_array_equal(
         rates_with({6: [1.0], 8: [2.0]}, count=20), rates_with({6: [1.0], 8: [0.1]}, count=20)
     )
 
 
-def test_a_fitted_run_ends_low_whatever_the_controller_does():
+def test_a_fitted_run_ends_at_a_low_rate_whatever_the_rule_decides():
     restarts = dataclasses.replace(OPTIM.restarts, last_cycle="fit", factor=1.0)
     optim = dataclasses.replace(OPTIM, restarts=restarts)
     rng = np.random.default_rng(0)
@@ -180,7 +180,7 @@ def test_a_fitted_run_ends_low_whatever_the_controller_does():
     assert (rates[-1] < 0.8 * 0.3).all()
 
 
-def test_the_record_tells_the_cycles():
+def test_cycles_are_recorded():
     state = make_optimizer(OPTIM, 100).init(PARAMS)
     state = with_cycle(state, cycle_of(state)._replace(count=np.int32(6)))
     memory = Memory(best=1.0, cycle_best=1.0)

@@ -62,7 +62,7 @@ def test_a_run_that_lacks_a_new_setting_resumes_with_its_default(tmp_path, capsy
         run(folder, start="resume", current_form=completed, resolved=other)
 
 
-def test_the_number_of_cores_is_recorded_and_a_change_is_told(tmp_path, capsys, monkeypatch):
+def test_the_number_of_cores_is_recorded_and_a_change_is_reported(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "run"
     run(folder, config=dataclasses.replace(CONFIG, steps=4))
     (start,) = read_provenance(folder)
@@ -77,7 +77,7 @@ def test_the_number_of_cores_is_recorded_and_a_change_is_told(tmp_path, capsys, 
     assert read_provenance(folder)[-1]["threads"] == thread_setting() == start["threads"] | {"OMP_NUM_THREADS": "77"}
 
 
-def test_a_checkpoint_is_known_by_its_content(tmp_path):
+def test_a_checkpoint_is_identified_by_its_content(tmp_path):
     def content(name, **others):
         run(tmp_path / name, config=dataclasses.replace(CONFIG, steps=4), **others)
         return Checkpoints(tmp_path / name / "checkpoints").content(4)

@@ -1,4 +1,4 @@
-"""Streams by name and step."""
+"""Random streams by name and step."""
 
 import zlib
 

@@ -63,7 +63,7 @@ def test_first_update_is_adamw_with_clipping():
     np.testing.assert_allclose(updates["bias"], [0.0, -0.1], rtol=1e-4)
 
 
-def test_what_never_has_a_gradient_does_not_decay():
+def test_parameters_without_gradients_do_not_decay():
     params = {"frozen": {"kernel": jnp.ones((2, 2))}, "learned": {"kernel": jnp.ones((2, 2))}}
     grads = {"frozen": {"kernel": jnp.zeros((2, 2))}, "learned": {"kernel": jnp.array([[1.0, 0.0], [0.0, 0.0]])}}
     for decay in ("decoupled", "coupled"):
@@ -106,7 +106,7 @@ def test_new_settings_are_off_by_default():
     )
     optimizer = make_optimizer(config, 9)
     states = [optimizer.init(params), plain.init(params)]
-    # Also checkpoints written before there were such settings must fit.
+    # Checkpoints written before these settings existed must still load.
     assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
     for _ in range(4):
         (updates, states[0]), (expected, states[1]) = (
@@ -125,7 +125,7 @@ def test_new_settings_are_off_by_default():
         ({"restarts": RestartsConfig(floor=-0.1)}, r"restarts\.floor is -0\.1"),
     ],
 )
-def test_settings_that_cannot_work_are_named(change, message):
+def test_invalid_settings_are_named(change, message):
     for make in (make_optimizer, make_rate):
         with pytest.raises(UserError, match=message):
             make(OptimConfig(warmup_steps=0, **change), 10)
@@ -175,9 +175,9 @@ def test_warm_restarts_are_pytorchs(path):
 def test_one_cosine_is_pytorchs(path):
     expected = load_module_case(path).outputs["cosine_annealing_T20"]
     rates = rates_of(OptimConfig(lr=1e-3, warmup_steps=0, final_ratio=0.01), 20, 21)
-    # Beyond its end PyTorch's goes up again as it came down; no run of ours goes there.
+    # Beyond its end PyTorch's schedule rises again; our runs end before that.
     back = 20 - np.abs(np.arange(len(expected)) % 40 - 20)
-    # The peak's share of float32 rounding: this schedule is optax's, not made for the last digits near its end.
+    # Tolerance: float32 rounding relative to the peak, because optax's schedule is not exact near its end.
     np.testing.assert_allclose(rates[back], expected, rtol=1e-6, atol=1e-7 * 1e-3)
 
 

@@ -105,7 +105,7 @@ def test_non_finite_numbers_leave_the_state_as_it_was(poison):
     jax.tree.map(np.testing.assert_array_equal, after, before)
 
 
-def test_one_bad_seed_holds_all_seeds():
+def test_one_non_finite_seed_stops_the_update_of_all_seeds():
     state = fresh((0, 1))
     update = make_multi_seed_step(LineTask(blow_up=100.0), OPTIM, STEPS, batch="per_seed")
     batch = jax.tree.map(lambda a, b: np.stack([a, b]), batch_of(0, 0), batch_of(1, 0))
@@ -115,13 +115,13 @@ def test_one_bad_seed_holds_all_seeds():
     assert state.step.tolist() == [0, 0]
 
 
-def test_several_seeds_start_with_the_bits_of_each_alone():
+def test_several_seeds_start_from_the_parameters_of_each_alone():
     alone, together = fresh((8,)), per_seed(fresh((3, 8)), (3, 8))[1]
     jax.tree.map(np.testing.assert_array_equal, alone.params, together.params)
 
 
 @pytest.mark.parametrize("sharing", ["shared", "per_seed"])
-def test_several_seeds_are_each_as_if_alone(sharing):
+def test_several_seeds_each_equal_a_single_seed(sharing):
     seeds = (3, 8, 11)
     together = fresh(seeds)
     update = make_multi_seed_step(LineTask(), OPTIM, STEPS, batch=sharing)

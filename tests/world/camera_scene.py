@@ -1,4 +1,4 @@
-"""A straight street far from the origin, small enough to reason about, before a ring of cameras."""
+"""A small scene for ring cameras: a straight street far from the origin."""
 
 import numpy as np
 

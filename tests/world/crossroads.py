@@ -1,4 +1,4 @@
-"""A hand-made network small enough to reason about: two one-way streets that cross.
+"""A small hand-made network: two one-way streets that cross.
 
 West to east: 1 -> 2 -> 3; south to north: 4 -> 5 -> 6, with a bend to the east 4 -> 7 -> 3. Stop lines lie 8 m before
 the middle. One crosswalk runs over street 3.

@@ -1,4 +1,4 @@
-"""The bird's-eye-view evidence: where it is, what hides it, how it degrades."""
+"""The bird's-eye-view evidence: geometry, occlusion and degradation."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def cell(x, y):
     return int((y + 25.6) / 0.512), int((x + 51.2) / 0.512)
 
 
-def test_nothing_there_is_nothing_seen():
+def test_an_empty_scene_gives_empty_evidence():
     image = render()
     assert image.shape == (100, 200, 4)
     assert image.dtype == np.uint8
@@ -62,12 +62,12 @@ def test_each_thing_is_in_its_channel():
     image = render(lane_map(crossings=(ring,), road_boundaries=(edge,)), TRUCK)
     assert not image[..., PAINT].any()
     assert image[..., BevChannel.CROSSING][cell(7, 7)] == 255
-    # The truck stands between the sensor and nothing of the edge at x = 0.
+    # The truck occludes no part of the edge at x = 0.
     assert image[..., BevChannel.ROAD_EDGE][cell(0, -9)] > 200
     assert image[..., OBSTACLE].any()
 
 
-def test_what_stands_in_the_line_of_sight_leaves_no_evidence_behind_it():
+def test_occluders_leave_no_evidence_behind_them():
     behind = lane_map(segment(0, [(16.0, -1.75), (50.0, -1.75)], left=LineType.SOLID, right=LineType.NONE))
     assert render(behind)[..., PAINT].any()
     assert not render(behind, TRUCK)[..., PAINT].any()
@@ -131,7 +131,7 @@ def test_severity_scales_every_degradation():
     assert 0.0 < distance(0.3) < distance(1.0) < distance(2.0)
 
 
-def test_lost_and_invented_patches_cover_about_their_share():
+def test_lost_and_invented_patches_cover_about_their_fraction():
     clean = BevSensorConfig(lost=0.0, invented=0.0, noise=0.0, far_error=0.0)
     lossy = dataclasses.replace(clean, lost=0.25)
     inventive = dataclasses.replace(clean, invented=0.05)

@@ -1,3 +1,5 @@
+"""The ground in camera images: texture, paint, wear, kerbs."""
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ def ground(window, wear=0.5, levels=6):
 
 
 def test_ground_stays_where_it_is_in_every_window():
-    """Two windows that overlap have the same texels there: texture, dirt, wear and all."""
+    """Two overlapping windows have the same texels in their overlap, with texture, dirt and wear."""
     first, second = (ground(window_around(MIDDLE + shift, 12.0, 0.08), levels=1) for shift in ([0.0, 0.0], [7.3, 3.9]))
     column, row = np.round((np.array(second.window.low) - first.window.low) / 0.08).astype(int)
     a, b = first.levels[0][row:, column:], second.levels[0][: first.window.rows - row, : first.window.columns - column]

@@ -1,4 +1,4 @@
-"""Markers in the world's images: where geometry puts them, as dark as their area, behind what hides them."""
+"""Markers in the world's images: projection, brightness by area, occlusion."""
 
 from dataclasses import replace
 
@@ -118,7 +118,7 @@ def test_a_marker_is_seen_from_its_face_only():
 
 
 def test_pictures_stay_with_their_polygons():
-    """Whatever bodies are joined, chosen and moved."""
+    """After bodies are joined, selected and moved."""
     some, more = (
         marker_bodies(markers(pose(9.0, 0.0, 2.5), pose(12.0, 1.0, 2.5))),
         marker_bodies(markers(pose(15.0, 2.0, 2.5), ids=[5])),
@@ -171,7 +171,7 @@ def test_nothing_to_draw():
         ({"ids": [-1]}, "0 to 99"),
     ],
 )
-def test_what_means_nothing_is_refused(change, words):
+def test_invalid_arguments_are_refused(change, words):
     covered = change.pop("covered", 0.0)
     with pytest.raises(UserError, match=words):
         marker_bodies(markers(pose(9.0, 0.0, 2.0), **change), covered=covered)

@@ -1,3 +1,5 @@
+"""Rings of cameras: mounts, fields of view, scaling."""
+
 import numpy as np
 import pytest
 

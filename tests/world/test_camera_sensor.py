@@ -1,4 +1,4 @@
-"""Images of the ring cameras against what geometry says must be in them."""
+"""Images of the ring cameras against projections by `geometry`."""
 
 from dataclasses import replace
 

@@ -1,3 +1,5 @@
+"""Drawing of solid bodies in camera images: order, clipping, placement."""
+
 import numpy as np
 import pytest
 
@@ -60,7 +62,7 @@ PAIRS = {
 
 @pytest.mark.parametrize("order", [1, -1])
 @pytest.mark.parametrize("pair", PAIRS)
-def test_what_stands_before_hides_what_stands_behind(pair, order):
+def test_nearer_bodies_hide_farther_ones(pair, order):
     front, behind, point = PAIRS[pair]
     image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     draw_bodies(image, join([front, behind][::order]), CAMERA, WEATHER)

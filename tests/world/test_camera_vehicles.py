@@ -1,3 +1,5 @@
+"""Bodies of road users: extent, variety, orientation of faces."""
+
 import numpy as np
 import pytest
 
@@ -16,12 +18,12 @@ def drawn(category, seed=0, pace=0.0):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("category", list(RoadUser))
 def test_bodies_fill_their_box_and_stay_within_it(category, seed):
-    """The order in which bodies are drawn rests on their boxes; the tracker's box is what stands there."""
+    """The drawing order of bodies depends on their boxes, and the tracker reports the same boxes."""
     size, parts = drawn(category, seed, pace=0.25)
     for solid, (x, y, length, width, yaw, low, high) in parts:
         corners = np.concatenate(solid.corners)
         assert yaw == 0.0
-        # Arms and handlebars of who is narrow reach out of the box a little.
+        # Arms and handlebars of narrow road users reach out of the box a little.
         slack = 0.06 if category <= RoadUser.BUS else 0.25
         assert (np.abs(corners[:, :2] - [x, y]) <= np.array([length, width]) / 2 + slack).all()
         assert corners[:, 2].min() >= low - 1e-9
@@ -32,14 +34,14 @@ def test_bodies_fill_their_box_and_stay_within_it(category, seed):
 
 
 @pytest.mark.parametrize("category", list(RoadUser))
-def test_looks_tell_them_apart(category):
+def test_vehicles_of_one_kind_vary_in_colour(category):
     colours = [np.concatenate([solid.colours for solid, _ in drawn(category, seed)[1]]) for seed in range(6)]
     assert len({array.tobytes() for array in colours}) > 1
 
 
 @pytest.mark.parametrize("category", list(RoadUser))
 def test_outer_faces_look_outwards(category):
-    """Of a convex body's polygons none is seen from inside: their planes have its middle behind them."""
+    """Polygons of a convex body face outwards: the body's middle lies behind each plane."""
     _, parts = drawn(category)
     for solid, box in parts:
         bodies = pack([solid], [box])

@@ -91,7 +91,7 @@ def test_nobody_enters_while_crossing_traffic_is_inside(table):
     assert chosen(table, cars)[1] < 0.0
 
 
-def test_lane_beside_is_in_the_way_where_it_forks(priority_table):
+def test_a_forking_lane_blocks_its_neighbour(priority_table):
     # The leader turns off and has its middle 3 m into the connector; the follower goes straight on.
     cars = convoy(priority_table, [(3, 4, 5), (3, 6, 2)], [TO_LINE - 10.0, TO_LINE + 3.0], [8.0, 0.5])
     assert chosen(priority_table, cars)[0] < -2.0
@@ -109,7 +109,7 @@ def test_drivers_stop_for_someone_on_a_crossing(table):
     assert crossings_busy(near, footing(near), places, 1).tolist() == [True]
 
 
-def test_people_wait_at_the_kerb_of_a_busy_crossing():
+def test_pedestrians_wait_at_the_kerb_of_a_busy_crossing():
     walks = crossroads().walk_across
     people = draw_crossers(np.random.default_rng(0), walks, start=0.0, stop=60.0, per_minute=20.0)
     assert len(people.pace) > 5

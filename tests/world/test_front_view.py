@@ -1,3 +1,5 @@
+"""Front views: labels against projected lines, weather, determinism."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -176,7 +178,7 @@ def test_severity_zero_is_clear_fresh_and_free_of_noise():
 
 
 @pytest.mark.parametrize("severity", [-0.1, 1.1, float("nan")])
-def test_a_severity_that_is_none_is_refused(severity):
+def test_an_invalid_severity_is_refused(severity):
     with pytest.raises(UserError, match="severity must be between 0 and 1"):
         draw_front_scene(0, FrontWorldConfig(severity=severity))
 

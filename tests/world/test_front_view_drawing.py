@@ -1,3 +1,5 @@
+"""Drawing of front views: camera, road coordinates, stripes, solids, noise."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -20,7 +22,7 @@ SCENES = st.integers(0, 3 * 10**8 - 1)
 
 @settings(max_examples=20, deadline=None)
 @given(SCENES)
-def test_the_camera_sees_as_the_geometry_floor_says(seed):
+def test_the_camera_agrees_with_geometry(seed):
     camera = draw_camera(np.random.default_rng(seed), FrontCameraConfig())
     xy = np.random.default_rng(seed).uniform([5.0, -20.0], [80.0, 20.0], (30, 2))
     pixels, depth = camera.image_of(lift(xy))
@@ -37,7 +39,7 @@ def test_the_camera_sees_as_the_geometry_floor_says(seed):
     np.testing.assert_allclose(camera.horizon_rows(far[:, 0]), far[:, 1], atol=1e-3)
 
 
-def test_pitch_yaw_and_roll_turn_the_way_they_say():
+def test_pitch_yaw_and_roll_have_their_documented_directions():
     ahead = np.array([20.0, 0.0, 1.5, 1.0])
     assert (camera_pose(1.5, 0.1) @ ahead)[1] < 0.0  # looking down, what is ahead rises in the image
     assert (camera_pose(1.5, 0.0, yaw=0.1) @ ahead)[0] > 0.0  # looking left, it moves right
@@ -67,7 +69,7 @@ def test_every_pixel_knows_its_place_on_the_road():
     assert ground.seen[-1].all()
 
 
-def test_the_road_is_as_wide_as_it_says():
+def test_the_road_has_its_configured_width():
     rng = np.random.default_rng(0)
     for _ in range(50):
         road = draw_highway(rng, HighwayConfig(), 1.0)
@@ -82,7 +84,7 @@ def test_the_road_is_as_wide_as_it_says():
 
 @pytest.mark.parametrize("period", [0.0, 6.0])
 def test_a_stripe_covers_its_own_area(period):
-    """The paint in a row is as wide as the stripe, however thin it is there, times the share of dashes."""
+    """Paint in a row is as wide as the stripe, also below a pixel; of dashed lines the painted fraction is filled."""
     scene = draw_front_scene(2)
     camera, road = scene.camera, scene.road
     ground = look_at_ground(camera, road.axis)
@@ -135,7 +137,7 @@ def test_a_polygon_beside_the_camera_is_cut_at_it():
     assert image[200:, 600:].any()
 
 
-def test_a_polygon_that_hardly_begins_before_the_camera_is_no_trouble():
+def test_a_polygon_at_the_near_plane_causes_no_error():
     scene = draw_front_scene(5)
     forward = np.linalg.inv(scene.camera.camera_from_ego)[:3, 2]
     eye = np.linalg.inv(scene.camera.camera_from_ego)[:3, 3]
@@ -170,7 +172,7 @@ def test_each_vehicle_is_a_solid_around_its_place(count):
         assert points[:, 2].max() < 1.6
 
 
-def test_everything_beside_the_road_is_beside_it():
+def test_roadside_objects_stay_off_the_road():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         road = draw_highway(rng, HighwayConfig(extra_lane=0.0), 0.0)
@@ -182,7 +184,7 @@ def test_everything_beside_the_road_is_beside_it():
                 assert not (inside & (s > 0.0) & (s < 200.0)).any()
 
 
-def test_the_noise_tile_is_noise():
+def test_the_noise_tile_has_the_statistics_of_noise():
     tile = noise_tile()
     assert tile.dtype == np.float32
     np.testing.assert_allclose([tile.mean(), tile.std()], [0.0, 1.0], atol=1e-3)

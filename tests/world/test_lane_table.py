@@ -50,7 +50,7 @@ def test_crossing_lanes_exclude_each_other_until_the_tail_is_clear(table):
     assert not table.crosses[row(table, 1)].any()
 
 
-def test_priority_traffic_does_not_stop_for_those_who_yield_into_its_lane(table):
+def test_priority_traffic_does_not_stop_for_yielding_traffic(table):
     assert table.yields[row(table, 7), row(table, 2)]
     assert table.crosses[row(table, 7), row(table, 2)]
     assert table.is_gate[row(table, 7)]

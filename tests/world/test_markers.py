@@ -1,4 +1,4 @@
-"""Where fiducial markers stand."""
+"""Placement of fiducial markers."""
 
 from dataclasses import fields, replace
 
@@ -46,7 +46,7 @@ def test_a_marker_stands_right_of_the_approach_and_faces_its_traffic():
     assert (driver[:2] < 0.0).all()
 
 
-def test_boards_behind_a_junction_face_those_who_come_across():
+def test_boards_behind_a_junction_face_crossing_traffic():
     crossing = lane_map(
         segment(2, [(-50, -1.75), (0, -1.75)], [4]),
         segment(4, [(0, -1.75), (20, -1.75)], [5], is_intersection=True),

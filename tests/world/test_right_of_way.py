@@ -9,7 +9,7 @@ from tflane_jax.scene import LineType
 from tflane_jax.world.roads.networks import RoadNetwork, SceneKind
 
 
-def test_a_turning_lane_only_turns():
+def test_a_turning_lane_leads_only_to_turns():
     """A lane that forks off before a junction leads there by one connector, to a turn."""
     pockets = 0
     for net in (network(s, SceneKind.FOUR_WAY) for s in range(8)):

@@ -1,4 +1,4 @@
-"""Procedural road networks hold the promises that traffic, examples and pictures build on."""
+"""Properties of procedural road networks that traffic, examples and pictures rely on."""
 
 from __future__ import annotations
 

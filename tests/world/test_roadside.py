@@ -1,4 +1,4 @@
-"""What stands and lies beside the lanes: kerbs, sidewalks, parked vehicles, buildings, crossings."""
+"""Roadside objects: kerbs, sidewalks, parked vehicles, buildings, crossings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SD maps of the built-in world: where their lines lie, what their faults do, what they leave as it was."""
+"""SD maps of the built-in world: places of lines, errors, and independence of the rest of a scene."""
 
 from dataclasses import replace
 
@@ -98,7 +98,7 @@ def test_a_map_without_faults_is_the_road():
 
 
 def test_an_error_of_the_receiver_moves_the_whole_map():
-    """Two vehicles with one error see one shift in global axes, whichever way they look."""
+    """Two vehicles with one error see one shift in global axes, whatever their headings are."""
     config = replace(EXACT, translation=2.0, yaw_deg=3.0, range=PerceptionRange((-500, 500), (-500, 500)))
     dx, dy, turn = gnss_error(5, 0.0, config)
     assert min(abs(dx), abs(dy)) > 0.01
@@ -129,7 +129,7 @@ def test_survey_errors_are_large_but_smooth():
     np.testing.assert_allclose(errors.std((0, 1)), 1.0, rtol=0.1)
     nearby = np.stack([survey_error(points + 0.7, seed) for seed in range(200)])
     assert (nearby - errors).std() < 0.1
-    # The error of a place does not hang on the others asked about.
+    # The error of a place does not depend on the other places of the query.
     np.testing.assert_allclose(survey_error(points[:3], 4), survey_error(points, 4)[:3], atol=1e-12)
 
 
@@ -155,7 +155,7 @@ def test_simplified_lines_stay_within_the_tolerance(seed, count, tolerance):
     np.testing.assert_array_equal(simplify(line, 0.0), line)
 
 
-def test_simplifying_drops_what_a_straight_line_says():
+def test_simplifying_drops_points_on_a_straight_line():
     line = np.stack([np.arange(9.0), np.zeros(9)], -1)
     np.testing.assert_array_equal(simplify(line, 0.1), line[[0, -1]])
     angle = np.linspace(0, 2 * np.pi, 49)

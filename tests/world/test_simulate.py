@@ -1,4 +1,4 @@
-"""Scenes from their numbers."""
+"""Whole scenes, generated from their numbers."""
 
 from dataclasses import replace
 

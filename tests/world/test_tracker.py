@@ -1,4 +1,4 @@
-"""The tracker on hand-made actors: what it sees, what it loses, what it mixes up."""
+"""The tracker on hand-made actors: detection, loss and confusion of identities."""
 
 import math
 from dataclasses import replace
@@ -185,7 +185,7 @@ def test_interpolated_line_of_sight_is_exact_where_it_is_computed():
     assert (every < 1.0).any()
 
 
-def test_what_stands_in_padding_is_never_read():
+def test_padding_is_never_read():
     rng = np.random.default_rng(3)
     valid = rng.random((30, 6)) < 0.7
     clean = actors_at(rng.uniform(-30, 30, (30, 6, 2)), [CAR] * 6, valid=valid)

@@ -70,7 +70,7 @@ def test_motion_is_physical(which):
     assert change.max() < 6.0
     turn = (np.diff(yaw, axis=0) + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(turn[there]).max() < 0.25
-    # Nobody turns on the spot.
+    # No vehicle turns on the spot.
     assert np.abs(turn[there & (speed < 0.01)]).max(initial=0.0) < 0.01
 
 
@@ -125,7 +125,7 @@ def test_red_lights_are_respected():
             passes = (front[:-1] < -STOP) & (front[1:] >= -STOP) & on_street[1:] & traffic.present[1:]
             frame, _ = np.nonzero(passes & (traffic.category <= RoadUser.BICYCLE))
             for f in frame:
-                # Who is too near to stop when the light turns may take 12 m/s / (2 * 3.5 m/s^2) s to the line.
+                # A vehicle too near to stop when the light changes may take 12 m/s / (2 * 3.5 m/s^2) s to the line.
                 assert (green[f + 30 - 22 : f + 31] == phase).any()
             crossings_of_the_line += len(frame)
     assert crossings_of_the_line > 15

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 
 from tflane_jax.scene import shapes_of
-from tflane_jax.tasks.base import Task
+from tflane_jax.tasks.base import AnyTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
@@ -52,24 +52,24 @@ def parameter_counts(params: Any, depth: int = 1) -> dict[str, int]:
     return counts
 
 
-def shapes_of_params(task: Task[Any, Any], example: Any) -> Any:
+def shapes_of_params(task: AnyTask, example: Any) -> Any:
     """Return the shapes of a task's parameters; raises what the model raises for an example that does not fit."""
     return jax.eval_shape(task.init, jax.random.key(0), _trained_on(task, example))
 
 
-def _trained_on(task: Task[Any, Any], example: Any) -> Any:
+def _trained_on(task: AnyTask, example: Any) -> Any:
     """Return the shapes of one training input: the example, or a clip of examples."""
     return example if task.frames == 1 else shapes_of(example, task.frames)
 
 
-def prediction_program(task: Task[Any, Any], example: Any, *, compiled: bool = True) -> Program:
+def prediction_program(task: AnyTask, example: Any, *, compiled: bool = True) -> Program:
     """Return the cost of predicting one example; `example` holds shapes."""
     lowered = jax.jit(task.predict).lower(shapes_of_params(task, example), example)
     return _program("prediction", 1, lowered, compiled)
 
 
 def training_program(
-    task: Task[Any, Any], example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
+    task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
     """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
     example = _trained_on(task, example)

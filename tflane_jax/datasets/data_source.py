@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from tflane_jax.datasets.base import Split
+from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
 from tflane_jax.scene import Example, RoadImage
 
@@ -24,6 +24,15 @@ class SplitData(Protocol):
 
     def source(self, split: Split) -> Any:
         """Return the config of a split, of the class `DataSource.config`."""
+        ...
+
+
+class LaneGraphSource(Protocol):
+    """What the configs of all datasets of lane graphs have in common."""
+
+    @property
+    def example(self) -> ExampleConfig:
+        """Sizes and ranges of the examples."""
         ...
 
 

@@ -26,6 +26,10 @@ ExampleT = TypeVar("ExampleT")
 """Type of an example: `Example` or `RoadImage`."""
 DataT = TypeVar("DataT")
 """Type of a split, as returned by `load` and taken by `evaluate`."""
+SourceT = TypeVar("SourceT")
+"""Type of the configuration that names a split, as returned by `data.source(split)`."""
+MemoryT = TypeVar("MemoryT")
+"""Type of what a model carries from frame to frame; None for a model without memory."""
 
 Terms = dict[str, Float[Array, ""] | Params]
 """Numbers to record beside a loss; the entry `STATISTICS` holds the new running statistics."""
@@ -42,13 +46,13 @@ class Model:
         params: parameters of one seed.
     """
 
-    task: Task[Any, Any]
+    task: AnyTask
     params: Params
 
 
 @dataclass(frozen=True)
-class Task(Generic[ExampleT, DataT]):
-    """Base class of all tasks. The argument `source` below is the configuration returned by `data.source(split)`."""
+class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
+    """Base class of all tasks."""
 
     columns: ClassVar[tuple[str, ...]] = ()
     """Columns of the evaluation's table; those that an evaluation lacks are left out."""
@@ -85,11 +89,11 @@ class Task(Generic[ExampleT, DataT]):
         """Return the last decoder layer's prediction for one example, without memory of earlier frames."""
         raise NotImplementedError
 
-    def start(self) -> Any:
-        """Return the memory before the first frame of a sequence; None for a model without memory."""
-        return None
+    def start(self) -> MemoryT:
+        """Return the memory before the first frame of a sequence."""
+        raise NotImplementedError
 
-    def step(self, params: Params, memory: Any, example: ExampleT) -> tuple[Any, Prediction]:
+    def step(self, params: Params, memory: MemoryT, example: ExampleT) -> tuple[MemoryT, Prediction]:
         """Return the memory for the next frame, and the prediction for this one."""
         return memory, self.predict(params, example)
 
@@ -101,7 +105,7 @@ class Task(Generic[ExampleT, DataT]):
         """Fields of an example that training and evaluation read; empty: all fields."""
         return ()
 
-    def load(self, source: Any, *, progress: bool = True) -> DataT:
+    def load(self, source: SourceT, *, progress: bool = True) -> DataT:
         """Return a split, in memory or as a `Streamed` that reads examples on demand."""
         raise NotImplementedError
 
@@ -135,14 +139,14 @@ class Task(Generic[ExampleT, DataT]):
         """Return the function that draws predictions for a few validation examples during training."""
         raise NotImplementedError
 
-    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: DataT, path: Path) -> Path:
+    def draw_comparison(self, models: Mapping[str, Model], source: SourceT, data: DataT, path: Path) -> Path:
         """Draw what several models predict for the same examples; return the picture's path."""
         raise NotImplementedError
 
     # -----------------------------------------------------------------------------------------------------------------
     # Comparing
 
-    def inference_variants(self) -> dict[str, Task[ExampleT, DataT]]:
+    def inference_variants(self) -> dict[str, Task[ExampleT, DataT, SourceT, MemoryT]]:
         """Return variants of a trained model at inference, as further rows of a comparison, by suffix of its name."""
         return {}
 
@@ -154,6 +158,10 @@ class Task(Generic[ExampleT, DataT]):
     def quoted(self) -> list[dict[str, str]]:
         """Return rows that a comparison quotes from papers."""
         return []
+
+
+AnyTask = Task[Any, Any, Any, Any]
+"""A task of which only the common methods are used."""
 
 
 def spread(size: int, count: int) -> list[int]:

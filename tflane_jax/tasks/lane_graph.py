@@ -17,7 +17,7 @@ from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import Dataset, ExampleConfig
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
-from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.data_source import LaneGraphSource, SplitData
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
@@ -45,7 +45,7 @@ _COMPARED_EXAMPLES = 6
 
 
 @dataclass(frozen=True)
-class LaneGraphTask(Task[Example, Example | Streamed]):
+class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemory | None]):
     """A host with its loss.
 
     Attributes:
@@ -178,7 +178,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     # -----------------------------------------------------------------------------------------------------------------
     # Data
 
-    def load(self, source: Any, *, progress: bool = True) -> Example | Streamed:
+    def load(self, source: LaneGraphSource, *, progress: bool = True) -> Example | Streamed:
         """Return the examples of a source, see `datasets.sources.load`."""
         return sources.load(source, progress=progress, parts=self.parts)
 
@@ -268,7 +268,9 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
 
         return draw
 
-    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: Example | Streamed, path: Path) -> Path:
+    def draw_comparison(
+        self, models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path
+    ) -> Path:
         """Draw the test frames with the most occluded lanes, every model beside the ground truth.
 
         Of streamed data, frames are spread evenly instead.
@@ -293,7 +295,7 @@ class LaneGraphTask(Task[Example, Example | Streamed]):
     # -----------------------------------------------------------------------------------------------------------------
     # Comparing
 
-    def inference_variants(self) -> dict[str, Task[Example, Example | Streamed]]:
+    def inference_variants(self) -> dict[str, Task[Example, Example | Streamed, LaneGraphSource, HostMemory | None]]:
         """Return the variant without traffic flow at inference, for models with it (TF-Lane, Table 7)."""
         if self.model.priors.traffic_flow is None:
             return {}

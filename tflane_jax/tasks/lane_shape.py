@@ -17,10 +17,12 @@ from jaxtyping import Array, Float
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import augment
 from tflane_jax.datasets.data_source import SplitData
+from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
 from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare
+from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.evaluation import lane_shapes
 from tflane_jax.evaluation.predict import Predictor, predict_batch, predictions
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
@@ -48,9 +50,11 @@ _TABLE_1 = (
     ("GTN paper", 420, 96.21, 2.93, 4.02),
 )
 
+ImageSource = FrontViewConfig | TuSimpleConfig
+
 
 @dataclass(frozen=True)
-class LaneShapeTask(Task[RoadImage, LabelledImages]):
+class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     """A network of the LSTR family with its loss.
 
     Attributes:
@@ -95,7 +99,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
         layers = self.model.build().apply({"params": learned} | statistics, image, example.image_valid)
         return Prediction(curves=jax.tree.map(lambda leaf: leaf[-1], layers))
 
-    def load(self, source: Any, *, progress: bool = True) -> LabelledImages:
+    def start(self) -> None:
+        """Return None: images have no memory."""
+
+    def load(self, source: ImageSource, *, progress: bool = True) -> LabelledImages:
         """Return the images of a source, stacked, with their labels."""
         return sources.load(source, progress=progress)
 
@@ -150,7 +157,9 @@ class LaneShapeTask(Task[RoadImage, LabelledImages]):
 
         return draw
 
-    def draw_comparison(self, models: Mapping[str, Model], source: Any, data: LabelledImages, path: Path) -> Path:
+    def draw_comparison(
+        self, models: Mapping[str, Model], source: ImageSource, data: LabelledImages, path: Path
+    ) -> Path:
         """Draw a few test images, every model beside the ground truth."""
         from tflane_jax.plots.images import save_road_images
 

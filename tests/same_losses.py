@@ -23,6 +23,8 @@ from tests.test_config import ROOT, shipped
 
 _FEW_SCENES = ["--data.train", "8", "--data.val", "1", "--data.test", "1"]
 _PAPER_SIZE_STEPS = 3
+# Data to be exported, in more cameras than the model beside them has; the paper-size models train on them.
+_DATA_ONLY = ("camera.native_ring",)
 _TRAIN_LOG = "adcf7d18-0510-35b0-a2fa-b4cea13a6d76"
 _TEST_LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 
@@ -40,8 +42,6 @@ def arguments_of(name: str, steps: int, exported: Path) -> list[str]:
         return [*arguments, "--data.image.front_rows", "None", "--data.image.front_size", "None"]
     if name.startswith("markers."):
         arguments += ["--training.init_from", "None"]
-    if name == "camera.native_ring":
-        arguments += ["--data.example.cameras.scale", "0.1"]
     return arguments + (_real_data(name) or _FEW_SCENES)
 
 
@@ -112,7 +112,7 @@ def main() -> int:
     wrong = 0
     for name, reference in shipped().items():
         chosen = name in options.names if options.exact else name.startswith(tuple(options.names))
-        if not reference or (options.names and not chosen):
+        if not reference or name in _DATA_ONLY or (options.names and not chosen):
             continue
         sides = {}
         for side, checkout in (("before", options.before.resolve()), ("after", ROOT)):

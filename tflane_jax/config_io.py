@@ -67,10 +67,10 @@ def from_json(kind: type[T], content: Any) -> T:
 
 
 def subclasses(kind: type) -> dict[str, type]:
-    """Return the dataclasses that derive from `kind`, by name, with `kind` itself where it stands for something.
+    """Return `kind` and the dataclasses derived from it, by class name.
 
-    A base class that others fill in (`HostConfig`, `HostLossConfig`) accepts all of them: those of its own package,
-    whose modules are imported to find them, and those of the caller's, as far as they are imported already.
+    For an open base class (`HostConfig`, `HostLossConfig`), all modules of its package are imported first, so that
+    every shipped subclass is found. Subclasses of other packages are found if they are imported already.
     """
     if kind.__module__.startswith("tflane_jax.") and getattr(kind, "open_base", False):
         package = importlib.import_module(kind.__module__.rpartition(".")[0])

@@ -8,7 +8,7 @@ import pytest
 
 from tests.fakes import fake_example, fake_views
 from tflane_jax.datasets.leaves import PARTS, example_from_leaves, example_leaves
-from tflane_jax.scene import Example, MarkerObservations, SdMap
+from tflane_jax.scene import Example, MapLines, MarkerObservations, SdMap
 
 
 def full_example() -> Example:
@@ -24,7 +24,8 @@ def full_example() -> Example:
         valid=np.ones(2, bool),
     )
     sd_map = SdMap(points=np.ones((1, 5, 2)), category=np.zeros(1, int), valid=np.ones(1, bool))
-    return fake_example().replace(markers=markers, sd_map=sd_map, cameras=fake_views())
+    lines = MapLines.empty(2, 4)
+    return fake_example().replace(markers=markers, sd_map=sd_map, cameras=fake_views(), map_lines=lines)
 
 
 def test_every_container_of_an_example_is_known():

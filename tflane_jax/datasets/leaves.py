@@ -14,6 +14,7 @@ from tflane_jax.scene import (
     Example,
     LaneGraph,
     LaneLines,
+    MapLines,
     MarkerObservations,
     RoadImage,
     SdMap,
@@ -31,6 +32,7 @@ PARTS = {
     "areas": Areas,
     "traffic_elements": TrafficElements,
     "cameras": CameraViews,
+    "map_lines": MapLines,
 }
 
 # The same of `RoadImage`.

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.sampling import deformable_attention
-from tflane_jax.layers.sampling import sample_bilinear as sample_bilinear
 
 
 def compass_offsets(heads: int, levels: int, points: int) -> np.ndarray:

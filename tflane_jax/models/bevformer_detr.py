@@ -17,8 +17,7 @@ from tflane_jax.geometry.bezier import bezier_basis
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
-from tflane_jax.models.encoders import check_elements
-from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.encoders import EncoderConfig, check_elements
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, LaneHeads, make_prediction
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes
@@ -40,7 +39,7 @@ class BevFormerDetrConfig(HostConfig):
         encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
     """
 
-    encoder: EvidenceEncoderConfig | CameraEncoderConfig = CameraEncoderConfig()
+    encoder: EncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
     control_points: int | None = None

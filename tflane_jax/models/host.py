@@ -15,9 +15,8 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.bev_encoder import BevMemory
-from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
-from tflane_jax.models.encoders import encode_example, make_encoder, start_bev_memory
+from tflane_jax.models.encoders import EncoderConfig, encode_example, make_encoder, start_bev_memory
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.prior import HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, PriorsConfig, bev_hook, encode, observe, start_memories
@@ -48,7 +47,7 @@ class HostConfig:
         elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
     """
 
-    encoder: EvidenceEncoderConfig | CameraEncoderConfig = EvidenceEncoderConfig()
+    encoder: EncoderConfig = EvidenceEncoderConfig()
     range: PerceptionRange = PerceptionRange()
     priors: PriorsConfig = PriorsConfig()
     elements: ElementDecoderConfig | None = None

@@ -20,9 +20,10 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
-from tflane_jax.layers.deformable import DeformableAttention, sample_bilinear
+from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGraphFeedForward
 from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.layers.sampling import sample_bilinear
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.lane_queries import LaneDecoderConfig

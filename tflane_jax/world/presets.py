@@ -15,18 +15,26 @@ from tflane_jax.world.traffic.simulation import TrafficConfig
 from tflane_jax.world.traffic.tracker import TrackerConfig
 
 CITY = WorldConfig(
-    # The ego vehicle drives up to 140 m before its first key frame.
-    roads=RoadConfig(reach=180.0, ego_reach=165.0, parking=0.7),
+    # The ego vehicle drives up to 160 m before its first key frame.
+    roads=RoadConfig(reach=190.0, ego_reach=178.0, parking=0.75, bike=0.35),
     traffic=TrafficConfig(
-        vehicles_per_metre=0.04,
-        parked_share=0.75,
-        pedestrians_per_metre=0.055,
-        crossers_per_minute=6.0,
-        variety=0.5,
+        vehicles_per_metre=0.05,
+        bicycles_per_metre=0.018,
+        parked_share=0.9,
+        pedestrians_per_metre=0.085,
+        crossers_per_minute=8.0,
+        variety=0.6,
+        ego_top_speed=12.0,
         ego_passes_s=13.0,
+        range=80.0,
+        warm_up_s=12.0,
+        early_s=70.0,
+        step_s=0.4,
     ),
     # Like labelled tracks: they bridge an occlusion of 2 s, and a glimpse of a road user is enough.
-    tracker=TrackerConfig(range=70.0, falloff=20.0, view_needed=0.1, drop=0.01, coast=20, switch_rate=0.01),
+    tracker=TrackerConfig(
+        range=60.0, falloff=15.0, view_needed=0.1, drop=0.01, coast=20, switch_rate=0.01, look_every_s=0.5
+    ),
     # 10 s of history, then key frames 2 s apart.
     duration_s=16.1,
     keyframes=4,

@@ -16,10 +16,8 @@ from tflane_jax.world.traffic.rollout import Rollout
 from tflane_jax.world.traffic.signals import Signals, draw_signals, turn_green
 from tflane_jax.world.traffic.vehicles import draw_drivers
 
-# Warm-up before the log begins, its time step, and how long before its end the ego vehicle joins, seconds.
-_WARM_UP, _WARM_UP_STEP, _EGO_JOINS = 20.0, 0.4, 3.2
-# Largest time step while logging, seconds; frames in between assume constant acceleration within the step.
-_LONGEST_STEP = 0.2
+# Time step of the warm-up, and how long before its end the ego vehicle joins, seconds.
+_WARM_UP_STEP, _EGO_JOINS = 0.4, 3.2
 # Places tried for the ego vehicle.
 _EGO_CHOICES = 6
 # Its mean speed as a fraction of the free speed, and how far from the middle of its route it may aim, metres.
@@ -44,6 +42,10 @@ class TrafficConfig:
             scene are each multiplied by exp(variety * z - variety^2 / 2), z standard normal, so that the means stay.
         green_wave: probability that the first light on the ego vehicle's way turns green about when the log begins.
         range: distance from the ego vehicle up to which road users are reported, metres.
+        warm_up_s: time for which traffic settles before the log begins, seconds: at least 3.2, when the ego vehicle
+            joins.
+        early_s: time before the warm-up from which vehicles are on their way, seconds: a slow drive through the map.
+        step_s: largest time step, seconds; frames within a step assume constant acceleration.
     """
 
     vehicles_per_metre: float = 0.032
@@ -62,6 +64,9 @@ class TrafficConfig:
     ego_passes_s: float | None = None
     green_wave: float = 0.6
     range: float = 90.0
+    warm_up_s: float = 20.0
+    early_s: float = 40.0
+    step_s: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -95,17 +100,17 @@ def simulate_traffic(
     table = build_lane_table(network)
     times = np.arange(frames) / rate_hz
     stop = times[-1] if frames else 0.0
-    start = -_WARM_UP
+    steps = max(round((config.warm_up_s - _EGO_JOINS) / _WARM_UP_STEP), 0)
+    start = -(steps * _WARM_UP_STEP + _EGO_JOINS)
 
     index = {int(segment): i for i, segment in enumerate(table.ids)}
     way = tuple(index[i] for i in network.ego_routes[rng.integers(len(network.ego_routes))])
     signals = _signals_for_ego(rng, table, way, config.green_wave)
-    # Look back by the duration of a slow drive through the map: older trips have left it by now.
     trips = draw_trips(
         rng,
         table,
         way,
-        start=start - 40.0,
+        start=start - config.early_s,
         stop=stop + 5.0,
         vehicles_per_metre=config.vehicles_per_metre,
         bicycles_per_metre=config.bicycles_per_metre,
@@ -117,12 +122,11 @@ def simulate_traffic(
     road = Rollout(table, signals, trips, crossers, places, len(network.walk_across))
     road.place_early_trips(start)
     ego_starts = _ego_starts(rng, road, stop + _EGO_JOINS, config.ego_passes_s)
-    joins = round((_WARM_UP - _EGO_JOINS) / _WARM_UP_STEP)
-    road.drive(start, _WARM_UP_STEP, joins, 1)
+    road.drive(start, _WARM_UP_STEP, steps, 1)
     road.put_ego(ego_starts)
     road.drive(-_EGO_JOINS, _WARM_UP_STEP, round(_EGO_JOINS / _WARM_UP_STEP), 1)
 
-    substeps = max(1, int(_LONGEST_STEP * rate_hz + 1e-9))
+    substeps = max(1, int(config.step_s * rate_hz + 1e-9))
     position, progress = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
     driven = _driven(road, position[:frames])
     walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]

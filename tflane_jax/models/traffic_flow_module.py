@@ -13,19 +13,22 @@ valid frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.models.prior import HostQueries, HostSpec, Prior
+from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
+from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
+from tflane_jax.priors.traffic_raster import rasterise_traffic_flow
 from tflane_jax.scene import Example, RoadUser, TrafficFlow
 
 Fusion = Literal["T->T", "T->L", "L->T", "L->L"]
@@ -62,30 +65,51 @@ class TrafficFlowConfig:
         prior: selection of instances.
         module: the TFM.
         insert: "before_decoder" enhances the queries once, as in the paper (section 3.3); "every_layer" enhances them
-            before each decoder layer, with separate parameters.
+            before each decoder layer, with separate parameters; "nowhere" leaves the TFM out, and `bev` must be set.
+        bev: writes the selected tracks into the BEV features as well, which the paper does not; None: queries only.
     """
 
     prior: TrafficFlowPriorConfig = TrafficFlowPriorConfig()
     module: TrafficFlowModuleConfig = TrafficFlowModuleConfig()
-    insert: Literal["before_decoder", "every_layer"] = "before_decoder"
+    insert: Literal["before_decoder", "every_layer", "nowhere"] = "before_decoder"
+    bev: TrafficRasterConfig | None = None
 
     def build(self, host: HostSpec) -> TrafficFlowPrior:
-        """Return the prior for a host."""
+        """Return the prior for a host; raises UserError where the traffic flow would enter nowhere."""
+        if self.insert == "nowhere" and self.bev is None:
+            raise UserError(
+                "traffic flow enters nowhere: choose traffic_flow.insert or traffic_flow.bev, or leave traffic_flow out"
+            )
         return TrafficFlowPrior(self, host)
 
 
+class EncodedTrafficFlow(NamedTuple):
+    """Traffic flow of a frame as the two hooks read it.
+
+    Attributes:
+        features: (T, D) TF_Feat, one token per instance; None without the TFM.
+        tracks: the selected instances.
+    """
+
+    features: Float[Array, "t d"] | None
+    tracks: TrafficFlowTokens
+
+
 class TrafficFlowPrior(Prior):
-    """Selects instances, encodes each to a token, and enhances the host's queries."""
+    """Selects instances, encodes each to a token, and enhances the host's queries; optionally, BEV features too.
+
+    Without traffic flow, the queries get what they get in an empty scene, and BEV features stay exactly as they are.
+    """
 
     reads = ("traffic_flow",)
 
     def __init__(self, config: TrafficFlowConfig, host: HostSpec):
         self.config, self.host = config, host
-        self.temporal_encoder = TemporalEncoder(config.module, host.dim)
+        self.temporal_encoder = None if config.insert == "nowhere" else TemporalEncoder(config.module, host.dim)
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the temporal encoder."""
-        return {"temporal_encoder": self.temporal_encoder}
+        return {} if self.temporal_encoder is None else {"temporal_encoder": self.temporal_encoder}
 
     def observe(self, example: Example, memory: None) -> tuple[TrafficFlowTokens, None]:
         """Return reTF_i; without traffic flow, all instances are invalid."""
@@ -94,24 +118,33 @@ class TrafficFlowPrior(Prior):
             flow = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames))
         return select_traffic_flow(flow, prior, self.host.range, self.host.bev_range), None
 
-    def encode(
-        self, observation: TrafficFlowTokens, *, deterministic: bool
-    ) -> tuple[Float[Array, "t d"], Bool[Array, " t"]]:
-        """Return TF_Feat (T, D) and which instances are valid (T,)."""
+    def encode(self, observation: TrafficFlowTokens, *, deterministic: bool) -> EncodedTrafficFlow:
+        """Return TF_Feat (T, D) beside the tracks that it encodes."""
         del deterministic
-        return self.temporal_encoder(observation), observation.valid
+        features = None if self.temporal_encoder is None else self.temporal_encoder(observation)
+        return EncodedTrafficFlow(features, observation)
 
-    def into_queries(
-        self, tokens: tuple[Float[Array, "t d"], Bool[Array, " t"]], layer: int, queries: HostQueries
-    ) -> Float[Array, "q d"]:
+    def fuses_into_bev(self) -> bool:
+        """Return whether `TrafficFlowConfig.bev` is set."""
+        return self.config.bev is not None
+
+    def into_bev(self, tokens: EncodedTrafficFlow, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+        """Return the BEV features with the tracks written into the cells that they pass."""
+        config = self.config.bev
+        if config is None or (layer > 0 and config.layers == "first"):
+            return cells.features
+        tracks = jax.tree.map(jnp.asarray, tokens.tracks)
+        raster = rasterise_traffic_flow(tracks, self.config.prior.coordinates, cells.grid, config.between)
+        return TrafficRasterFusion(config, name=f"traffic_flow_{layer}")(cells.features, raster)
+
+    def into_queries(self, tokens: EncodedTrafficFlow, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
         """Return L'_Feat before the layers selected by `insert`."""
-        if layer > 0 and self.config.insert == "before_decoder":
+        if tokens.features is None or (layer > 0 and self.config.insert == "before_decoder"):
             return queries.features
-        features, valid = tokens
-        mask = SpatialMask.from_validity(len(queries.features), valid, queries.mask)
+        mask = SpatialMask.from_validity(len(queries.features), tokens.tracks.valid, queries.mask)
         name = f"spatial_encoder_{layer}"
         spatial = SpatialEncoder(self.config.module, self.host.dim, self.host.query_type, name=name)
-        return spatial(queries.features, queries.position, features, mask)
+        return spatial(queries.features, queries.position, tokens.features, mask)
 
 
 class TemporalEncoder(nn.Module):

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -192,9 +193,31 @@ class LaneHeads(nn.Module):
         unit = reference + change * scale[None, None]
         box = self.limits or self.range
         corners = self.range.normalise(jnp.array([[axis[end] for axis in (box.x, box.y, box.z)] for end in (0, 1)]))
-        clipped = jnp.clip(unit, corners[None, :1], corners[None, 1:])
-        # The gradient passes the clip, so that a point outside can come back.
-        return unit + lax.stop_gradient(clipped - unit)
+        low, high = (jnp.broadcast_to(corners[i], unit.shape[1:]) for i in (0, 1))
+        return jax.vmap(clip_with_return, in_axes=(0, None, None))(unit, low, high)
+
+
+@jax.custom_vjp
+def clip_with_return(x: Float[Array, "*b"], low: Float[Array, "*b"], high: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Clip to [low, high], with a gradient for a value outside if descent along it moves the value back inside.
+
+    The gradient of a plain clip is 0 outside, so that a lane which leaves the range could never return. Passing every
+    gradient would let a rounding error between a clipped value and a target on the border push it outwards for ever.
+    """
+    return jnp.clip(x, low, high)
+
+
+def _clip_forward(x, low, high):
+    return jnp.clip(x, low, high), (x, low, high)
+
+
+def _clip_backward(residuals, gradient):
+    x, low, high = residuals
+    outward = ((x > high) & (gradient < 0.0)) | ((x < low) & (gradient > 0.0))
+    return jnp.where(outward, 0.0, gradient), jnp.zeros_like(low), jnp.zeros_like(high)
+
+
+clip_with_return.defvjp(_clip_forward, _clip_backward)
 
 
 def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -> Prediction:

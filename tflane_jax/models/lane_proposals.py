@@ -116,7 +116,7 @@ def best_cells(
     A maximum exceeds the 3 x 3 cells around it in its own bin and the two next to it (bins form a circle). If there are
     fewer, other cells follow.
     """
-    h, w, k = heat.shape
+    k = heat.shape[-1]
     circle = jnp.concatenate([heat[..., -1:], heat, heat[..., :1]], -1) if k > 2 else heat
     depth = ((1, 1), (1, 1), (0, 0) if k > 2 else (1, 1))
     largest = lax.reduce_window(circle, -jnp.inf, lax.max, (3, 3, 3), (1, 1, 1), depth)

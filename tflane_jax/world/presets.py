@@ -46,12 +46,12 @@ STREET = replace(
     roads=replace(
         CITY.roads,
         kinds=(
-            (SceneKind.ROAD, 0.30),
-            (SceneKind.LANE_DROP, 0.13),
-            (SceneKind.LANE_GAIN, 0.13),
-            (SceneKind.ON_RAMP, 0.13),
+            (SceneKind.ROAD, 0.15),
+            (SceneKind.LANE_DROP, 0.17),
+            (SceneKind.LANE_GAIN, 0.18),
+            (SceneKind.ON_RAMP, 0.15),
             (SceneKind.EXIT_RAMP, 0.13),
-            (SceneKind.T_JUNCTION, 0.18),
+            (SceneKind.T_JUNCTION, 0.22),
         ),
         junction_lanes=1,
     ),

@@ -132,7 +132,7 @@ class WorldData:
         return cls(train, val, test, STREET, STREET_EXAMPLE)
 
 
-CITY_EXAMPLE = ExampleConfig(history_hz=2.0, tracks=160)
+CITY_EXAMPLE = ExampleConfig(history_hz=2.0, tracks=192)
 """20 frames at 2 Hz, so 10 s."""
 STREET_EXAMPLE = replace(
     CITY_EXAMPLE,

@@ -16,12 +16,12 @@ from tflane_jax.world.traffic.tracker import TrackerConfig
 
 CITY = WorldConfig(
     # The ego vehicle drives up to 160 m before its first key frame.
-    roads=RoadConfig(reach=190.0, ego_reach=178.0, parking=0.75, bike=0.35),
+    roads=RoadConfig(reach=190.0, ego_reach=178.0, parking=0.85, bike=0.35),
     traffic=TrafficConfig(
-        vehicles_per_metre=0.05,
-        bicycles_per_metre=0.018,
+        vehicles_per_metre=0.055,
+        bicycles_per_metre=0.016,
         parked_share=0.9,
-        pedestrians_per_metre=0.085,
+        pedestrians_per_metre=0.08,
         crossers_per_minute=8.0,
         variety=0.6,
         ego_top_speed=12.0,
@@ -46,12 +46,12 @@ STREET = replace(
     roads=replace(
         CITY.roads,
         kinds=(
-            (SceneKind.ROAD, 0.30),
-            (SceneKind.LANE_DROP, 0.13),
-            (SceneKind.LANE_GAIN, 0.13),
-            (SceneKind.ON_RAMP, 0.13),
+            (SceneKind.ROAD, 0.15),
+            (SceneKind.LANE_DROP, 0.17),
+            (SceneKind.LANE_GAIN, 0.18),
+            (SceneKind.ON_RAMP, 0.15),
             (SceneKind.EXIT_RAMP, 0.13),
-            (SceneKind.T_JUNCTION, 0.18),
+            (SceneKind.T_JUNCTION, 0.22),
         ),
         junction_lanes=1,
     ),

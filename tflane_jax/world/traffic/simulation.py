@@ -21,7 +21,7 @@ _WARM_UP_STEP, _EGO_JOINS = 0.4, 3.2
 # Places tried for the ego vehicle.
 _EGO_CHOICES = 6
 # Its mean speed as a fraction of the free speed, and how far from the middle of its route it may aim, metres.
-_EGO_PACE, _EGO_AIM = 0.85, 25.0
+_EGO_PACE, _EGO_AIM = 0.95, 20.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TrafficConfig:
         crossers_per_minute: crossing pedestrians, for each crossing.
         ego_top_speed: m/s.
         ego_passes_s: time at which the ego vehicle passes the middle of its route, so the central feature of the roads,
-            up to 25 m and what traffic lets it, seconds after the first frame; None starts it anywhere on the route.
+            up to 20 m and what traffic allows, seconds after the first frame; None starts it anywhere on the route.
         variety: how much the amounts differ between scenes: moving vehicles, parked vehicles and pedestrians of a
             scene are each multiplied by exp(variety * z - variety^2 / 2), z standard normal, so that the means stay.
         green_wave: probability that the first light on the ego vehicle's way turns green about when the log begins.
@@ -121,9 +121,8 @@ def simulate_traffic(
     places = crossing_places(network.walk_across, table)
     road = Rollout(table, signals, trips, crossers, places, len(network.walk_across))
     road.place_early_trips(start)
-    ego_starts = _ego_starts(rng, road, stop + _EGO_JOINS, config.ego_passes_s)
     road.drive(start, _WARM_UP_STEP, steps, 1)
-    road.put_ego(ego_starts)
+    road.put_ego(_ego_starts(rng, road, stop + _EGO_JOINS, config.ego_passes_s))
     road.drive(-_EGO_JOINS, _WARM_UP_STEP, round(_EGO_JOINS / _WARM_UP_STEP), 1)
 
     substeps = max(1, int(config.step_s * rate_hz + 1e-9))
@@ -170,6 +169,10 @@ def _ego_starts(
     starts = rng.uniform(5.0, max(routes.length[0] - 50.0 - speed * duration, 10.0), _EGO_CHOICES)
     if passes_s is not None:
         aim = 0.5 * routes.length[0] + rng.uniform(-_EGO_AIM, _EGO_AIM, _EGO_CHOICES)
+        rows = np.flatnonzero(road.active)
+        on_way = rows[np.isin(routes.take(rows).place(road.position[rows])[0], way)]
+        if len(on_way):
+            speed = min(speed, float(road.speed[on_way].mean()))
         starts = np.maximum(aim - _EGO_PACE * speed * (_EGO_JOINS + passes_s), 5.0)
     for i, at in enumerate(starts):
         leg = int((routes.start[0] <= at).sum()) - 1

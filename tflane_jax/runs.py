@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from tflane_jax.config import RunConfig
@@ -22,14 +21,14 @@ from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.migrations import migrate
-from tflane_jax.models.parameters import Params, split_statistics
+from tflane_jax.models.parameters import Params
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
 from tflane_jax.training.run_folder import Start, check_start, claimed, read_config
 from tflane_jax.training.schedule import make_optimizer
-from tflane_jax.training.state import TrainState, per_seed
+from tflane_jax.training.state import per_seed, state_of
 
 
 @dataclass(frozen=True)
@@ -180,14 +179,7 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
     """
     config = replace(config, training=replace(config.training, seeds=(0,)))
     optimizer = make_optimizer(config.optim, config.training.steps)
-    params = jax.tree.map(jnp.asarray, params)
-    state = TrainState(
-        step=jnp.zeros((), jnp.int32),
-        params=params,
-        ema_params=params,
-        opt_state=optimizer.init(split_statistics(params)[0]),
-        key=jax.random.key(0),
-    )
+    state = state_of(params, optimizer, jax.random.key(0))
     with claimed(folder, "new"):
         add_provenance(folder)
         write_text(folder / "config.txt", to_text(config))

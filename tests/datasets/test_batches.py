@@ -29,12 +29,12 @@ def test_order_differs_by_seed_and_epoch():
 @pytest.mark.parametrize("seeds", [(4,), (4, 9)])
 def test_batches_hold_the_examples_of_their_step(seeds):
     arrays = {"a": np.arange(7), "b": np.arange(14.0, dtype=np.float32).reshape(7, 2)}
-    for step, batch in zip(range(2, 5), batches(arrays, seeds, range(2, 5), 3), strict=True):
-        order = np.stack([batch_indices(seed, step, 7, 3) for seed in seeds])
-        order = order[0] if len(seeds) == 1 else order
-        assert isinstance(batch["a"], jax.Array)
-        np.testing.assert_array_equal(batch["a"], order)
-        np.testing.assert_array_equal(batch["b"][..., 1], 2 * order + 1)
+    for step, each in zip(range(2, 5), batches(arrays, seeds, range(2, 5), 3), strict=True):
+        for seed, batch in zip(seeds, each, strict=True):
+            order = batch_indices(seed, step, 7, 3)
+            assert isinstance(batch["a"], jax.Array)
+            np.testing.assert_array_equal(batch["a"], order)
+            np.testing.assert_array_equal(batch["b"][:, 1], 2 * order + 1)
 
 
 @pytest.mark.parametrize("seeds", [(4,), (4, 9)])
@@ -43,10 +43,10 @@ def test_examples_are_prepared_by_seed_step_and_place(seeds):
         return {"a": example["a"] + 100 * key[0] + 10_000 * key[1] + 1_000_000 * key[2]}
 
     arrays = {"a": np.arange(7)}
-    for step, batch in zip(range(2, 5), batches(arrays, seeds, range(2, 5), 3, prepare), strict=True):
-        place = 1_000_000 * np.arange(3)
-        order = [batch_indices(seed, step, 7, 3) + 100 * seed + 10_000 * step + place for seed in seeds]
-        np.testing.assert_array_equal(batch["a"], order[0] if len(seeds) == 1 else order)
+    for step, each in zip(range(2, 5), batches(arrays, seeds, range(2, 5), 3, prepare), strict=True):
+        for seed, batch in zip(seeds, each, strict=True):
+            expected = batch_indices(seed, step, 7, 3) + 100 * seed + 10_000 * step + 1_000_000 * np.arange(3)
+            np.testing.assert_array_equal(batch["a"], expected)
 
 
 def test_no_steps_no_batches():

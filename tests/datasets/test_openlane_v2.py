@@ -227,7 +227,7 @@ def test_streamed_frames_can_be_trained_on(whole):
     assert isinstance(loaded, Streamed)
     shapes = task.shapes(config.data)
     plain, coloured = (
-        next(batches(loaded, (0,), range(1), 2, prepare)) for prepare in (None, task.prepare(config.data))
+        next(batches(loaded, (0,), range(1), 2, prepare))[0] for prepare in (None, task.prepare(config.data))
     )
     assert plain.cameras.image.shape == (2, *shapes.cameras.image.shape)
     assert plain.segments.valid.shape == (2, 0)  # not a training part

@@ -54,7 +54,7 @@ def training_data(data: Path) -> None:
     assert loaded.lanes.points.shape[0] == 4
     np.testing.assert_array_equal(loaded.lanes.points[3], fake_example(3).lanes.points)
     assert loaded.hidden is None  # no training part
-    (batch,) = batches(loaded, (0,), range(1), 2)
+    ((batch,),) = batches(loaded, (0,), range(1), 2)
     assert batch.lanes.valid.shape[:2] == (2, 5)
     assert sources.sample(config.data.source("train")).lanes.points.shape == loaded.lanes.points.shape[1:]
 

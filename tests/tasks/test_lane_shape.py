@@ -16,7 +16,7 @@ from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig,
 from tflane_jax.models.lstr import MEAN_BGR, STD_BGR, LaneShapeHeads, nearest, normalise, shrink
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
-from tflane_jax.training.state import init_state
+from tflane_jax.training.state import init_state, state_of
 from tflane_jax.training.step import make_update_step
 
 ENCODERS = {
@@ -34,7 +34,8 @@ class Fitted:
         optim = OptimConfig(lr=1e-2, warmup_steps=0, weight_decay=0.0)
         self.params = random_params(task.init, road_image(0))
         self.predict = jax.jit(task.predict)
-        self.init = jax.jit(lambda key, example: init_state(task, make_optimizer(optim, 10), key, example))
+        self.optimizer = make_optimizer(optim, 10)
+        self.init = jax.jit(lambda key, example: init_state(task, self.optimizer, key, example))
         # The loss and its gradient take most of these tests' time: all of them read them off this one program.
         self.update = make_update_step(task, optim, 10)
 
@@ -44,7 +45,7 @@ class Fitted:
 
     def updated(self, batch, key=0):
         """Return the state and the metrics after one update of the random parameters."""
-        return self.update(self.start(key).replace(params=jax.tree.map(np.array, self.params)), batch)
+        return self.update(state_of(self.params, self.optimizer, jax.random.key(key)), batch)
 
 
 @cache

@@ -9,15 +9,17 @@ from tests.training.stub import LineTask, line_arrays
 from tflane_jax.errors import UserError
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
-from tflane_jax.training.state import init_states
+from tflane_jax.training.state import init_states, of_all_seeds, tree_of
+from tflane_jax.training.vectors import ravel
 
+TASK = LineTask()
 CONFIG = {"class": "RunConfig", "training": {"steps": 9}}
 
 
-def state_of(seeds=(0,), features=3):
+def state_of(seeds=(0,), task=TASK, **optim):
     example = jax.tree.map(lambda leaf: leaf[0], line_arrays())
-    optimizer = make_optimizer(OptimConfig(warmup_steps=0), 9)
-    return init_states(LineTask(features), optimizer, seeds, example)
+    optimizer = make_optimizer(OptimConfig(warmup_steps=0, **optim), 9)
+    return of_all_seeds(init_states(task, optimizer, seeds, example))
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +40,13 @@ def words(state):
     return jax.tree.map(np.array, state.replace(key=jax.random.key_data(state.key)))
 
 
+@pytest.mark.parametrize("optimizer", ["adam", "muon"])
 @pytest.mark.parametrize("seeds", [(0,), (5, 6)])
-def test_round_trip_is_exact(tmp_path, seeds):
-    state = state_of(seeds)
+def test_round_trip_is_exact(tmp_path, seeds, optimizer):
+    state = state_of(seeds, optimizer=optimizer)
     odd = jax.tree.map(lambda leaf: leaf * np.float32(1 / 3), state.params)  # full mantissas
     odd["line"]["bias"] = odd["line"]["bias"].at[..., 0].set(jnp.nan).at[..., 1].set(-0.0)
-    state = state.replace(params=odd)
+    state = state.replace(learned=ravel(odd, state.learned.layout))
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(state, Manifest(step=3, config=CONFIG))
     restored = Checkpoints(tmp_path).restore(3, state)
@@ -125,12 +128,37 @@ def test_damage_is_named_with_the_remedy(tmp_path, state, damage):
 def test_a_checkpoint_of_another_model_is_refused(tmp_path, state):
     checkpoints = saved(tmp_path, state, [(1, None)])
     with pytest.raises(UserError, match=r"does not fit.*line/bias is float32\[3\], not float32\[4\]"):
-        checkpoints.restore(1, state_of(features=4))
+        checkpoints.restore(1, state_of(task=LineTask(features=4)))
     with pytest.raises(UserError, match="another model, optimiser or number of seeds"):
         checkpoints.restore(1, state_of(seeds=(0, 1)))
-    wider = state.replace(params={**state.params, "extra": {"kernel": jnp.zeros(2)}})
-    with pytest.raises(UserError, match="params/extra/kernel"):
-        checkpoints.restore(1, wider)
+    with pytest.raises(UserError, match="params/second/offset"):
+        checkpoints.restore(1, state_of(task=LineTask(second_layer=True)))
+
+
+def test_files_hold_trees_by_the_names_of_the_first_version(tmp_path, state):
+    found = saved(tmp_path, state, [(1, None)]).arrays(1)
+    leaves, moments = ("line/kernel", "line/bias"), ("mu", "nu")
+    expected = {f"{part}/{leaf}" for part in ("params", "ema_params") for leaf in leaves}
+    expected |= {f"opt_state/1/0/{moment}/{leaf}" for moment in moments for leaf in leaves}
+    assert found.keys() == expected | {"step", "key", "opt_state/1/0/count", "opt_state/1/2/count"}
+    np.testing.assert_array_equal(found["params/line/kernel"], state.params["line"]["kernel"])
+
+
+def test_states_of_optaxs_muon_are_read(tmp_path):
+    """Earlier versions had optax's Muon, whose state names more."""
+    state = state_of(optimizer="muon")
+    checkpoints = saved(tmp_path, state, [(1, None)])
+    arrays, new = checkpoints.arrays(1), "opt_state/1/0/inner_states/muon/inner_state/"
+    arrays = {n.replace(new, f"{new}0/inner_states/muon/inner_state/0/"): a for n, a in arrays.items()}
+    mu = f"{new}0/inner_states/muon/inner_state/0/mu/line/kernel"
+    arrays[mu] = np.arange(12, dtype=np.float32).reshape(4, 3)
+    arrays[f"{new}0/inner_states/muon/inner_state/0/ns_coeffs"] = np.ones(3, np.float32)
+    arrays[f"{new}0/inner_states/adam/inner_state/0/count"] = np.int32(0)
+    checkpoints.arrays = lambda step: arrays
+    restored = checkpoints.restore(1, state)
+    assert jax.tree.structure(restored) == jax.tree.structure(state)
+    (found,) = (leaf for leaf in jax.tree.leaves(tree_of(restored)["opt_state"]) if np.array_equal(leaf, arrays[mu]))
+    assert found.shape == (4, 3)
 
 
 def test_a_newer_layout_is_refused(tmp_path, state):

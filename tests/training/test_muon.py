@@ -9,6 +9,7 @@ import optax
 import pytest
 from optax.contrib import MuonDimensionNumbers, muon
 
+from tests.training.test_schedule import as_vectors, updates_of
 from tflane_jax.training.muon import orthogonal, scale_by_muon
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 
@@ -30,27 +31,27 @@ def test_updates_are_optaxs(shapes):
     theirs = muon(1.0, consistent_rms=0.2, muon_weight_dimension_numbers=dimensions)
     ours = scale_by_muon()
     params = gradients(shapes, 99)
-    states = [ours.init(params), theirs.init(params)]
+    states = [ours.init(as_vectors(params)), theirs.init(params)]
     ours_update, theirs_update = jax.jit(ours.update), jax.jit(theirs.update)
     for step in range(4):
         grads = gradients(shapes, step)
-        found, states[0] = ours_update(grads, states[0], params)
+        found, states[0] = ours_update(as_vectors(grads), states[0])
         expected, states[1] = theirs_update(grads, states[1], params)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, -b, atol=2e-5), found, expected)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, -b, atol=2e-5), found.tree(), expected)
 
 
 def test_one_iteration_for_all_kernels_of_a_shape():
     def products(shapes):
-        return str(jax.make_jaxpr(orthogonal)(gradients(shapes, 0))).count("dot_general")
+        return str(jax.make_jaxpr(orthogonal)(as_vectors(gradients(shapes, 0)))).count("dot_general")
 
     assert products(SHAPES) == 3 * products({"wide": (3, 7)})  # 3 x 7, 4 x 4, 1 x 5
 
 
 def test_a_kernel_without_gradient_is_not_updated():
-    grads = {"learned": jnp.ones((2, 3)), "frozen": jnp.zeros((2, 3))}
-    found = orthogonal(grads)
-    np.testing.assert_array_equal(found["frozen"], 0.0)
-    assert np.isfinite(found["learned"]).all()
+    grads = {"learned": {"kernel": jnp.ones((2, 3))}, "frozen": {"kernel": jnp.zeros((2, 3))}}
+    found = orthogonal(as_vectors(grads)).tree()
+    np.testing.assert_array_equal(found["frozen"]["kernel"], 0.0)
+    assert np.isfinite(found["learned"]["kernel"]).all()
 
 
 @pytest.mark.parametrize("kernels", ["dense", "dense_and_convolution"])
@@ -59,8 +60,8 @@ def test_only_the_kernels_that_are_named_are_muons(kernels):
     grads = gradients(SHAPES | CONVOLUTIONS | {"graph": (2, 3, 4)}, 0) | {"queries": {"embedding": jnp.ones((5, 3))}}
     params = jax.tree.map(jnp.zeros_like, grads)
     found, adam = (
-        jax.jit(o.update)(grads, o.init(params), params)[0]
-        for o in (make_optimizer(dataclasses.replace(config, optimizer=kind), 10) for kind in ("muon", "adam"))
+        updates_of(make_optimizer(dataclasses.replace(config, optimizer=kind), 10), grads, params)[0]
+        for kind in ("muon", "adam")
     )
     changed = {name for name in grads if not optax.tree.allclose(found[name], adam[name], rtol=1e-5)}
     expected = set(SHAPES) | (set(CONVOLUTIONS) if kernels == "dense_and_convolution" else set())

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.training.test_schedule import rates_of
+from tests.training.test_schedule import as_vectors, rates_of
 from tflane_jax.training.adaptive import AdaptiveConfig, Memory
 from tflane_jax.training.restarts import (
     RestartsConfig,
@@ -110,7 +110,7 @@ def test_an_extension_keeps_the_rate_and_has_the_configured_length(elapsed, left
 
 ADAPTIVE = AdaptiveConfig(patience=1, grace=0.0, extend=1.0, shrink=0.5)
 OPTIM = OptimConfig(lr=0.8, warmup_steps=0, restarts=RestartsConfig(8, 2.0, floor=0.25, adaptive=ADAPTIVE))
-PARAMS = {"kernel": jnp.ones((1, 2))}
+PARAMS = as_vectors({"kernel": jnp.ones((1, 2))})
 
 
 def rates_with(losses: dict[int, list[float]], *, count: int, optim=OPTIM, steps=100) -> np.ndarray:

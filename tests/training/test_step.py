@@ -9,9 +9,9 @@ import pytest
 from tests.training.stub import LineTask, line_arrays
 from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.training.rng import stream
-from tflane_jax.training.schedule import OptimConfig, make_optimizer
-from tflane_jax.training.state import init_states, per_seed
-from tflane_jax.training.step import compiled_update, make_multi_seed_step, make_update_step, moving_average
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
+from tflane_jax.training.state import init_states
+from tflane_jax.training.step import compiled_update, make_update_step, moving_average, update_all
 
 OPTIM = OptimConfig(lr=0.01, warmup_steps=2)
 STEPS = 20
@@ -23,25 +23,32 @@ def fresh(seeds=(0,)):
     return init_states(LineTask(), make_optimizer(OPTIM, STEPS), seeds, example)
 
 
+def alone(seed=0):
+    return fresh((seed,))[0]
+
+
 def batch_of(seed, step, size=4):
     return jax.tree.map(lambda leaf: leaf[batch_indices(seed, step, 20, size)], ARRAYS)
 
 
 def test_trainings_of_one_model_share_a_compiled_update():
     batch, other = batch_of(0, 0), batch_of(0, 0, size=3)
-    first = compiled_update(LineTask(), OPTIM, STEPS, 1, fresh(), batch)
-    assert compiled_update(LineTask(), OPTIM, STEPS, 1, fresh((7,)), batch) is first
-    assert compiled_update(LineTask(), OPTIM, STEPS, 1, fresh(), other) is not first
-    assert compiled_update(LineTask(blow_up=3.0), OPTIM, STEPS, 1, fresh(), batch) is not first
-    expected = make_update_step(LineTask(), OPTIM, STEPS)(fresh(), batch)
-    jax.tree.map(np.testing.assert_array_equal, first(fresh(), batch)[0].params, expected[0].params)
+    first = compiled_update(LineTask(), OPTIM, STEPS, alone(), batch)
+    assert compiled_update(LineTask(), OPTIM, STEPS, alone(7), batch) is first
+    assert compiled_update(LineTask(), OPTIM, STEPS, alone(), other) is not first
+    assert compiled_update(LineTask(blow_up=3.0), OPTIM, STEPS, alone(), batch) is not first
+    expected = make_update_step(LineTask(), OPTIM, STEPS)(alone(), batch)
+    jax.tree.map(np.testing.assert_array_equal, first(alone(), batch)[0].params, expected[0].params)
 
 
 def test_steps_are_plain_adamw_on_the_tasks_gradient():
-    task, optimizer = LineTask(), make_optimizer(OPTIM, STEPS)
-    state, update = fresh(), make_update_step(task, OPTIM, STEPS)
+    task = LineTask()
+    decay = lambda params: {"line": {"kernel": True, "bias": False}}  # noqa: E731
+    optimizer = optax.adamw(make_schedule(OPTIM, STEPS), weight_decay=OPTIM.weight_decay, mask=decay)
+    state, update = alone(), make_update_step(task, OPTIM, STEPS)
     value_and_grad, optimizer_update = jax.jit(jax.value_and_grad(task.loss, has_aux=True)), jax.jit(optimizer.update)
-    params, opt_state, average = (jax.tree.map(jnp.copy, t) for t in (state.params, state.opt_state, state.params))
+    params, average = (jax.tree.map(jnp.copy, state.params) for _ in range(2))
+    opt_state = optimizer.init(params)
     for step in range(4):
         batch = batch_of(0, step)
         key = stream(jax.random.key(0), "dropout", step)
@@ -62,7 +69,7 @@ def test_steps_are_plain_adamw_on_the_tasks_gradient():
 
 
 def test_learning_rate_is_that_of_the_update():
-    state, update = fresh(), make_update_step(LineTask(), OPTIM, STEPS)
+    state, update = alone(), make_update_step(LineTask(), OPTIM, STEPS)
     rates = []
     for step in range(3):
         state, metrics = update(state, batch_of(0, step))
@@ -70,17 +77,12 @@ def test_learning_rate_is_that_of_the_update():
     np.testing.assert_allclose(rates, [0.01 / 3, 0.01 * 2 / 3, 0.01], rtol=1e-5)
 
 
-@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
-def test_one_trace_and_an_error_for_a_second(seeds):
-    state = fresh(seeds)
-    if len(seeds) == 1:
-        update = make_update_step(LineTask(), OPTIM, STEPS)
-    else:
-        update = make_multi_seed_step(LineTask(), OPTIM, STEPS, batch="shared")
+def test_one_trace_and_an_error_for_a_second():
+    states, update = fresh((0, 1)), make_update_step(LineTask(), OPTIM, STEPS, donate=False)
     for step in range(3):
-        state, _ = update(state, batch_of(0, step))
+        states, _ = update_all(update, states, [batch_of(0, step), batch_of(1, step)])
     with pytest.raises(AssertionError, match="traced"):
-        update(state, batch_of(0, 0, size=5))
+        update(states[0], batch_of(0, 0, size=5))
 
 
 @pytest.mark.parametrize("poison", ["loss", "gradient"])
@@ -93,7 +95,7 @@ def test_non_finite_numbers_leave_the_state_as_it_was(poison):
             # sqrt(0) is finite, its gradient is not.
             return loss + jnp.sqrt(jnp.where(batch["bad"].any(), 0.0 * loss, 1.0)), terms
 
-    state, update = fresh(), make_update_step(Poisoned(), OPTIM, STEPS)
+    state, update = alone(), make_update_step(Poisoned(), OPTIM, STEPS)
     good, bad = ({**batch_of(0, 0), "bad": np.full(4, flag)} for flag in (False, True))
     state, metrics = update(state, good)
     assert metrics["finite"]
@@ -106,37 +108,29 @@ def test_non_finite_numbers_leave_the_state_as_it_was(poison):
 
 
 def test_one_non_finite_seed_stops_the_update_of_all_seeds():
-    state = fresh((0, 1))
-    update = make_multi_seed_step(LineTask(blow_up=100.0), OPTIM, STEPS, batch="per_seed")
-    batch = jax.tree.map(lambda a, b: np.stack([a, b]), batch_of(0, 0), batch_of(1, 0))
-    batch["x"][1, 0, 0] = 1000.0
-    state, metrics = update(state, batch)
+    states = fresh((0, 1))
+    update = make_update_step(LineTask(blow_up=100.0), OPTIM, STEPS, donate=False)
+    batches = [batch_of(0, 0), batch_of(1, 0)]
+    batches[1]["x"][0, 0] = 1000.0
+    after, metrics = update_all(update, states, batches)
     assert metrics["finite"].tolist() == [True, False]
-    assert state.step.tolist() == [0, 0]
+    for before, now in zip(states, after, strict=True):
+        assert now.step == 0
+        jax.tree.map(np.testing.assert_array_equal, now.params, before.params)
 
 
-def test_several_seeds_start_from_the_parameters_of_each_alone():
-    alone, together = fresh((8,)), per_seed(fresh((3, 8)), (3, 8))[1]
-    jax.tree.map(np.testing.assert_array_equal, alone.params, together.params)
-
-
-@pytest.mark.parametrize("sharing", ["shared", "per_seed"])
-def test_several_seeds_each_equal_a_single_seed(sharing):
-    seeds = (3, 8, 11)
-    together = fresh(seeds)
-    update = make_multi_seed_step(LineTask(), OPTIM, STEPS, batch=sharing)
-    single = make_update_step(LineTask(), OPTIM, STEPS)
-    alone = jax.tree.map(jnp.copy, per_seed(together, seeds))
-    for step in range(6):
-        each = [batch_of(seed if sharing == "per_seed" else 0, step) for seed in seeds]
-        stacked = each[0] if sharing == "shared" else jax.tree.map(lambda *leaves: np.stack(leaves), *each)
-        together, metrics = update(together, stacked)
-        results = [single(state, batch) for state, batch in zip(alone, each, strict=True)]
-        alone = [state for state, _ in results]
-        np.testing.assert_allclose(metrics["loss"], [m["loss"] for _, m in results], rtol=1e-5)
-    for one, same in zip(alone, per_seed(together, seeds), strict=True):
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), one.params, same.params)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), one.ema_params, same.ema_params)
+def test_several_seeds_each_equal_a_single_seed():
+    seeds = (3, 8)
+    states, update = fresh(seeds), make_update_step(LineTask(), OPTIM, STEPS, donate=False)
+    singles, single = [alone(seed) for seed in seeds], make_update_step(LineTask(), OPTIM, STEPS)
+    for step in range(4):
+        batches = [batch_of(seed, step) for seed in seeds]
+        states, metrics = update_all(update, states, batches)
+        results = [single(state, batch) for state, batch in zip(singles, batches, strict=True)]
+        singles = [state for state, _ in results]
+        np.testing.assert_array_equal(metrics["loss"], [m["loss"] for _, m in results])
+    for one, same in zip(singles, states, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, (one.params, one.ema_params), (same.params, same.ema_params))
 
 
 @pytest.mark.parametrize(

@@ -67,12 +67,12 @@ def batches(
     prepare: Prepare | None = None,
     *,
     share: tuple[int, int] = (0, 1),
-) -> Generator[Any]:
-    """Yield the batch of each step on the device; a thread gathers the next one meanwhile.
+) -> Generator[list[Any]]:
+    """Yield the batches of each step on the device, one for each seed; a thread gathers the next ones meanwhile.
 
     Args:
         arrays: examples, see the module's docstring.
-        seeds: of the run; each has its own order. More than one seed gives batches a leading seed axis.
+        seeds: of the run; each has its own order.
         steps: the steps to yield batches for.
         batch_size: examples of a step (and seed).
         prepare: augments each example; called in that thread, or in the workers of a `Streamed`.
@@ -107,10 +107,8 @@ def batches(
     if isinstance(arrays, Streamed):
         stream = arrays.stream(order, len(steps) * len(seeds) * rows, prepare)
 
-    def fetch(step: int) -> Any:
-        parts = streamed(step) if isinstance(arrays, Streamed) else gathered(step)
-        batch = parts[0] if len(seeds) == 1 else jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-        return jax.device_put(batch)
+    def fetch(step: int) -> list[Any]:
+        return jax.device_put(streamed(step) if isinstance(arrays, Streamed) else gathered(step))
 
     with contextlib.closing(stream), ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
         ahead = None

@@ -13,18 +13,17 @@ import os
 import re
 import shutil
 import zlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import serialization
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from tflane_jax.errors import UserError
-from tflane_jax.training.state import TrainState
+from tflane_jax.training.state import TrainState, state_from, tree_of
 
 _VERSION = 1
 Which = int | Literal["last", "best"]
@@ -139,18 +138,19 @@ class Checkpoints:
         Raises:
             UserError: the checkpoint is damaged, or belongs to another model or optimiser.
         """
-        tree, expected = self.arrays(step), _plain_shapes(template)
-        if (difference := _first_difference(tree, expected)) is not None:
+        saved, shapes = _as_now(self.arrays(step)), jax.eval_shape(_plain_tree, template)
+        expected = serialization.to_state_dict(shapes)
+        if (difference := _first_difference(saved, _flat(expected))) is not None:
             raise UserError(
                 f"checkpoint {self.path(step)} does not fit this configuration: {difference}. It was made by another "
                 "model, optimiser or number of seeds"
             )
         # Through the template's own dict, because empty parts of an optimiser's state are not stored.
         leaves = jax.tree_util.tree_map_with_path(
-            lambda path, _: tree["/".join(entry.key for entry in path)], serialization.to_state_dict(template)
+            lambda path, _: saved["/".join(entry.key for entry in path)], expected
         )
-        state: TrainState = serialization.from_state_dict(template, leaves)  # pyright: ignore[reportAssignmentType]
-        return jax.device_put(_with_keys(state, template))
+        trees: dict[str, Any] = serialization.from_state_dict(shapes, leaves)
+        return jax.device_put(state_from(trees | {"key": jax.random.wrap_key_data(trees["key"])}, template))
 
     def arrays(self, step: int) -> dict[str, np.ndarray]:
         """Return the saved arrays by path ("ema_params/encoder/kernel"); raises UserError if they are damaged."""
@@ -221,27 +221,24 @@ def _checksums(folder: Path) -> dict[str, int]:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A state as named plain arrays and back. Random keys are stored as their raw words.
+# A state as named plain arrays. The random key is stored as its raw words.
 
 
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+def _plain_tree(state: TrainState) -> dict[str, Any]:
+    trees = tree_of(state)
+    return trees | {"key": jax.random.key_data(trees["key"])}
 
 
 def _plain(state: TrainState) -> dict[str, np.ndarray]:
-    words = jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
-    return _flat(serialization.to_state_dict(jax.device_get(words)))
+    words = replace(state, key=jax.random.key_data(state.key))
+    return _flat(serialization.to_state_dict(tree_of(jax.device_get(words))))
 
 
-def _plain_shapes(state: TrainState) -> dict[str, jax.ShapeDtypeStruct]:
-    words = jax.eval_shape(
-        lambda s: jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, s), state
-    )
-    return _flat(serialization.to_state_dict(words))
-
-
-def _with_keys(state: TrainState, template: TrainState) -> TrainState:
-    return jax.tree.map(lambda leaf, like: jax.random.wrap_key_data(leaf) if _is_key(like) else leaf, state, template)
+def _as_now(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of a checkpoint by the names of this version: Muon's state was that of optax's Muon."""
+    old = re.compile(r"(.*/inner_states/muon/inner_state/)0/inner_states/(?:muon/inner_state/0/(count|mu/.*)|.*)")
+    found = [(name, old.fullmatch(name), array) for name, array in arrays.items()]
+    return {match[1] + match[2] if match else name: a for name, match, a in found if match is None or match[2]}
 
 
 def _first_difference(tree: dict[str, Any], expected: dict[str, Any]) -> str | None:

@@ -19,15 +19,17 @@ from tflane_jax.training.run_folder import read_config
 from tflane_jax.training.state import TrainState, per_seed
 
 
-def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, partly: bool) -> list[Params]:
+def starting_params(
+    reference: str, states: Sequence[TrainState], seeds: Sequence[int], *, partly: bool
+) -> list[Params]:
     """Return the parameters that each seed starts from: the averaged ones of a run's best checkpoint.
 
     The last checkpoint counts as best if none was evaluated.
 
     Args:
         reference: run folder; `{seed}` in it is replaced by the seed, so that each seed can have its own run.
-        state: fresh.
-        seeds: of the state.
+        states: fresh, of each seed.
+        seeds: of the run.
         partly: keep fresh parameters where the run's model has none, and ignore those that only that model has.
 
     Raises:
@@ -36,7 +38,7 @@ def starting_params(reference: str, state: TrainState, seeds: Sequence[int], *, 
     """
     return [
         _params_of_run(folder, fresh.params, partly=partly)
-        for folder, fresh in zip(_folders(reference, seeds), per_seed(state, seeds), strict=True)
+        for folder, fresh in zip(_folders(reference, seeds), states, strict=True)
     ]
 
 

@@ -10,11 +10,10 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
@@ -32,8 +31,8 @@ from tflane_jax.training.records import Record, RecordWriter
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
-from tflane_jax.training.state import init_states, per_seed, with_params
-from tflane_jax.training.step import compiled_update
+from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
+from tflane_jax.training.step import compiled_update, update_all
 from tflane_jax.training.task import Trainable
 
 Evaluate = Callable[[Params], dict[str, float]]
@@ -51,8 +50,8 @@ class TrainingConfig:
     Attributes:
         steps: updates.
         batch_size: examples of an update (of each seed).
-        seeds: roots of all random numbers in training. Several seeds train in one program, each as it would alone up
-            to float rounding.
+        seeds: roots of all random numbers in training. Several seeds train side by side, each as it would alone; n
+            seeds take n times as long.
         log_every: steps between records; a record holds means over the steps since the last one.
         eval_every: steps between evaluations, each with a checkpoint and pictures; the last step always has one.
         checkpoint_every: steps between further checkpoints.
@@ -169,20 +168,20 @@ def train(
         # =============================================================================================================
         # State: fresh, of another run, or resumed
         # =============================================================================================================
-        state = init_states(task, optimizer, config.seeds, first_example(arrays))
+        states = init_states(task, optimizer, config.seeds, first_example(arrays))
         window, metrics, seconds = _Window(), {}, 0.0
         memories, started_from = [Memory() for _ in config.seeds], {}
         if start == "resume" and (written := checkpoints.steps()):
             manifest = checkpoints.manifest(written[-1])
-            state = checkpoints.restore(manifest.step, state)
+            states = per_seed(checkpoints.restore(manifest.step, of_all_seeds(states)), config.seeds)
             window, seconds = _Window(**manifest.progress["window"]), manifest.progress["seconds"]
             metrics = manifest.progress["metrics"]
             memories = [Memory(**memory) for memory in manifest.progress.get("cycles", [])] or memories
         elif config.init_from is not None:
-            given = starting_params(config.init_from, state, config.seeds, partly=config.init_partly)
-            state = with_params(state, given, optimizer)
+            given = starting_params(config.init_from, states, config.seeds, partly=config.init_partly)
+            states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
             started_from = {"init_from": origins(config.init_from, config.seeds)}
-        first = step = int(np.max(state.step))
+        first = step = int(states[0].step)
         _tell(add_provenance(folder, **started_from))
         write_text(folder / "config.txt", resolved_text)
         write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
@@ -195,7 +194,7 @@ def train(
         batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            update = compiled_update(task, optim, config.steps, len(config.seeds), state, batch)
+            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1)
         compile_seconds = time.perf_counter() - began
         if progress:
             tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)
@@ -207,7 +206,9 @@ def train(
             carried = {"window": asdict(window), "seconds": seconds, "metrics": metrics}
             if adaptive is not None:
                 carried["cycles"] = [asdict(memory) for memory in memories]
-            checkpoints.save(state, Manifest(step=step, config=resolved, metrics=evaluated, progress=carried))
+            checkpoints.save(
+                of_all_seeds(states), Manifest(step=step, config=resolved, metrics=evaluated, progress=carried)
+            )
 
         stepping, saved_step = 0.0, first
         with (
@@ -217,9 +218,7 @@ def train(
         ):
             while batch is not None and stop.signal is None:
                 began = time.perf_counter()
-                state, values = update(state, batch)
-                # Waiting here costs nothing: matching runs on the host, which is needed in every step anyway.
-                values = jax.device_get(values)
+                states, values = update_all(update, states, batch)
                 if not values["finite"].all():
                     save({})
                     raise UserError(_not_finite(values, step, config.seeds, checkpoints.path(step)))
@@ -237,18 +236,19 @@ def train(
                     bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
                     window = _Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
-                    evaluations = [evaluate(params) for params in per_seed(state.ema_params, config.seeds)]
+                    evaluations = [evaluate(state.ema_params) for state in states]
                     writer.write(_seed_record(step, "val", {k: [e[k] for e in evaluations] for k in evaluations[0]}))
                     metrics = {k: float(np.mean([e[k] for e in evaluations])) for k in evaluations[0]}
                     if adaptive is not None:
-                        adapted = adapt(adaptive, state.opt_state, memories, evaluations, config.steps)
-                        opt_state, memories, cycles = adapted
-                        state = state.replace(opt_state=opt_state)  # pyright: ignore[reportAttributeAccessIssue]
+                        together = of_all_seeds([state.opt_state for state in states])
+                        together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
+                        changed = per_seed(together, config.seeds)
+                        states = [replace(s, opt_state=o) for s, o in zip(states, changed, strict=True)]
                         writer.write(_seed_record(step, "cycle", cycles))
                     save(metrics)
                     saved_step = step
                     if draw is not None:
-                        draw(folder, step, per_seed(state.ema_params, config.seeds)[0], writer.records)
+                        draw(folder, step, states[0].ema_params, writer.records)
                 elif step % config.checkpoint_every == 0 or is_last:
                     save({})
                     saved_step = step

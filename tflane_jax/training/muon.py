@@ -14,6 +14,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.training.vectors import ROW, Stack, Vectors
+
 _COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of X, (X X^T) X and (X X^T)^2 X
 _ITERATIONS = 5
 _MOMENTUM = 0.95
@@ -26,7 +28,7 @@ class MuonState(NamedTuple):
 
     Attributes:
         count: () updates made.
-        mu: average of the gradients, a tree like the parameters.
+        mu: average of the gradients, like the parameters.
     """
 
     count: Int[Array, ""]
@@ -34,10 +36,7 @@ class MuonState(NamedTuple):
 
 
 def scale_by_muon() -> optax.GradientTransformation:
-    """Return Muon with Nesterov momentum; an update has a root mean square of about 0.2, like Adam's.
-
-    Kernels of more than two axes, such as those of convolutions, are matrices of all inputs (kh kw cin) x outputs.
-    """
+    """Return Muon with Nesterov momentum for `Vectors`; updates have a root mean square of about 0.2, like Adam's."""
 
     def init(params: Any) -> MuonState:
         return MuonState(jnp.zeros((), jnp.int32), jax.tree.map(jnp.zeros_like, params))
@@ -55,27 +54,38 @@ def scale_by_muon() -> optax.GradientTransformation:
     return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
 
 
-def orthogonal(updates: Any) -> Any:
-    """Return a tree of matrices with all singular values near 1, times 0.2 sqrt(longer side).
+def orthogonal(updates: Vectors) -> Vectors:
+    """Return kernels whose singular values are near 1, times 0.2 sqrt(longer side).
 
-    Five iterations leave singular values between about 0.5 and 1.5; those of tiny ones stay below.
+    Five iterations leave singular values between about 0.5 and 1.5; tiny ones stay below.
     """
-    leaves, tree = jax.tree.flatten(updates)
-    by_shape: dict[tuple[int, int], list[int]] = {}
-    for i, leaf in enumerate(leaves):
-        rows, columns = _sides(leaf.shape)
-        by_shape.setdefault((min(rows, columns), max(rows, columns)), []).append(i)
-    for shape, members in by_shape.items():
-        wide = [leaves[i].reshape(_sides(leaves[i].shape)) for i in members]
-        wide = jnp.stack([matrix if matrix.shape == shape else matrix.T for matrix in wide])
-        for i, matrix in zip(members, _newton_schulz(wide) * (_RMS * np.sqrt(shape[1])), strict=True):
-            rows, columns = _sides(leaves[i].shape)
-            leaves[i] = (matrix if (rows, columns) == shape else matrix.T).reshape(leaves[i].shape)
-    return jax.tree.unflatten(tree, leaves)
+    by_shape: dict[tuple[int, int], list[tuple[str, Stack]]] = {}
+    for group, vector in updates.groups.items():
+        for stack in () if isinstance(vector, optax.MaskedNode) else updates.layout.stacks(group):
+            by_shape.setdefault((min(stack.shape), max(stack.shape)), []).append((group, stack))
+    parts: dict[str, dict[int, jax.Array]] = {}
+    for shape, stacks in by_shape.items():
+        wide = [_matrices(updates.groups[group], stack) for group, stack in stacks]
+        wide = jnp.concatenate(
+            [x if stack.shape == shape else x.mT for x, (_, stack) in zip(wide, stacks, strict=True)]
+        )
+        found = _newton_schulz(wide) * (_RMS * np.sqrt(shape[1]))
+        for group, stack in stacks:
+            mine, found = found[: stack.count], found[stack.count :]
+            rows = (mine if stack.shape == shape else mine.mT).reshape(stack.count, -1)
+            rows = jnp.pad(rows, ((0, 0), (0, stack.rows * ROW - rows.shape[1])))
+            parts.setdefault(group, {})[stack.row] = rows.reshape(-1)
+    return updates.map(
+        lambda group, masked: (
+            jnp.concatenate([parts[group][row] for row in sorted(parts[group])]) if group in parts else masked
+        )
+    )
 
 
-def _sides(shape: tuple[int, ...]) -> tuple[int, int]:
-    return int(np.prod(shape[:-1])), shape[-1]
+def _matrices(vector: Float[Array, " n"], stack: Stack) -> Float[Array, "matrices inputs outputs"]:
+    rows, size = stack.count * stack.rows, stack.shape[0] * stack.shape[1]
+    kernels = vector[stack.row * ROW : (stack.row + rows) * ROW].reshape(stack.count, -1)
+    return kernels[:, :size].reshape(stack.count, *stack.shape)
 
 
 def _newton_schulz(x: Float[Array, "matrices rows columns"]) -> Float[Array, "matrices rows columns"]:

@@ -15,7 +15,6 @@ import optax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.models.parameters import Params
 from tflane_jax.training.muon import scale_by_muon
 from tflane_jax.training.restarts import (
     Cycle,
@@ -27,6 +26,7 @@ from tflane_jax.training.restarts import (
     half_cosine,
     relative_rate,
 )
+from tflane_jax.training.vectors import Vectors, any_in_leaf, norm
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def warmup_factor(config: OptimConfig, step: Int[ArrayLike, "..."]) -> Float[Arr
 
 
 def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformation:
-    """Return the gradient transformation of a run of `steps` updates.
+    """Return the gradient transformation of a run of `steps` updates, for `Vectors`.
 
     Raises UserError where a setting cannot work, see `make_schedule` and `RestartsConfig`.
     """
@@ -125,22 +125,33 @@ def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformat
     decay = optax.masked(_decay_what_learns(config.weight_decay), is_decayed)
     adam = _preconditioner(config)
     return optax.chain(
-        optax.clip_by_global_norm(config.clip_norm),
+        _clip_by_norm(config.clip_norm),
         optax.chain(*((adam, decay) if config.decay == "decoupled" else (decay, adam)), _scale_by_rate(config, steps)),
     )
 
 
+def _clip_by_norm(largest: float) -> optax.GradientTransformation:
+    def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        found = norm(updates)
+        return jax.tree.map(lambda g: jnp.where(found < largest, g, g / found * largest), updates), state
+
+    return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
+
+
 def _decay_what_learns(rate: float) -> optax.GradientTransformation:
-    """Add `rate` times the parameters, except to those whose update is zero everywhere.
+    """Add `rate` times the parameters, except to leaves whose update is zero everywhere.
 
     These are the frozen parts of a backbone, which PyTorch does not pass to the optimiser at all.
     """
 
     def update(updates: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        def decayed(change: jax.Array, leaf: jax.Array) -> jax.Array:
-            return change + jnp.where(jnp.any(change != 0), rate, 0.0).astype(leaf.dtype) * leaf
+        def decayed(group: str, change: Any) -> Any:
+            if isinstance(change, optax.MaskedNode):
+                return change
+            learns = any_in_leaf(change != 0, updates.layout, group)
+            return change + jnp.where(learns, rate, 0.0) * params.groups[group]
 
-        return jax.tree.map(decayed, updates, params), state
+        return updates.map(decayed), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
@@ -150,14 +161,10 @@ def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
     adam = optax.scale_by_adam(b1=config.b1, b2=config.b2, eps=config.eps)
     if config.optimizer == "adam":
         return adam
+    kernels = ("dense",) if config.muon_kernels == "dense" else ("dense", "convolution")
 
-    ranks = (2,) if config.muon_kernels == "dense" else (2, 4)
-
-    def labels(params: Params) -> Any:
-        def label(path: tuple[Any, ...], leaf: jax.Array) -> str:
-            return "muon" if leaf.ndim in ranks and getattr(path[-1], "key", None) == "kernel" else "adam"
-
-        return jax.tree_util.tree_map_with_path(label, params)
+    def labels(params: Any) -> Any:
+        return params.map(lambda group, _: "muon" if group in kernels else "adam")
 
     return optax.partition({"adam": adam, "muon": scale_by_muon()}, labels)
 
@@ -167,7 +174,7 @@ def _scale_by_rate(config: OptimConfig, steps: int) -> optax.GradientTransformat
     if (restarts := config.restarts) is None:
         return optax.scale_by_learning_rate(make_schedule(config, steps))
 
-    def init(params: Params) -> Cycle:
+    def init(params: Any) -> Cycle:
         return first_cycle(restarts, config.warmup_steps, steps)
 
     def update(updates: Any, state: Cycle, params: Any = None) -> tuple[Any, Cycle]:
@@ -197,13 +204,6 @@ def _check(config: OptimConfig, steps: int) -> None:
         check_restarts(config.restarts)
 
 
-def is_decayed(params: Params) -> Any:
-    """Return which leaves get weight decay: matrices, but neither biases nor the scales of norms.
-
-    Names are checked beside ranks, because the biases of attention heads are matrices too.
-    """
-
-    def decayed(path: tuple[Any, ...], leaf: jax.Array) -> bool:
-        return leaf.ndim > 1 and getattr(path[-1], "key", None) not in ("bias", "scale")
-
-    return jax.tree_util.tree_map_with_path(decayed, params)
+def is_decayed(params: Vectors) -> Vectors:
+    """Return which groups get weight decay: matrices, but neither biases nor the scales of norms."""
+    return params.map(lambda group, _: group != "plain")

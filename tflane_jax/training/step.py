@@ -1,13 +1,18 @@
-"""The update step: loss, gradient, optimiser, moving average. It is traced once, and its input state is donated."""
+"""The update step: loss, gradient, optimiser, moving average. It is traced once.
+
+Several seeds share one compiled update of a single seed. One program for all of them (`vmap`) would be slower, because
+XLA turns convolutions with a kernel for each seed into grouped ones.
+"""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, Literal
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
@@ -16,70 +21,62 @@ from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
 from tflane_jax.training.state import TrainState
 from tflane_jax.training.task import Trainable
+from tflane_jax.training.vectors import Vectors, norm, ravel
 
 Metrics = dict[str, jax.Array]
 UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 
 
-def make_update_step(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
-    """Return the jitted update (state, batch) -> (state, metrics); the input state is donated.
+def make_update_step(task: Trainable, optim: OptimConfig, steps: int, *, donate: bool = True) -> UpdateStep:
+    """Return the jitted update (state, batch) -> (state, metrics) of one seed.
 
     Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group, "matching/lanes", stays as it is),
     `grad_norm` before clipping, `learning_rate`, and `finite`.
     If the loss or a gradient is not finite, `finite` is False and the state is returned unchanged.
     A second trace (a batch of another shape) raises AssertionError.
-    """
-    return _guarded(_update(task, optim, steps))
-
-
-def make_multi_seed_step(
-    task: Trainable, optim: OptimConfig, steps: int, *, batch: Literal["shared", "per_seed"]
-) -> UpdateStep:
-    """Return the update of several seeds at once: state and metrics have a leading seed axis.
-
-    Each seed trains as it would alone, up to float rounding (batched products round differently). A number that is not
-    finite in one seed leaves the states of all seeds unchanged.
 
     Args:
-        task, optim, steps: as for `make_update_step`.
-        batch: "per_seed" batches have a leading seed axis, a "shared" batch serves every seed.
+        task, optim: what to train, and how.
+        steps: of the whole run.
+        donate: give the memory of the input state to the new one; the input state cannot be used again.
     """
-    update = _update(task, optim, steps)
-    return _guarded(jax.vmap(update, in_axes=(0, 0 if batch == "per_seed" else None)))
+    return jax.jit(_traced_once(_update(task, optim, steps)), donate_argnums=0 if donate else ())
+
+
+def update_all(
+    update: UpdateStep, states: Sequence[TrainState], batches: Sequence[Any]
+) -> tuple[list[TrainState], dict[str, np.ndarray]]:
+    """Return the states of all seeds after an update with a batch for each, and metrics (numpy).
+
+    Metrics have a leading seed axis if there are several seeds. A number that is not finite in one seed leaves all
+    states unchanged, which needs an `update` that donates nothing if there are several.
+    """
+    results = [update(state, batch) for state, batch in zip(states, batches, strict=True)]
+    metrics = jax.device_get([metrics for _, metrics in results])
+    if len(states) > 1 and not all(each["finite"] for each in metrics):
+        results = [(state, None) for state in states]
+    whole = {name: np.stack([each[name] for each in metrics]) for name in metrics[0]}
+    return [state for state, _ in results], whole if len(states) > 1 else metrics[0]
 
 
 def compiled_update(
-    task: Trainable, optim: OptimConfig, steps: int, seeds: int, state: TrainState, batch: Any
+    task: Trainable, optim: OptimConfig, steps: int, state: TrainState, batch: Any, *, donate: bool = True
 ) -> UpdateStep:
-    """Return the update of one or several seeds (with a batch for each), compiled for these shapes.
+    """Return the update of one seed, compiled for the shapes of a state and a batch.
 
     A process compiles it once: trainings that differ only in seeds or starting parameters use the same program.
     """
     leaves, tree = jax.tree.flatten((state, batch))
-    return _compiled(task, optim, steps, seeds, tree, tuple(jax.typeof(leaf) for leaf in leaves))
+    return _compiled(task, optim, steps, donate, tree, tuple(jax.typeof(leaf) for leaf in leaves))
 
 
 @functools.lru_cache(maxsize=16)
 def _compiled(
-    task: Trainable, optim: OptimConfig, steps: int, seeds: int, tree: Any, types: tuple[Any, ...]
+    task: Trainable, optim: OptimConfig, steps: int, donate: bool, tree: Any, types: tuple[Any, ...]
 ) -> UpdateStep:
-    if seeds == 1:
-        update: Any = make_update_step(task, optim, steps)
-    else:
-        update = make_multi_seed_step(task, optim, steps, batch="per_seed")
+    update: Any = make_update_step(task, optim, steps, donate=donate)
     shapes = [jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in types]
     return update.lower(*jax.tree.unflatten(tree, shapes)).compile()
-
-
-def _guarded(update: UpdateStep) -> UpdateStep:
-    """Compile an update that keeps the old state (of every seed) unless all numbers are finite."""
-
-    def guarded(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
-        new, metrics = update(state, batch)
-        finite = metrics["finite"].all()
-        return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, state), metrics
-
-    return jax.jit(_traced_once(guarded), donate_argnums=0)
 
 
 def _traced_once(update: UpdateStep) -> UpdateStep:
@@ -104,20 +101,22 @@ def _update(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
         key = stream(state.key, "dropout", state.step)
-        learned, statistics = split_statistics(state.params)
 
         def loss_of(learned: Params):
-            return task.loss(learned | statistics, batch, key)
+            return task.loss(learned | state.statistics, batch, key)
 
-        (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(learned)
+        (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(state.learned.tree())
         terms, statistics = split_statistics(aux)
-        grad_norm = optax.tree.norm(grads)
-        updates, opt_state = optimizer.update(grads, state.opt_state, learned)
-        params: Params = optax.apply_updates(learned, updates) | statistics  # pyright: ignore
+        gradient = ravel(grads, state.learned.layout)
+        grad_norm = norm(gradient)
+        updates, opt_state = optimizer.update(gradient, state.opt_state, state.learned)  # pyright: ignore
+        learned: Vectors = optax.apply_updates(state.learned, updates)  # pyright: ignore
         new = TrainState(
             step=state.step + 1,
-            params=params,
-            ema_params=moving_average(state.ema_params, params, state.step, optim.ema_decay),
+            learned=learned,
+            statistics=statistics,
+            ema_learned=moving_average(state.ema_learned, learned, state.step, optim.ema_decay),
+            ema_statistics=moving_average(state.ema_statistics, statistics, state.step, optim.ema_decay),
             opt_state=opt_state,
             key=state.key,
         )
@@ -127,14 +126,12 @@ def _update(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
             "learning_rate": rate(state.opt_state, state.step),
             "finite": jnp.isfinite(loss) & jnp.isfinite(grad_norm),
         }
-        return new, metrics
+        return jax.tree.map(lambda after, before: jnp.where(metrics["finite"], after, before), new, state), metrics
 
     return update
 
 
-def moving_average(
-    average: Params, params: Params, step: int | Int[Array, ""], decay: float | Float[Array, ""]
-) -> Params:
+def moving_average(average: Any, params: Any, step: int | Int[Array, ""], decay: float | Float[Array, ""]) -> Any:
     """Return d * average + (1 - d) * params with d = min(decay, (1 + step) / (10 + step)).
 
     The second bound removes the initial parameters from the average early, so that it can evaluate short runs.

@@ -32,10 +32,18 @@ def resample(points: Float[AnyArray, "n d"], count: int) -> Float[np.ndarray, "c
     return sample_at(points, np.linspace(0.0, arc_length(points)[-1], count))
 
 
-def sample_at(points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"]) -> Float[np.ndarray, "k d"]:
-    """Return the points at the given ground-plane distances along the line, clamped to its ends."""
+def sample_at(
+    points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"], along: Float[np.ndarray, " n"] | None = None
+) -> Float[np.ndarray, "k d"]:
+    """Return the points at the given ground-plane distances along the line, clamped to its ends.
+
+    Args:
+        points: of the line.
+        distances: metres.
+        along: `arc_length(points)`, if the caller has it.
+    """
     points = np.asarray(points)
-    along = arc_length(points)
+    along = arc_length(points) if along is None else along
     if len(points) == 1 or along[-1] == 0.0:
         return np.repeat(points[:1], len(distances), axis=0)
     distances = np.clip(distances, 0.0, along[-1])

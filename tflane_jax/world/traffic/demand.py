@@ -67,6 +67,10 @@ class Trips:
     drivers: Drivers
     enters: Float[np.ndarray, " n"]
 
+    def take(self, rows: Int[np.ndarray, " m"]) -> Trips:
+        """Return some trips."""
+        return Trips(self.routes.take(rows), self.drivers.take(rows), self.enters[rows])
+
 
 def draw_trips(
     rng: np.random.Generator,

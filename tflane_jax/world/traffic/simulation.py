@@ -9,12 +9,12 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.scene import RoadUser
 from tflane_jax.world.roads.networks import RoadNetwork
-from tflane_jax.world.traffic.demand import draw_trips
+from tflane_jax.world.traffic.demand import Trips, draw_trips
 from tflane_jax.world.traffic.lane_table import LaneTable, build_lane_table
 from tflane_jax.world.traffic.pedestrians import Walkers, crossing_places, draw_crossers, walk_sidewalks
 from tflane_jax.world.traffic.rollout import Rollout
 from tflane_jax.world.traffic.signals import Signals, draw_signals, turn_green
-from tflane_jax.world.traffic.vehicles import draw_drivers
+from tflane_jax.world.traffic.vehicles import Drivers, draw_drivers
 
 # Time step of the warm-up, and how long before its end the ego vehicle joins, seconds.
 _WARM_UP_STEP, _EGO_JOINS = 0.4, 3.2
@@ -127,10 +127,14 @@ def simulate_traffic(
 
     substeps = max(1, int(config.step_s * rate_hz + 1e-9))
     position, progress = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
-    driven = _driven(road, position[:frames])
+    position = position[:frames]
+    # Most trips end before the log begins or start after it ends; the ego vehicle's is the first.
+    here = ((position >= 0.0) & (position <= road.trips.routes.length)).any(0)
+    rows = np.flatnonzero(here | (np.arange(len(here)) == 0))
+    driven = _driven(road.trips.take(rows), road.table, position[:, rows])
     walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]
     walking.append(crossers.paths(progress[:frames]))
-    return _assemble(rng, network, config, road, driven, walking)
+    return _assemble(rng, network, config, driven, walking, signals)
 
 
 def _varied(rng: np.random.Generator, config: TrafficConfig) -> TrafficConfig:
@@ -182,11 +186,19 @@ def _ego_starts(
     return np.maximum(starts, 3.0)
 
 
-def _driven(
-    road: Rollout, position: Float[np.ndarray, "f n"]
-) -> tuple[Float[np.ndarray, "f n 2"], Float[np.ndarray, "f n"], Bool[np.ndarray, "f n"]]:
-    """Return box centres, headings and presence of all trips: front and rear wheels stay on the lane."""
-    routes, drivers, table = road.trips.routes, road.trips.drivers, road.table
+@dataclass(frozen=True)
+class _Driven:
+    """Vehicles of N trips over F frames: box centres, headings, presence, sizes and categories."""
+
+    xy: Float[np.ndarray, "f n 2"]
+    yaw: Float[np.ndarray, "f n"]
+    present: Bool[np.ndarray, "f n"]
+    drivers: Drivers
+
+
+def _driven(trips: Trips, table: LaneTable, position: Float[np.ndarray, "f n"]) -> _Driven:
+    """Return the vehicles at distances along their routes: front and rear wheels stay on the lane."""
+    routes, drivers = trips.routes, trips.drivers
     present = (position >= 0.0) & (position <= routes.length)
     at = np.where(present, position, 0.0)
     wheelbase = 0.6 * drivers.size[:, 0]
@@ -199,19 +211,19 @@ def _driven(
     )
     xy = xy + sway[..., None] * np.stack([-np.sin(heading), np.cos(heading)], -1)
     middle, axis = xy.mean(2), xy[:, :, 1] - xy[:, :, 0]
-    return middle.transpose(1, 0, 2), np.arctan2(axis[..., 1], axis[..., 0]).T, present
+    return _Driven(middle.transpose(1, 0, 2), np.arctan2(axis[..., 1], axis[..., 0]).T, present, drivers)
 
 
 def _assemble(
     rng: np.random.Generator,
     network: RoadNetwork,
     config: TrafficConfig,
-    road: Rollout,
-    driven: tuple[np.ndarray, np.ndarray, np.ndarray],
+    driven: _Driven,
     walking: list[Walkers],
+    signals: Signals,
 ) -> Traffic:
     """Join vehicles, parked vehicles and pedestrians; drop those that never come near the ego vehicle."""
-    xy, yaw, present = driven
+    xy, yaw, present, drivers = driven.xy, driven.yaw, driven.present, driven.drivers
     frames = len(xy)
     slots = network.parking[rng.random(len(network.parking)) < config.parked_share]
     lorry = rng.random(len(slots)) < 0.06
@@ -224,7 +236,6 @@ def _assemble(
     def still(values: np.ndarray) -> np.ndarray:
         return np.broadcast_to(values, (frames, *values.shape))
 
-    drivers = road.trips.drivers
     xy = np.concatenate([xy, still(slots[:, :2]), *(w.xy for w in walking)], 1)
     yaw = np.concatenate([yaw, still(slots[:, 2]), *(w.yaw for w in walking)], 1)
     present = np.concatenate([present, still(np.ones(len(slots), bool)), *(w.present for w in walking)], 1)
@@ -234,4 +245,4 @@ def _assemble(
     present = present & (np.hypot(*(xy - ego[:, None, :2]).transpose(2, 0, 1)) < config.range)
     present[:, 0] = False
     seen = present.any(0)
-    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, road.signals)
+    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, signals)

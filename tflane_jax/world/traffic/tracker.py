@@ -236,8 +236,11 @@ def _switch(
     there[1:] &= identity[:-1] >= 0
     there[:1] = False
     x, y = np.where(there[..., None], xy, np.inf).transpose(2, 0, 1)
-    near_x = np.abs(np.where(there, x, 0.0)[:, :, None] - np.where(there, x, 1e6)[:, None]) < config.switch_distance
+    seen = np.flatnonzero(there.any(0))
+    at, elsewhere = np.where(there, x, 0.0)[:, seen], np.where(there, x, 1e6)[:, seen]
+    near_x = np.abs(at[:, :, None] - elsewhere[:, None]) < config.switch_distance
     frame, a, b = np.nonzero(np.triu(near_x, 1))
+    a, b = seen[a], seen[b]
     close = there[frame, a] & there[frame, b]
     frame, a, b = frame[close], a[close], b[close]
     close = np.hypot(x[frame, a] - x[frame, b], y[frame, a] - y[frame, b]) < config.switch_distance

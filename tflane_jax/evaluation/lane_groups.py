@@ -98,7 +98,7 @@ def driven_fraction(
         vehicles.
     """
     start, step, yaw, turn = _pieces(flow)
-    line = _samples(points)
+    line = _samples(points).astype(np.float32)
     direction = np.arctan2(*np.moveaxis(np.gradient(line, axis=1), -1, 0)[::-1])
     # Coordinate by coordinate: a last axis of two would be several times slower.
     (x, y), (step_x, step_y) = np.moveaxis(line[:, :, None] - start, -1, 0), step.T

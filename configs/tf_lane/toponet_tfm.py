@@ -8,12 +8,14 @@ Same data, optimiser and host as `toponet.py`. The paper runs its ablations on L
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
     LANE_FUSIONS,
+    Fusion,
     TrafficFlowConfig,
     TrafficFlowModuleConfig,
 )
@@ -26,24 +28,41 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the rows of Table 5 (Pipe., Dep., Norm.) and Table 6 (N_t, tol_pts), by the paper's names."""
+    """Return the rows of Table 5 (Pipe., Dep., Norm.) and Table 6 (N_t, tol_pts), by the paper's names.
+
+    Rows with a suffix take a reading that the paper leaves open, see docs/tf_lane.md: "spatial" reads "Dep." as layers
+    of the spatial encoder; "sine" and "linear" exchange the encoding and keep "Norm."; "no_residual" and "mean" are
+    abla5 without residual in the fusion modules, and without first and last frame beside the mean.
+    """
+    deep, deep_spatial = TrafficFlowModuleConfig(depth=3), TrafficFlowModuleConfig(spatial_depth=3)
+    plain = TrafficFlowModuleConfig()
     architecture = {
-        "abla1": (ALL_FUSIONS, 3, False),
-        "abla2": (ALL_FUSIONS, 1, False),
-        "abla3": (LANE_FUSIONS, 3, False),
-        "abla4": (LANE_FUSIONS, 1, False),
-        "abla5": (LANE_FUSIONS, 1, True),
+        "abla1": _architecture(ALL_FUSIONS, deep, "linear", "metres"),
+        "abla1_spatial": _architecture(ALL_FUSIONS, deep_spatial, "linear", "metres"),
+        "abla2": _architecture(ALL_FUSIONS, plain, "linear", "metres"),
+        "abla3": _architecture(LANE_FUSIONS, deep, "linear", "metres"),
+        "abla3_spatial": _architecture(LANE_FUSIONS, deep_spatial, "linear", "metres"),
+        "abla4": _architecture(LANE_FUSIONS, plain, "linear", "metres"),
+        "abla4_sine": _architecture(LANE_FUSIONS, plain, "sine", "metres"),
+        "abla5": _architecture(LANE_FUSIONS, plain, "sine", "normalised"),
+        "abla5_linear": _architecture(LANE_FUSIONS, plain, "linear", "normalised"),
+        "abla5_no_residual": _architecture(
+            LANE_FUSIONS, dataclasses.replace(plain, residual="none"), "sine", "normalised"
+        ),
+        "abla5_mean": _architecture(LANE_FUSIONS, dataclasses.replace(plain, token="mean"), "sine", "normalised"),
     }
     data = {"abla6": (20, 5), "abla7": (30, 5), "abla8": (30, 10)}
-    return {name: _architecture(*row) for name, row in architecture.items()} | {
-        name: _data(*row) for name, row in data.items()
-    }
+    return architecture | {name: _data(*row) for name, row in data.items()}
 
 
-def _architecture(fusions: tuple, depth: int, normalised: bool) -> RunConfig:
-    module = TrafficFlowModuleConfig(fusions=fusions, depth=depth, position_encoding="sine" if normalised else "linear")
-    prior = TrafficFlowPriorConfig(coordinates="normalised" if normalised else "metres")
-    return _with_traffic_flow(TrafficFlowConfig(prior=prior, module=module))
+def _architecture(
+    fusions: tuple[Fusion, ...],
+    module: TrafficFlowModuleConfig,
+    encoding: Literal["sine", "linear"],
+    coordinates: Literal["normalised", "metres"],
+) -> RunConfig:
+    module = dataclasses.replace(module, fusions=fusions, position_encoding=encoding)
+    return _with_traffic_flow(TrafficFlowConfig(TrafficFlowPriorConfig(coordinates=coordinates), module))
 
 
 def _data(instances: int, tolerance: int) -> RunConfig:

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, ArrayLike, Float, Int
-from optax.contrib import muon
 
 from tflane_jax.errors import UserError
 from tflane_jax.models.parameters import Params
+from tflane_jax.training.muon import scale_by_muon
 from tflane_jax.training.restarts import (
     Cycle,
     RestartsConfig,
@@ -39,8 +39,10 @@ class OptimConfig:
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
         weight_decay: on kernels and embeddings only.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam).
-        optimizer: of the kernels of dense layers. "muon" (Jordan et al. 2024) orthogonalises the updates. None of the
-            three papers uses it; docs/cameras.md has its effect on small models.
+        optimizer: of the kernels that `muon_kernels` names; all other parameters have Adam. "muon" (Jordan et al.
+            2024) orthogonalises the updates. None of the three papers uses it; docs/cameras.md has its effect on
+            small models.
+        muon_kernels: which kernels are Muon's; that of a convolution is a matrix of (kh kw cin) x cout.
         clip_norm: largest global gradient norm; inf for none.
         b1, b2, eps: of Adam.
         ema_decay: of the averaged parameters that are evaluated; 0 evaluates the parameters themselves.
@@ -57,6 +59,7 @@ class OptimConfig:
     weight_decay: float = 0.01
     decay: Literal["decoupled", "coupled"] = "decoupled"
     optimizer: Literal["adam", "muon"] = "adam"
+    muon_kernels: Literal["dense", "dense_and_convolution"] = "dense"
     clip_norm: float = 35.0
     b1: float = 0.9
     b2: float = 0.999
@@ -143,21 +146,20 @@ def _decay_what_learns(rate: float) -> optax.GradientTransformation:
 
 
 def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
-    """Return Adam, or Muon for matrices beside Adam for the rest."""
+    """Return Adam, or Muon for kernels beside Adam for the rest."""
     adam = optax.scale_by_adam(b1=config.b1, b2=config.b2, eps=config.eps)
     if config.optimizer == "adam":
         return adam
 
+    ranks = (2,) if config.muon_kernels == "dense" else (2, 4)
+
     def labels(params: Params) -> Any:
         def label(path: tuple[Any, ...], leaf: jax.Array) -> str:
-            return "muon" if leaf.ndim == 2 and getattr(path[-1], "key", None) == "kernel" else "adam"
+            return "muon" if leaf.ndim in ranks and getattr(path[-1], "key", None) == "kernel" else "adam"
 
         return jax.tree_util.tree_map_with_path(label, params)
 
-    # The root mean square of an update is 0.2, as usual for Adam, so that one learning rate fits both. optax's Muon
-    # returns steps, its Adam gradients: hence the sign.
-    matrices = optax.chain(muon(1.0, consistent_rms=0.2), optax.scale(-1.0))
-    return optax.partition({"adam": adam, "muon": matrices}, labels)
+    return optax.partition({"adam": adam, "muon": scale_by_muon()}, labels)
 
 
 def _scale_by_rate(config: OptimConfig, steps: int) -> optax.GradientTransformation:

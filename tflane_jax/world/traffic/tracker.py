@@ -19,8 +19,6 @@ from tflane_jax.world.bev.line_of_sight import hidden_points
 
 # Points of a box tested for line of sight, in half lengths and half widths: middle and near the corners.
 _PROBES = 0.9 * np.array([[0.0, 0.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-# Line of sight is computed this often and interpolated, seconds.
-_LOOK_EVERY = 0.3
 
 
 @dataclass(frozen=True)
@@ -41,6 +39,7 @@ class TrackerConfig:
         coast: frames for which a lost track is continued.
         switch_rate: identity switches per second between two neighbours nearer than `switch_distance`.
         switch_distance: metres.
+        look_every_s: interval at which line of sight is computed, seconds; it is interpolated in between.
     """
 
     range: float = 60.0
@@ -56,6 +55,7 @@ class TrackerConfig:
     coast: int = 5
     switch_rate: float = 0.02
     switch_distance: float = 3.5
+    look_every_s: float = 0.3
 
     def with_noise(self, scale: float) -> TrackerConfig:
         """Return the tracker with noise and misses scaled."""
@@ -171,7 +171,7 @@ def _detections(
     else:
         chance = np.where(distance <= config.range, 1.0, 0.0)
     if config.view_needed > 0.0:
-        stride = max(1, int(_LOOK_EVERY * rate_hz + 1e-9))
+        stride = max(1, int(config.look_every_s * rate_hz + 1e-9))
         share = visible_share(actors, global_from_ego, buildings, stride)
         chance = chance * np.clip(share / config.view_needed, 0.0, 1.0)
     return actors.valid & (rng.random(distance.shape) < chance * (1.0 - config.drop))

@@ -1,0 +1,67 @@
+"""Muon by shape equals optax's Muon, which orthogonalises every kernel apart."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from optax.contrib import MuonDimensionNumbers, muon
+
+from tflane_jax.training.muon import orthogonal, scale_by_muon
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+
+SHAPES = {"wide": (3, 7), "tall": (7, 3), "again": (3, 7), "square": (4, 4), "row": (1, 5), "column": (5, 1)}
+CONVOLUTIONS = {"conv": (3, 3, 2, 5), "narrow": (3, 3, 1, 2), "pointwise": (1, 1, 3, 7)}
+
+
+def gradients(shapes, step):
+    rng = np.random.default_rng(step)
+    return {
+        name: {"kernel": jnp.asarray(10.0 ** rng.integers(-3, 3) * rng.normal(size=shape), jnp.float32)}
+        for name, shape in shapes.items()
+    }
+
+
+@pytest.mark.parametrize("shapes", [SHAPES, CONVOLUTIONS, SHAPES | CONVOLUTIONS, {"one": (1, 1)}])
+def test_updates_are_optaxs(shapes):
+    dimensions = {n: {"kernel": MuonDimensionNumbers(tuple(range(len(s) - 1)), len(s) - 1)} for n, s in shapes.items()}
+    theirs = muon(1.0, consistent_rms=0.2, muon_weight_dimension_numbers=dimensions)
+    ours = scale_by_muon()
+    params = gradients(shapes, 99)
+    states = [ours.init(params), theirs.init(params)]
+    ours_update, theirs_update = jax.jit(ours.update), jax.jit(theirs.update)
+    for step in range(4):
+        grads = gradients(shapes, step)
+        found, states[0] = ours_update(grads, states[0], params)
+        expected, states[1] = theirs_update(grads, states[1], params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, -b, atol=2e-5), found, expected)
+
+
+def test_one_iteration_for_all_kernels_of_a_shape():
+    def products(shapes):
+        return str(jax.make_jaxpr(orthogonal)(gradients(shapes, 0))).count("dot_general")
+
+    assert products(SHAPES) == 3 * products({"wide": (3, 7)})  # 3 x 7, 4 x 4, 1 x 5
+
+
+def test_a_kernel_without_gradient_is_not_updated():
+    grads = {"learned": jnp.ones((2, 3)), "frozen": jnp.zeros((2, 3))}
+    found = orthogonal(grads)
+    np.testing.assert_array_equal(found["frozen"], 0.0)
+    assert np.isfinite(found["learned"]).all()
+
+
+@pytest.mark.parametrize("kernels", ["dense", "dense_and_convolution"])
+def test_only_the_kernels_that_are_named_are_muons(kernels):
+    config = OptimConfig(lr=0.1, warmup_steps=0, weight_decay=0.0, clip_norm=np.inf, muon_kernels=kernels)
+    grads = gradients(SHAPES | CONVOLUTIONS | {"graph": (2, 3, 4)}, 0) | {"queries": {"embedding": jnp.ones((5, 3))}}
+    params = jax.tree.map(jnp.zeros_like, grads)
+    found, adam = (
+        jax.jit(o.update)(grads, o.init(params), params)[0]
+        for o in (make_optimizer(dataclasses.replace(config, optimizer=kind), 10) for kind in ("muon", "adam"))
+    )
+    changed = {name for name in grads if not optax.tree.allclose(found[name], adam[name], rtol=1e-5)}
+    expected = set(SHAPES) | (set(CONVOLUTIONS) if kernels == "dense_and_convolution" else set())
+    assert changed == expected

@@ -1,4 +1,4 @@
-"""`tflane data stats`: how many lanes a split has, how much of them evidence and traffic show, and the traffic itself."""
+"""`tflane data stats`: how many lanes a split has, how much of them evidence and traffic show, and its traffic."""
 
 from __future__ import annotations
 

@@ -21,14 +21,13 @@ from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
 from tflane_jax.world.roads.sd_map import make_sd_map
 
 
-def traffic_flow(
-    log: Log, keyframe: int, *, history: int, capacity: int, stride: int = 1
-) -> tuple[TrafficFlow, int]:
+def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int, stride: int = 1) -> tuple[TrafficFlow, int]:
     """Return the tracks in `history` frames before the key frame, and how many exceeded the capacity.
 
-    The frames are `stride` track frames apart, the latest one `stride` before the key frame. The log holds each frame's boxes in the ego frame of that frame; TF-Lane Eq. (1) moves them into the ego frame of
-    the key frame. Where the log starts later, the first frames of the result are invalid. Of more instances than
-    `capacity`, those whose nearest position is farthest are left out.
+    The frames are `stride` track frames apart, the latest one `stride` before the key frame. The log holds each frame's
+    boxes in the ego frame of that frame; TF-Lane Eq. (1) moves them into the ego frame of the key frame. Where the log
+    starts later, the first frames of the result are invalid. Of more instances than `capacity`, those whose nearest
+    position is farthest are left out.
     """
     moment, tracks = log.keyframes[keyframe], log.tracks
     frames = np.arange(moment.track_frame - history * stride, moment.track_frame, stride)

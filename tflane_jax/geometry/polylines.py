@@ -136,9 +136,7 @@ def _has_length(points: np.ndarray) -> bool:
     return bool((points[1:, :2] != points[:-1, :2]).any())
 
 
-def _cut(
-    a: np.ndarray, b: np.ndarray, range_: PerceptionRange
-) -> tuple[np.ndarray, np.ndarray, bool, bool] | None:
+def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[np.ndarray, np.ndarray, bool, bool] | None:
     """Return where a segment enters and leaves the box (Liang-Barsky), and whether at its ends; None if outside."""
     enter, leave = 0.0, 1.0
     # Plain floats: an array operation on one segment costs more than all of this.

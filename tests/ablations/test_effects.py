@@ -15,6 +15,7 @@ from tflane_jax.evaluation.results import SceneRatio
 
 SCENES, SEEDS = 40, (0, 1, 2, 3)
 PRIMARY, CONTROL = "hidden+traffic/recall", "hidden-traffic/recall"
+NEGATIVE, DIFFERENCE = f"negative control {CONTROL}", "difference of the two"
 DECLARED = Declaration(PRIMARY, "+TFM", CONTROL)
 LANES = {name: np.random.default_rng([7, i]).integers(0, 20, SCENES) for i, name in enumerate((PRIMARY, CONTROL))}
 
@@ -48,7 +49,7 @@ def results():
 
 def test_differences_and_tests_are_those_of_the_scores(results):
     found = effects(results, DECLARED, "", "last")
-    names = [PRIMARY, CONTROL, f"{PRIMARY} - {CONTROL}"]
+    names = [PRIMARY, NEGATIVE, DIFFERENCE]
     # Interventions on other models than the treatment are not compared with.
     assert [(e.measure, e.row) for e in found] == [
         (name, row) for name in names for row in ("baseline", "+TFM, none", "matched")
@@ -56,8 +57,8 @@ def test_differences_and_tests_are_those_of_the_scores(results):
     table = results.rows("", "last")
     value = {
         PRIMARY: lambda row, seed: table[row][seed][PRIMARY],
-        CONTROL: lambda row, seed: table[row][seed][CONTROL],
-        names[2]: lambda row, seed: table[row][seed][PRIMARY] - table[row][seed][CONTROL],
+        NEGATIVE: lambda row, seed: table[row][seed][CONTROL],
+        DIFFERENCE: lambda row, seed: table[row][seed][PRIMARY] - table[row][seed][CONTROL],
     }
     for name in names:
         of_measure = [e for e in found if e.measure == name]
@@ -90,8 +91,8 @@ def test_intervals_against_a_loop_over_drawn_scenes(results):
 def test_findings(results):
     finding = {(e.measure, e.row): e.finding for e in effects(results, DECLARED, "", "last")}
     for row in ("baseline", "+TFM, none", "matched"):
-        assert finding[PRIMARY, row] == finding[f"{PRIMARY} - {CONTROL}", row] == "shown"
-        assert finding[CONTROL, row] == "not shown"
+        assert finding[PRIMARY, row] == finding[DIFFERENCE, row] == "shown"
+        assert finding[NEGATIVE, row] == "not shown"
     worse = Declaration(PRIMARY, "matched")
     assert {e.row: e.finding for e in effects(results, worse, "", "last")} == {
         "baseline": "not shown",
@@ -122,7 +123,7 @@ def test_an_effect_of_few_scenes_is_not_shown():
 def test_scores_that_are_no_ratio_have_no_interval(results):
     found = effects(results, Declaration("all/AP_l", "+TFM"), "", "last")
     assert all(math.isnan(e.low) and math.isnan(e.high) and not math.isnan(e.p) for e in found)
-    assert "over scenes" not in sentence(found[0], Declaration("all/AP_l", "+TFM"))
+    assert "95 %" not in sentence(found[:1], Declaration("all/AP_l", "+TFM"))
 
 
 def test_rows_of_other_scenes_are_refused():
@@ -141,8 +142,12 @@ def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
     assert text.strip() in capsys.readouterr().out
     assert f"Declared before any run (2026-01-01T00:00:00+00:00): primary measure {PRIMARY}" in text
     assert "**Interim**: 4 of 5 declared seeds (0, 1, 2, 3)." in text
-    assert f"- **shown**: +TFM is better than baseline in {PRIMARY} (+" in text
-    assert f"- **not shown**: negative control: +TFM is better than matched in {CONTROL} (" in text
+    line = next(line for line in text.splitlines() if "*matched*" in line)
+    assert line.startswith(f"- **shown**: +TFM is better than *matched* in {PRIMARY}, +")
+    assert f"; not shown in the negative control {CONTROL}, " in line
+    assert "; shown in the difference of the two, +" in line
+    assert line.count("better in 4 of 4 seeds") >= 2
+    assert line.count("95 % ") == line.count("p 0.") == 3
     rows = json.loads(path.with_suffix(".json").read_text())["rows"]
     assert {row["checkpoint"] for row in rows} == {"last", "best"}
     assert [row["model"] for row in rows[:4]] == ["+TFM", "baseline", "+TFM, none", "matched"]

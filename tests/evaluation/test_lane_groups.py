@@ -125,9 +125,9 @@ def test_groups_by_hand():
         ["hidden+traffic"],
         ["hidden-traffic"],
     ]
-    # A lane of which less than half was driven, or with a vehicle in the next lane, is in no group.
+    # A lane of which less than half was driven, or with a vehicle at its side, is in no group.
     assert members(straight_lanes(0.0), raster(), driving(3.0, 0.2)) == [[]]
-    assert members(straight_lanes(0.0), raster(), driving(10.0, 3.5)) == [[]]
+    assert members(straight_lanes(0.0), raster(), driving(10.0, 2.0)) == [[]]
     assert members(straight_lanes(0.0), painted(-1.75), driving(6.0, 0.2)) == [["visible+traffic"]]
 
 

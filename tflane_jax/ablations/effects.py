@@ -81,7 +81,8 @@ def measures(declaration: Declaration) -> tuple[Measure, ...]:
     alone = Measure(primary, {primary: 1.0})
     if control is None:
         return (alone,)
-    return alone, Measure(control, {control: 1.0}), Measure(f"{primary} - {control}", {primary: 1.0, control: -1.0})
+    difference = Measure("difference of the two", {primary: 1.0, control: -1.0})
+    return alone, Measure(f"negative control {control}", {control: 1.0}), difference
 
 
 def effects(
@@ -182,7 +183,9 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     seeds = every[0].seeds
     if set(seeds) != set(declared.seeds):
         lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
-    lines += ["", *(f"- {sentence(effect, declaration)}" for effect in every if effect.checkpoint == "last"), ""]
+    last = [effect for effect in every if effect.checkpoint == "last"]
+    by_row = [[effect for effect in last if effect.row == row] for row in dict.fromkeys(effect.row for effect in last)]
+    lines += ["", *(f"- {sentence(of_row, declaration)}." for of_row in by_row), ""]
     lines += [
         f"Difference: {declaration.treatment} minus the row. From, to: 95 % interval over scenes (seeds averaged,",
         f"{SAMPLES:,} bootstrap samples; only for ratios of counts). p: two-sided paired t-test over seeds; Holm:",
@@ -194,17 +197,22 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     return [save_table(stem, rows, meta, title=title, digits=4)[0]]
 
 
-def sentence(effect: Effect, declaration: Declaration) -> str:
-    """Return an effect as a sentence, differences in points of percent."""
-    p = "no test" if math.isnan(effect.p) else f"p {effect.p_holm:.4f} after Holm"
-    numbers = f"{100 * effect.difference:+.2f} points"
-    if not math.isnan(effect.low):
-        numbers += f", 95 % over scenes {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"
-    numbers += f", {p}, better in {effect.better} of {len(effect.seeds)} seeds"
-    claim = f"{declaration.treatment} is better than {effect.row} in {effect.measure}"
-    if effect.measure == declaration.negative_control:
-        claim = f"negative control: {claim}"
-    return f"**{effect.finding}**: {claim} ({numbers})."
+def sentence(of_row: Sequence[Effect], declaration: Declaration) -> str:
+    """Return the effects against one row as a sentence: primary measure, then negative control and their difference."""
+    primary, *others = of_row
+    text = (
+        f"**{primary.finding}**: {declaration.treatment} is better than *{primary.row}* in {primary.measure}, "
+        f"{_numbers(primary)}"
+    )
+    return "; ".join([text, *(f"{effect.finding} in the {effect.measure}, {_numbers(effect)}" for effect in others)])
+
+
+def _numbers(effect: Effect) -> str:
+    """Return a difference in points of percent, with its uncertainties."""
+    parts = [] if math.isnan(effect.low) else [f"95 % {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    parts += [] if math.isnan(effect.p) else [f"p {effect.p_holm:.4f}"]
+    parts.append(f"better in {effect.better} of {len(effect.seeds)} seeds")
+    return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
 
 
 def _rows(results: Results, declaration: Declaration, test: str, every: Sequence[Effect]) -> list[dict[str, Any]]:

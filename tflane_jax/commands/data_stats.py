@@ -1,4 +1,4 @@
-"""`tflane data stats`: how many lanes a split has, how much of them evidence and traffic show, and its traffic."""
+"""`tflane data stats`: how many lanes a split has, by evidence and traffic, and how much traffic."""
 
 from __future__ import annotations
 
@@ -7,22 +7,20 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.datasets.coverage import covered_by_evidence, covered_by_traffic, observed_frames
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import BevGrid
+from tflane_jax.evaluation.lane_groups import HALF, driven_fraction, lane_groups
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import format_table
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.scene import Example, LaneGraph, RoadImage, RoadUser, TrafficFlow
 from tflane_jax.tasks import spread
 
-# A lane has little evidence if less than this fraction of its points has any, and traffic if at least this fraction of
-# its points was driven over.
-_LITTLE, _DRIVEN = 1 / 3, 1 / 3
 # A lane is out of sight below this visibility, as in the metrics.
 _HIDDEN = 0.5
 # A vehicle that moves less during its observed frames stands, metres: more than the tracker's noise.
@@ -53,20 +51,20 @@ def example_stats(example: Example, config: ExampleConfig) -> dict[str, float]:
     lanes, flow = example.lanes, example.traffic_flow
     driven = None
     if flow is not None and flow.valid[:, 0].any():
-        driven = covered_by_traffic(lanes, flow, config.range)
-    shown = None
-    if example.bev is not None:
-        grid = BevGrid() if config.sensor is None else config.sensor.grid
-        shown = covered_by_evidence(lanes, np.asarray(example.bev), grid)
-    found = _lane_stats(lanes, shown, driven)
+        driven, _ = driven_fraction(np.asarray(lanes.points)[lanes.valid], flow)
+    found = _lane_stats(lanes, driven)
+    if flow is not None and driven is not None and example.bev is not None:
+        groups = lane_groups(lanes, np.asarray(example.bev), flow, config.ground)
+        found |= {f"lanes {name}": members.sum() for name, members in groups.items()}
     if flow is not None and driven is not None:
         found |= _traffic_stats(flow, config)
     return found
 
 
-def _lane_stats(lanes: LaneGraph, shown: np.ndarray | None, driven: np.ndarray | None) -> dict[str, float]:
+def _lane_stats(lanes: LaneGraph, driven: Float[np.ndarray, " g"] | None) -> dict[str, float]:
+    """Return the quantities of lanes; `driven` is the fraction of each valid lane that vehicles drove along."""
     valid = np.asarray(lanes.valid)
-    hidden = valid & (lanes.visibility < _HIDDEN)
+    hidden = np.asarray(lanes.visibility)[valid] < _HIDDEN
     step = np.diff(np.asarray(lanes.points)[valid][..., :2], axis=1)
     metres = np.linalg.norm(step, axis=-1).sum(-1)
     found = {
@@ -75,22 +73,16 @@ def _lane_stats(lanes: LaneGraph, shown: np.ndarray | None, driven: np.ndarray |
         "metres of lane": metres.sum(),
         "topology links": (lanes.successor & valid[:, None] & valid).sum(),
     }
-    traffic = None if driven is None else driven.mean(-1) >= _DRIVEN
-    if driven is not None and metres.sum() > 0:
-        found["fraction of lane length driven on"] = (driven[valid].mean(-1) * metres).sum() / metres.sum()
-    if traffic is not None:
-        found["lanes out of sight with traffic"] = (hidden & traffic).sum()
-    if shown is not None:
-        little = valid & (shown.mean(-1) < _LITTLE)
-        found["lanes with little evidence"] = little.sum()
-        if traffic is not None:
-            found["lanes with little evidence and traffic"] = (little & traffic).sum()
+    if driven is not None:
+        found["lanes out of sight with traffic"] = (hidden & (driven >= HALF)).sum()
+        if metres.sum() > 0:
+            found["fraction of lane length driven on"] = (driven * metres).sum() / metres.sum()
     return found
 
 
 def _traffic_stats(flow: TrafficFlow, config: ExampleConfig) -> dict[str, float]:
     """Return what the traffic-flow prior would take, at its default settings, with unlimited slots."""
-    prior, frames = TrafficFlowPriorConfig(), observed_frames(flow, config.range)
+    prior, frames = TrafficFlowPriorConfig(), _observed_frames(flow, config.range)
     number = frames.sum(-1)
     taken = number >= prior.min_valid_frames
     position = np.where(frames[..., None], flow.position, np.nan)[taken, :, :2]
@@ -109,6 +101,12 @@ def _traffic_stats(flow: TrafficFlow, config: ExampleConfig) -> dict[str, float]
     if taken.any():
         found["frames of each in range"] = number[taken].mean()
     return found
+
+
+def _observed_frames(flow: TrafficFlow, range_: PerceptionRange) -> Bool[np.ndarray, "k n"]:
+    """Return in which frames each road user was seen inside the range, as the traffic-flow prior counts them."""
+    inside = range_.contains(np.where(flow.valid[..., None], flow.position, 0.0))
+    return np.asarray(flow.valid & ~flow.occluded & inside)
 
 
 def _first(position: np.ndarray, frames: np.ndarray) -> np.ndarray:

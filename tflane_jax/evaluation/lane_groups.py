@@ -1,7 +1,7 @@
 """Groups of true lanes by what the sensor shows of them and by the traffic near them.
 
-A prior from traffic should help on lanes that the sensor hardly shows and that vehicles drive along. It cannot help on
-lanes that the sensor hardly shows and that have no vehicle nearby: they are the negative control of a comparison.
+A prior from traffic should help on lanes that the sensor hardly shows and that vehicles drive along. Lanes that the
+sensor hardly shows and that no vehicle touched are the negative control of a comparison.
 
 Both fractions are computed from the example alone, so that a lane is in the same group for every model. They are taken
 over `SAMPLES` points, equally spaced along the lane.
@@ -17,7 +17,8 @@ over `SAMPLES` points, equally spaced along the lane.
 | `hidden-traffic` | below `HALF` | no vehicle came within `NEARBY` of the lane, in any direction |
 | `visible+traffic`, `visible-traffic` | at least `HALF` | the same |
 
-Lanes with some traffic, but along less than half of their length, are in none of the groups. Traffic is the history of
+Lanes with some traffic, but along less than half of their length, are in none of the groups. Lanes of the control may
+have traffic in the lane beside them, which tells of them too, but less. Traffic is the history of
 the example before any selection: its valid, not occluded frames, and straight lines between successive ones.
 Pedestrians do not count.
 """
@@ -37,7 +38,7 @@ EVIDENCE = 64  # of 255
 TOLERANCE = 1.0  # metres
 BESIDE = 1.5  # metres
 HEADING = np.radians(30.0)
-NEARBY = 5.0  # metres
+NEARBY = 2.5  # metres
 HALF = 0.5
 
 
@@ -98,7 +99,7 @@ def driven_fraction(
         vehicles.
     """
     start, step, yaw, turn = _pieces(flow)
-    line = _samples(points)
+    line = _samples(points).astype(np.float32)
     direction = np.arctan2(*np.moveaxis(np.gradient(line, axis=1), -1, 0)[::-1])
     # Coordinate by coordinate: a last axis of two would be several times slower.
     (x, y), (step_x, step_y) = np.moveaxis(line[:, :, None] - start, -1, 0), step.T

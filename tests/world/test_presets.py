@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.shared import shared_path
 from tflane_jax.world.presets import CITY, STREET
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.networks import build_road_network
 from tflane_jax.world.simulate import WorldConfig, simulate
 
 JUNCTIONS = {SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS, SceneKind.ROUNDABOUT}
+
+BOXES = ((50.0, 25.0), (30.0, 15.0))
 
 
 def networks(roads, count):
@@ -67,6 +70,40 @@ def test_traffic_is_as_dense_as_in_real_logs(world, box, low, high):
         counts[-1] = (there >= 5).sum()
     assert low < np.mean(counts) < high
     assert np.ptp(counts) > 0.5 * np.mean(counts)
+
+
+# Means over the key frames with 10 s of history in +-50 m x +-25 m and +-30 m x +-15 m, and how often 30 is exceeded.
+NUSCENES = {
+    "0061": (43.7, 27.2, 1.0),
+    "0655": (33.2, 15.8, 0.62),
+    "0757": (15.5, 10.2, 0.0),
+    "0796": (8.8, 4.6, 0.0),
+    "1077": (12.4, 6.0, 0.0),
+    "1094": (28.8, 11.8, 0.4),
+    "1100": (21.4, 15.2, 0.0),
+}
+
+
+@pytest.mark.golden
+def test_the_density_of_real_scenes_in_the_docs():
+    """Road users valid in 5 or more of the 20 key frames before, inside the box of the current key frame."""
+    means = []
+    for scene, expected in NUSCENES.items():
+        with np.load(shared_path(f"data/nuscenes_scenes/scene-{scene}.npz")) as data:
+            user = np.array([name.startswith(("vehicle.", "human.pedestrian")) for name in data["category"]])
+            position, valid = data["position"][:, user, :2], data["valid"][:, user].astype(bool)
+            ego, yaw = data["ego_position"][:, :2], data["ego_yaw"]
+        counts = []
+        for now in range(20, len(position)):
+            cos, sin = np.cos(yaw[now]), np.sin(yaw[now])
+            at = (position[now - 20 : now] - ego[now]) @ np.array([[cos, -sin], [sin, cos]])
+            inside = [valid[now - 20 : now] & (np.abs(at) <= box).all(-1) for box in BOXES]
+            counts.append([(frames.sum(0) >= 5).sum() for frames in inside])
+        wide, narrow = np.array(counts).T
+        means.append((wide.mean(), narrow.mean(), (wide > 30).mean()))
+        np.testing.assert_allclose(means[-1], expected, atol=0.05, err_msg=scene)
+        assert not (narrow > 30).any()
+    np.testing.assert_allclose(np.mean(means, 0), (23.4, 13.0, 0.29), atol=0.05)
 
 
 def test_the_default_world_is_as_it_was():

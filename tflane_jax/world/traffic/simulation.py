@@ -130,7 +130,7 @@ def simulate_traffic(
     position = position[:frames]
     # Most trips end before the log begins or start after it ends; the ego vehicle's is the first.
     here = ((position >= 0.0) & (position <= road.trips.routes.length)).any(0)
-    rows = np.flatnonzero(here | (np.arange(len(here)) == 0))
+    rows = np.flatnonzero(here | (np.arange(position.shape[1]) == 0))
     driven = _driven(road.trips.take(rows), road.table, position[:, rows])
     walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]
     walking.append(crossers.paths(progress[:frames]))

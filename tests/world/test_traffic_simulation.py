@@ -237,3 +237,10 @@ def test_networks_without_lights_have_no_red():
     table = build_lane_table(crossroads("yield"))
     signals = draw_signals(np.random.default_rng(0), table)
     assert not signals.red(table, 3.0).any()
+
+
+def test_more_bicycles_than_a_lane_takes_enter_at_its_capacity():
+    network = build_road_network(np.random.default_rng([0]), RoadConfig(bike=1.0))
+    crowded = replace(EMPTY, bicycles_per_metre=0.5)
+    traffic = simulate_traffic(np.random.default_rng([7]), network, crowded, frames=10, rate_hz=RATE)
+    assert (traffic.category == RoadUser.BICYCLE).any()

@@ -37,7 +37,7 @@ from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.runs import Run
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_graph import centerlines_of, titles
+from tflane_jax.tasks.lane_pictures import centerlines_of, titles
 
 _RELATION_THRESHOLD = 0.5
 

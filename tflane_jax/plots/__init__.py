@@ -9,12 +9,14 @@ from tflane_jax.plots.attention import (
 from tflane_jax.plots.bev import draw_prediction, draw_scene
 from tflane_jax.plots.cameras import save_camera_views
 from tflane_jax.plots.curves import save_curves
+from tflane_jax.plots.differences import Findings, save_differences
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.gallery import add_legend, save_examples, show_dataset
 from tflane_jax.plots.summary import dataset_summary
 from tflane_jax.plots.tables import format_table, save_table
 
 __all__ = [
+    "Findings",
     "add_legend",
     "dataset_summary",
     "draw_attention_matrix",
@@ -27,6 +29,7 @@ __all__ = [
     "new_figure",
     "save_camera_views",
     "save_curves",
+    "save_differences",
     "save_examples",
     "save_figure",
     "save_table",

@@ -71,9 +71,9 @@ def save_examples(
         raise ValueError(f"{count} examples, but {sizes}")
     panels = 2 + len(predictions)
     lines = -(-panels // _MOST_COLUMNS)
-    figure, axes = new_figure(count * lines, -(-panels // lines), panel=_panel(view), footer=0.5)
+    figure, axes = new_figure(count * lines, -(-panels // lines), panel=panel_size(view), footer=0.5)
     for row, title in enumerate(titles):
-        example, (truth, seen, *places) = _pick(examples, row), axes[row * lines : (row + 1) * lines].flat
+        example, (truth, seen, *places) = pick(examples, row), axes[row * lines : (row + 1) * lines].flat
         columns, unused = places[: len(predictions)], places[len(predictions) :]
         for ax in unused:
             ax.set_axis_off()
@@ -93,9 +93,9 @@ def save_examples(
             if example.bev is not None:
                 draw_evidence(ax, example.bev, ground, strength=0.3)
             draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
-            draw_prediction(ax, _pick(stacked, row), threshold=threshold)
+            draw_prediction(ax, pick(stacked, row), threshold=threshold)
             draw_ego(ax)
-    _label(axes)
+    label_edges(axes)
     add_legend(figure, "with predictions" if predictions else "scenes")
     return save_figure(figure, path)
 
@@ -111,7 +111,7 @@ def show_dataset(
         raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} examples, {count} asked for")
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).round().astype(int))
     pairs = 2 if len(chosen) > 1 else 1
-    figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=_panel(view), footer=0.5)
+    figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view), footer=0.5)
     for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
         example, info = dataset.example(index), dataset.info(index)
         draw_scene(
@@ -126,7 +126,7 @@ def show_dataset(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
         )
     hide_unused(axes, 2 * len(chosen))
-    _label(axes)
+    label_edges(axes)
     add_legend(figure, "scenes")
     return save_figure(figure, out)
 
@@ -161,13 +161,13 @@ def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "sc
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
 
 
-def _panel(view: PerceptionRange) -> tuple[float, float]:
-    """Return width and height of a panel, inches; 0.35 of the height is for title and axis."""
+def panel_size(view: PerceptionRange, inches: float = _PANEL_WIDTH) -> tuple[float, float]:
+    """Return width and height of a panel of a width in inches; 0.35 of the height is for title and axis."""
     width, height = view.size(2)
-    return _PANEL_WIDTH, _PANEL_WIDTH * height / width + 0.35
+    return inches, inches * height / width + 0.35
 
 
-def _label(axes: np.ndarray) -> None:
+def label_edges(axes: np.ndarray) -> None:
     """Label only the axes along the left and lower edge of the grid."""
     for ax in axes[-1]:
         ax.set_xlabel("x, forward [m]", fontsize=8)
@@ -179,5 +179,5 @@ def _label(axes: np.ndarray) -> None:
         ax.tick_params(labelleft=False)
 
 
-def _pick(stacked: Tree, row: int) -> Tree:
+def pick(stacked: Tree, row: int) -> Tree:
     return jax.tree.map(lambda leaf: np.asarray(leaf[row]), stacked)

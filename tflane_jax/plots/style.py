@@ -10,6 +10,8 @@ HATCH = "#5a6373"
 EGO = "#ffffff"
 PREDICTION = "#4dd2ff"
 LINK = "#ff5fd2"
+# Outline of a lane to which a picture points.
+OUTLINE = "#ffee58"
 
 # Colours of a true lane that is fully in line of sight and fully hidden; others lie between.
 LANE_CLEAR = "#8be28b"

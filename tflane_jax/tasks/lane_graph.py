@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import Dataset, ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.datasets.data_source import LaneGraphSource, SplitData
@@ -40,11 +40,11 @@ from tflane_jax.models.host import HostConfig, HostMemory
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import CenterlinePrediction, Example, Prediction, shapes_of, stack_examples
+from tflane_jax.scene import Example, Prediction, shapes_of
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.lane_pictures import draw_differences, draw_hidden_lanes, titles
 
 T = TypeVar("T")
-_COMPARED_EXAMPLES = 6
 
 
 @dataclass(frozen=True)
@@ -284,26 +284,17 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def draw_comparison(
         self, models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path
     ) -> Path:
-        """Draw the test frames with the most occluded lanes, every model beside the ground truth.
+        """Draw the test frames in which the first two models differ most, see `lane_pictures.draw_differences`.
 
-        Of streamed data, frames are spread evenly instead.
+        Their lanes are those that a prior from traffic should help with if any model has it, else occluded lanes. A
+        single model is drawn on the frames with the most occluded lanes.
         """
-        from tflane_jax.plots import save_examples
-
-        dataset = sources.open_dataset(source)
-        if isinstance(data, Streamed):
-            indices = spread(len(data), _COMPARED_EXAMPLES)
-        else:
-            hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
-            indices = np.argsort(-hidden, kind="stable")[:_COMPARED_EXAMPLES].tolist()
-        examples = stack_examples([dataset.example(index) for index in indices])
-        lanes = {
-            name: centerlines_of(predict_examples(model.task, model.params, dataset, indices)[1])
-            for name, model in models.items()
-        }
-        names = titles(dataset, indices)
-        ground, view = source.example.ground, source.example.range
-        return save_examples(path, examples, lanes, titles=names, ground=ground, view=view)
+        if len(models) < 2:
+            return draw_hidden_lanes(models, source, data, path)
+        tasks = [model.task for model in models.values() if isinstance(model.task, LaneGraphTask)]
+        traffic = any(task.model.priors.traffic_flow is not None for task in tasks)
+        known = traffic and self._ground is not None
+        return draw_differences(models, source, data, path, "hidden+traffic" if known else "occluded")
 
     # -----------------------------------------------------------------------------------------------------------------
     # Comparing
@@ -317,19 +308,6 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
 def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:
     return augment_example(example, config, key)
-
-
-def centerlines_of(prediction: Prediction) -> CenterlinePrediction:
-    """Return the predicted centerlines; raise UserError for a host that predicts none."""
-    if prediction.centerlines is None:
-        raise UserError("this host predicts no centerlines: pictures of other lanes are not drawn yet")
-    return prediction.centerlines
-
-
-def titles(dataset: Dataset, indices: list[int]) -> list[str]:
-    """Return a title for the picture of each example."""
-    infos = [dataset.info(index) for index in indices]
-    return [f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]
 
 
 def _frames(clips: T) -> T:

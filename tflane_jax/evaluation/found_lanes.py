@@ -1,0 +1,80 @@
+"""Which true lanes a model finds, lane by lane, and the frames in which two models differ most.
+
+A lane counts as found if a detection whose nearest lane it is lies within `WITHIN` of it, with a confidence of at least
+the model's threshold. Distances are those of the metric (`metrics.centerline_matching.nearest_lanes`), so without a
+threshold the fraction of found lanes is `recall@2.0`. Confidences of two models have different scales: the threshold of
+each is the one with its best F-score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from tflane_jax.metrics.centerline_matching import nearest_lanes
+
+WITHIN = 2.0  # metres
+
+
+def lane_confidences(
+    truth: Float[np.ndarray, "g n 3"], points: Float[np.ndarray, "p m 3"], scores: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, " g"]:
+    """Return for each true lane the highest confidence of the detections that find it; -inf without one.
+
+    Args:
+        truth: valid lanes of one frame, metres.
+        points, scores: all detections of the frame.
+    """
+    distance, nearest = nearest_lanes(np.asarray(truth), np.asarray(points))
+    found, near = np.full(len(truth), -np.inf), distance < WITHIN
+    np.maximum.at(found, nearest[near], np.asarray(scores)[near])
+    return found
+
+
+def best_threshold(lanes: Sequence[Float[np.ndarray, " g"]], detections: Sequence[Float[np.ndarray, " p"]]) -> float:
+    """Return the least confidence with the best F-score over all frames; of equally good ones the highest.
+
+    Args:
+        lanes: `lane_confidences` of each frame.
+        detections: confidences of all detections of each frame.
+
+    Returns:
+        One of the lanes' confidences; inf if no lane is ever found.
+    """
+    true, every = (np.sort(np.concatenate([np.zeros(0), *frames])) for frames in (lanes, detections))
+    levels = np.unique(true[np.isfinite(true)])[::-1]
+    if len(levels) == 0:
+        return np.inf
+    found, kept = (len(values) - np.searchsorted(values, levels) for values in (true, every))
+    return float(levels[(2.0 * found / (len(true) + kept)).argmax()])
+
+
+def frames_of_difference(
+    only_first: Int[np.ndarray, " f"], only_second: Int[np.ndarray, " f"], scene: Int[np.ndarray, " f"], count: int
+) -> tuple[list[int], list[int]]:
+    """Return the frames in which the first model is ahead the most, and those in which the second is.
+
+    A model's lead is the number of lanes that only it finds, less those that only the other finds. The models share
+    the `count` frames in the ratio of all lanes that only they find; one that leads anywhere gets a frame at least.
+    Of a scene, each list has only the frame of the largest lead.
+
+    Args:
+        only_first, only_second: numbers of lanes of each frame.
+        scene: number of each frame's scene.
+        count: of frames, at least 2; there may be fewer.
+    """
+    lead = np.asarray(only_second) - np.asarray(only_first)
+    first, second = _leaders(-lead, scene), _leaders(lead, scene)
+    alone = int(np.sum(only_first)), int(np.sum(only_second))
+    places = round(count * alone[1] / max(sum(alone), 1))
+    places = min(max(places, 1, count - len(first)), len(second), count - min(len(first), 1))
+    return first[: count - places], second[:places]
+
+
+def _leaders(lead: Int[np.ndarray, " f"], scene: Int[np.ndarray, " f"]) -> list[int]:
+    """Return the frames with a lead, largest first, one of each scene."""
+    order = np.argsort(-lead, kind="stable")
+    order = order[lead[order] > 0]
+    return order[np.sort(np.unique(scene[order], return_index=True)[1])].tolist()

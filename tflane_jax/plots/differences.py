@@ -1,0 +1,165 @@
+"""Where models differ: truth, evidence and predictions side by side, with outlined lanes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.plots import style
+from tflane_jax.plots.bev import GROUND, VIEW, draw_ego, draw_evidence, draw_lanes, draw_prediction, draw_scene, prepare
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.gallery import label_edges, panel_size, pick
+from tflane_jax.scene import BevChannel, CenterlinePrediction, Example, RoadUser
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_PANEL_WIDTH = 4.0  # inches
+_HALF_WIDTH = 1.3  # metres
+Outline = Literal["edge", "filled", "dashed"]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a model predicts for the B drawn examples, and which true lanes it finds.
+
+    Attributes:
+        lanes: predictions, stacked.
+        threshold: lowest confidence of a lane that is drawn.
+        found: (B, G) by row of the padded truth.
+    """
+
+    lanes: CenterlinePrediction
+    threshold: float
+    found: Bool[np.ndarray, "b g"]
+
+
+def save_differences(
+    path: Path,
+    examples: Example,
+    models: Mapping[str, Findings],
+    outlined: Bool[np.ndarray, "b g"],
+    *,
+    title: str,
+    titles: Sequence[str],
+    caption: str = "",
+    meaning: str = "outlined lane",
+    ground: PerceptionRange = GROUND,
+    view: PerceptionRange = VIEW,
+) -> Path:
+    """Write one row per example: truth | evidence and traffic | one panel per model.
+
+    Outlined lanes are marked in every panel. In that of a model, the outline is filled if the model finds the lane and
+    dashed if it misses it.
+
+    Args:
+        path: .png, .pdf or .svg.
+        examples: B of them, stacked along a leading axis.
+        models: by name.
+        outlined: (B, G) by row of the padded truth.
+        title, caption: above and below the picture.
+        titles: one per row.
+        meaning: of an outline, for the legend.
+        ground, view: see `draw_scene`.
+
+    Returns:
+        `path`.
+    """
+    size = panel_size(view, _PANEL_WIDTH)
+    figure, axes = new_figure(len(titles), 2 + len(models), panel=size, footer=1.5)
+    figure.suptitle(title, fontsize=13, x=0.01, ha="left")
+    for row, (line, name) in enumerate(zip(axes, titles, strict=True)):
+        example, (truth, seen, *places) = pick(examples, row), line
+        lanes = np.asarray(example.lanes.points)
+        draw_scene(
+            truth, example, layers=("hidden", "areas", "lanes"), ground=ground, view=view, title=f"truth, {name}"
+        )
+        layers = ("evidence", "traffic")
+        draw_scene(seen, example, layers=layers, ground=ground, view=view, title="evidence and traffic")
+        for ax in (truth, seen):
+            draw_outlines(ax, lanes[outlined[row]])
+        for ax, (model, findings) in zip(places, models.items(), strict=True):
+            found = findings.found[row] & outlined[row]
+            prepare(ax, view, f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined")
+            if example.bev is not None:
+                draw_evidence(ax, example.bev, ground, strength=0.3)
+            draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
+            draw_outlines(ax, lanes[found], "filled")
+            draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")
+            draw_prediction(ax, pick(findings.lanes, row), threshold=findings.threshold)
+            draw_ego(ax)
+    label_edges(axes)
+    _add_legend(figure, caption, meaning)
+    return save_figure(figure, path)
+
+
+def draw_outlines(ax: Axes, lanes: Float[np.ndarray, "l n 3"], outline: Outline = "edge") -> None:
+    """Draw a band around each lane: its edge alone, filled, or dashed."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgba
+
+    ax.add_collection(
+        PolyCollection(
+            [band(line[:, :2], _HALF_WIDTH) for line in lanes],
+            facecolors=[to_rgba(style.OUTLINE, 0.3 if outline == "filled" else 0.0)],
+            edgecolors=[to_rgba(style.OUTLINE)],
+            linestyles="dashed" if outline == "dashed" else "solid",
+            linewidths=1.2,
+            zorder=3.3,
+        )
+    )
+
+
+def band(line: Float[np.ndarray, "n 2"], half_width: float) -> Float[np.ndarray, "2n 2"]:
+    """Return the polygon between the parallels of a line to its right, forward, and to its left, backward.
+
+    Args:
+        line: points in driving direction, at least two.
+        half_width: distance of the parallels, metres.
+    """
+    step = np.gradient(np.asarray(line, float), axis=0)
+    left = np.stack([-step[:, 1], step[:, 0]], -1) / np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-9)
+    return np.concatenate([line - half_width * left, (line + half_width * left)[::-1]])
+
+
+def _add_legend(figure: Figure, caption: str, meaning: str) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    edge = {"edgecolor": style.OUTLINE, "lw": 1.3}
+    car = style.ROAD_USER[RoadUser.CAR]
+    entries: list = [  # column by column
+        Patch(facecolor="none", label=meaning, **edge),
+        Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
+        Patch(facecolor=style.OUTLINE + "4d", label="this model finds it", **edge),
+        Patch(facecolor="none", ls="--", label="this model misses it", **edge),
+        Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
+        Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
+        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in line of sight"),
+        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
+        Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
+        Patch(facecolor=car + "8c", edgecolor=car, label="road user, its track"),
+        Patch(facecolor="none", edgecolor=car, label="not seen at present"),
+        *(
+            Patch(facecolor=style.EVIDENCE[channel], label=f"evidence: {channel.name.lower().replace('_', ' ')}")
+            for channel in (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE, BevChannel.OBSTACLE)
+        ),
+    ]
+    legend = figure.legend(
+        handles=entries,
+        title=caption,
+        loc="outside lower left",
+        ncols=7,
+        fontsize=8,
+        title_fontsize=9,
+        alignment="left",
+        frameon=False,
+    )
+    legend.get_title().set_multialignment("left")

@@ -1,0 +1,177 @@
+"""Pictures of a comparison of lane-graph models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from tflane_jax.datasets import sources
+from tflane_jax.datasets.base import Dataset
+from tflane_jax.datasets.batches import ordered_batches
+from tflane_jax.datasets.data_source import LaneGraphSource
+from tflane_jax.datasets.streaming import Streamed
+from tflane_jax.errors import UserError
+from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, frames_of_difference, lane_confidences
+from tflane_jax.evaluation.interventions import scene_numbers
+from tflane_jax.evaluation.lane_groups import lane_groups
+from tflane_jax.evaluation.predict import predict_examples, predicted_batches
+from tflane_jax.scene import CenterlinePrediction, Example, Prediction, stack_examples
+from tflane_jax.tasks.base import Model, spread
+
+Group = Literal["hidden+traffic", "occluded"]
+_MEANING: dict[Group, str] = {
+    "hidden+traffic": "lanes that the sensor hardly shows and vehicles drove along",
+    "occluded": "lanes of which less than half is in line of sight",
+}
+_FRAMES = 4
+_FRAMES_OF_ONE_MODEL = 6
+_BATCH = 16
+
+
+def draw_hidden_lanes(
+    models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path
+) -> Path:
+    """Draw the frames with the most occluded lanes, every model beside the truth; frames spread evenly if streamed."""
+    from tflane_jax.plots import save_examples
+
+    dataset = sources.open_dataset(source)
+    if isinstance(data, Streamed):
+        indices = spread(len(data), _FRAMES_OF_ONE_MODEL)
+    else:
+        hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
+        indices = np.argsort(-hidden, kind="stable")[:_FRAMES_OF_ONE_MODEL].tolist()
+    examples = stack_examples([dataset.example(index) for index in indices])
+    lanes = {
+        name: centerlines_of(predict_examples(model.task, model.params, dataset, indices)[1])
+        for name, model in models.items()
+    }
+    ground, view = source.example.ground, source.example.range
+    return save_examples(path, examples, lanes, titles=titles(dataset, indices), ground=ground, view=view)
+
+
+@dataclass(frozen=True)
+class _Answers:
+    """One model on all F frames of a split.
+
+    Attributes:
+        found: (F, G) true lanes that the model finds, by row of the padded truth.
+        threshold: lowest confidence that counts.
+        lanes: predictions, stacked.
+    """
+
+    found: Bool[np.ndarray, "f g"]
+    threshold: float
+    lanes: CenterlinePrediction
+
+
+def draw_differences(
+    models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path, group: Group
+) -> Path:
+    """Draw the frames in which the first two models differ most, and outline the lanes that only one of them finds.
+
+    All models predict the whole split once. `evaluation.found_lanes` says which lanes are found and which frames are
+    drawn.
+
+    Args:
+        models: by name, at least two.
+        source, data: of the split; the data as the first model reads them.
+        path: of the picture.
+        group: the lanes that are counted and outlined: `hidden+traffic` of `evaluation.lane_groups`, for examples with
+            BEV evidence and traffic flow; or lanes of which less than half is in line of sight.
+    """
+    from tflane_jax.plots import Findings, save_differences
+
+    parts, answers = next(iter(models.values())).task.parts, {}
+    for name, model in models.items():
+        mine = data if model.task.parts == parts else model.task.load(source, progress=False)
+        answers[name] = _answers(model, mine)
+    first, second = list(answers)[:2]
+    members = _members(data, source, group)
+    by_first, by_second = (members & answers[name].found for name in (first, second))
+    alone = {first: by_first & ~by_second, second: by_second & ~by_first}
+    frames = frames_of_difference(alone[first].sum(1), alone[second].sum(1), scene_numbers(data), _FRAMES)
+    ahead = dict(zip((first, second), frames, strict=True))
+    chosen = [*ahead[second], *ahead[first]] or np.argsort(-members.sum(1), kind="stable")[:_FRAMES].tolist()
+
+    dataset = sources.open_dataset(source)
+    only = ", ".join(f"only {name} {alone[name].sum()}" for name in (second, first))
+    return save_differences(
+        path,
+        stack_examples([dataset.example(index) for index in chosen]),
+        {
+            name: Findings(jax.tree.map(lambda leaf: leaf[chosen], one.lanes), one.threshold, one.found[chosen])
+            for name, one in answers.items()
+        },
+        (alone[first] | alone[second])[chosen],
+        title=f"Of {members.sum()} {_MEANING[group]}, both models find {(by_first & by_second).sum()}, {only}",
+        caption=_caption(answers, {name: ahead[name] for name in (second, first)}, len(members)),
+        meaning=f"lane that only one of {first} and {second} finds",
+        titles=titles(dataset, chosen),
+        ground=source.example.ground,
+        view=source.example.range,
+    )
+
+
+def _caption(answers: Mapping[str, _Answers], ahead: Mapping[str, Sequence[int]], frames: int) -> str:
+    """Return the rules by which the frames were chosen and the lanes found."""
+    rows = [f"the {len(rows)} in which {name} is ahead the most" for name, rows in ahead.items() if rows]
+    chosen = " and ".join(rows) + ", in the ratio of the lanes that only they find (for each, one frame of a scene)"
+    chosen = chosen if rows else "those with the most such lanes, because no model is ahead in any"
+    levels = ", ".join(f"{one.threshold:.2f} ({name})" for name, one in answers.items())
+    return (
+        f"Of {frames} frames, {chosen}.\nFound: within {WITHIN:g} m of a drawn prediction. Drawn: predictions with at "
+        f"least the confidence of the model's best F-score, {levels}."
+    )
+
+
+def _answers(model: Model, data: Example | Streamed) -> _Answers:
+    """Return what a model predicts for a whole split."""
+    confidences, valid, lanes = [], [], []
+    for indices, batch, answer in predicted_batches(model.task, model.params, data, _BATCH):
+        lanes.append(centerlines_of(answer))
+        scores = np.asarray(lanes[-1].scores)
+        for row in range(len(indices)):
+            true = np.asarray(batch.lanes.valid[row])
+            confidence = np.full(len(true), -np.inf)
+            confidence[true] = lane_confidences(batch.lanes.points[row][true], lanes[-1].points[row], scores[row])
+            confidences.append(confidence)
+            valid.append(true)
+    stacked: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves), *lanes)
+    found = np.stack(confidences)
+    threshold = best_threshold([found[np.stack(valid)]], [np.asarray(stacked.scores).ravel()])
+    return _Answers(found >= threshold, threshold, stacked)
+
+
+def _members(data: Example | Streamed, source: LaneGraphSource, group: Group) -> Bool[np.ndarray, "f g"]:
+    """Return which true lanes, by row of the padded truth, belong to the group."""
+    every = []
+    for indices, batch in ordered_batches(data, _BATCH):
+        for row in range(len(indices)):
+            lanes, bev, flow = jax.tree.map(
+                lambda leaf, i=row: np.asarray(leaf[i]), (batch.lanes, batch.bev, batch.traffic_flow)
+            )
+            members = lanes.valid & (lanes.visibility < 0.5)
+            if group != "occluded":
+                members = np.zeros(len(lanes.valid), bool)
+                members[lanes.valid] = lane_groups(lanes, bev, flow, source.example.ground)[group]
+            every.append(members)
+    return np.stack(every)
+
+
+def centerlines_of(prediction: Prediction) -> CenterlinePrediction:
+    """Return the predicted centerlines; raise UserError for a host that predicts none."""
+    if prediction.centerlines is None:
+        raise UserError("this host predicts no centerlines: pictures of other lanes are not drawn yet")
+    return prediction.centerlines
+
+
+def titles(dataset: Dataset, indices: list[int]) -> list[str]:
+    """Return a title for the picture of each example."""
+    infos = [dataset.info(index) for index in indices]
+    return [f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]

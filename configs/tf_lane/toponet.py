@@ -27,7 +27,7 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return the baseline on the preset `street`, the same without one part each, and TopoNet's published forms."""
     street = _small(WorldData.street(), steps=5000)
-    model, losses, optim = street.task.model, street.task.losses, street.optim
+    model, losses, optim = _host(WorldData.street()), street.task.losses, street.optim
     decoder, encoder = model.decoder, model.encoder
 
     def changed(**changes) -> RunConfig:
@@ -52,19 +52,20 @@ def ablations() -> dict[str, RunConfig]:
     }
 
 
-def _small(data: WorldData, steps: int) -> RunConfig:
+def _host(data: WorldData) -> TopoNetConfig:
     """Return a host that learns within minutes; docs/small_models.md tells what is TopoNet's and what is not."""
-    if data.example.sensor is None:
-        raise ValueError("the small host reads BEV evidence")
-    encoder = EvidenceEncoderConfig(
-        dim=32, levels=(48, 96), dilations=(), coordinates=True, range=data.example.sensor.grid.range
-    )
+    encoder = EvidenceEncoderConfig(dim=48, levels=(64, 128), dilations=(), coordinates=True, range=data.example.ground)
     decoder = LaneDecoderConfig(layers=2, queries=40, output="metric", proposals=LaneProposalConfig(count=28))
+    return TopoNetConfig(
+        encoder=encoder, range=data.example.range, decoder=decoder, denoising=DenoisingConfig(copies=1)
+    )
+
+
+def _small(data: WorldData, steps: int) -> RunConfig:
+    """Return the training of the host; clipping and b2 are those of the earlier small configurations."""
     return RunConfig(
         task=LaneGraphTask(
-            TopoNetConfig(
-                encoder=encoder, range=data.example.range, decoder=decoder, denoising=DenoisingConfig(copies=1)
-            ),
+            _host(data),
             # The topology loss is a mean over all pairs of queries, so that a small model needs a larger weight.
             TopoNetLossConfig(successor_weight=20.0, class_target="quality", matcher="jax"),
         ),

@@ -6,8 +6,10 @@ run can be evaluated or drawn by itself.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ def compare(
     tests: Tests | None = None,
     retrain: bool = False,
     declaration: Declaration | None = None,
+    summary: Callable[[Results], str] | None = None,
 ) -> Path:
     """Train what is not trained yet, evaluate on the test sets, print and save tables and pictures.
 
@@ -52,7 +55,9 @@ def compare(
         tests: further test sets by name: settings, `--data.name value`, that differ from the own test split.
         retrain: whether runs of other configurations in the folders are deleted and trained anew.
         declaration: what is tested. It is written to `declaration.json` before the trainings, and the report gets a
-            table of these tests alone, `effects.md`.
+            table of these tests alone, `effects.md`. The picture shows where its treatment and the control differ;
+            without a declaration, where the first two configurations do.
+        summary: returns the text to print if no training failed; None prints all tables. The files are the same.
 
     Returns:
         The Markdown file with the table of the configurations' own test split.
@@ -86,14 +91,20 @@ def compare(
     remarks = {name: model.task.remarks(model.params) for name, model in models.items()}
     if importlib.util.find_spec("matplotlib") is not None:
         source = first.data.source("test")
+        if declaration is not None:
+            pair = next(iter(configs)), declaration.treatment
+            models = {name: models[name] for name in sorted(models, key=lambda name: name not in pair)}
         written.append(first.task.draw_comparison(models, source, load_test_data(first), out / "comparison.png"))
-    tables = save_report(results, first.task, remarks, out)
-    if declared is not None:
-        for test, suffix in suffixes(results).items():
-            tables += save_effects(results, declared, test, first.task.errors, out / f"effects{suffix}")
-    print("\nwritten:", *tables, *written, sep="\n  ")
+    with contextlib.nullcontext() if summary is None else contextlib.redirect_stdout(io.StringIO()):
+        tables = save_report(results, first.task, remarks, out)
+        if declared is not None:
+            for test, suffix in suffixes(results).items():
+                tables += save_effects(results, declared, test, first.task.errors, out / f"effects{suffix}")
+        print("\nwritten:", *tables, *written, sep="\n  ")
     if failures:
         raise UserError(_summary(failures, len(every)))
+    if summary is not None:
+        print(summary(results))
     return tables[0]
 
 

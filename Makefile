@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 .PHONY: help setup demo test test-slow lint same-losses bench clean
 
 help:
-	@echo "make demo         set up, train TF-Lane with and without traffic flow on the built-in world, print the table"
+	@echo "make demo         set up, train with and without traffic flow on the built-in world, table and picture"
 	@echo "make test         set up, lint, run the tests (what CI runs)"
 	@echo "make test-slow    the tests that take minutes"
 	@echo "make lint         ruff (rules and format) and pyright"

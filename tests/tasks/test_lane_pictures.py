@@ -8,7 +8,9 @@ import pytest
 
 from tests.fakes import FakeConfig, FakeDataset
 from tests.models.cases import WITH_TRAFFIC
+from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import CenterlinePrediction, Prediction
 from tflane_jax.tasks import Model
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -53,9 +55,12 @@ def drawn(monkeypatch):
     )
     monkeypatch.setattr("tflane_jax.plots.save_differences", lambda *args, **names: calls.append((args, names)))
 
-    def draw(models):
+    def draw(models, streamed=False):
         source, (first, *_) = ProceduralConfig(), models.values()
-        first.task.draw_comparison(models, source, first.task.load(source), "a.png")
+        data = first.task.load(source)
+        if streamed:
+            data = stream(FakeDataset(FakeConfig(SIZE, 3)), StreamingConfig(threads=0), first.task.parts)
+        first.task.draw_comparison(models, source, data, "a.png")
         ((_, examples, findings, outlined), words) = calls.pop()
         return examples, findings, outlined, words
 
@@ -67,12 +72,12 @@ def starts():
     return np.array([FakeDataset(FakeConfig(SIZE, 3)).example(i).lanes.points[0, 0, 0] for i in range(SIZE)])
 
 
-def test_the_frames_in_which_only_one_of_two_models_finds_an_occluded_lane(drawn):
+@pytest.mark.parametrize("streamed", [False, True])
+def test_the_frames_in_which_only_one_of_two_models_finds_an_occluded_lane(drawn, streamed):
     x = starts()
     # The first finds x > 5, the second x < 9.
-    examples, findings, outlined, words = drawn(
-        {"one": model(1, 5), "two": model(-1, 9, logit=2.0), "third": model(1, 5)}
-    )
+    models = {"one": model(1, 5), "two": model(-1, 9, logit=2.0), "third": model(1, 5)}
+    examples, findings, outlined, words = drawn(models, streamed)
     only_one, only_two = (x >= 9.0), (x <= 5.0)
     assert only_one.any()
     assert only_two.any()
@@ -111,3 +116,18 @@ def test_with_traffic_flow_the_lanes_are_those_that_vehicles_drove_along(drawn):
     words = drawn({"one": model(1, 5), "two": model(-1, 9, task=Knowing(WITH_TRAFFIC))})[3]
     # The fake vehicles jump about, so they drive along no lane.
     assert words["title"].startswith("Of 0 lanes that the sensor hardly shows and vehicles drove along")
+
+
+def test_a_single_model_is_drawn_on_the_frames_with_the_most_occluded_lanes(monkeypatch):
+    shown = []
+    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda *_, **__: FakeDataset(FakeConfig(3)))
+    monkeypatch.setattr("tflane_jax.plots.save_examples", lambda path, *args, **names: shown.append((args, names)))
+    alone, source = model(1, 0), ProceduralConfig()
+    data = alone.task.load(source)
+    data.lanes.visibility[:, 1] = [1.0, 0.0, 1.0]
+    alone.task.draw_comparison({"alone": alone}, source, data, "a.png")
+    (((examples, lanes), names),) = shown
+    assert list(lanes) == ["alone"]
+    assert [title.rsplit(" at ")[0] for title in names["titles"]] == ["scene 0", "scene 0", "scene 1"]
+    expected = [FakeDataset(FakeConfig(3)).example(i).lanes.points for i in (1, 0, 2)]
+    np.testing.assert_array_equal(examples.lanes.points, expected)

@@ -175,7 +175,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 def run(out: Path, seconds: float = 20.0) -> None:
     """Measure, print and save."""
-    configure_jax()
+    configure_jax(keep_programs=False)  # compiling is timed
     record = machine() | {"results": measure(seconds)}
     text = table(record["results"])
     print(text)

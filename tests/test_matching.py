@@ -44,12 +44,25 @@ def test_padding_is_never_read(backend):
     np.testing.assert_array_equal(clean.matched, filled.matched)
 
 
-def test_backends_agree_on_many_problems():
+@pytest.mark.parametrize(("problems", "queries", "targets"), [(40, 12, 9), (12, 48, 40), (6, 5, 8)])
+def test_backends_agree_on_many_problems(problems, queries, targets):
     rng = np.random.default_rng(1)
-    cost = jnp.asarray(rng.normal(size=(40, 12, 9)).astype(np.float32))
-    valid = jnp.asarray(rng.random((40, 9)) < 0.6)
+    cost = jnp.asarray(rng.normal(size=(problems, queries, targets)).astype(np.float32))
+    valid = jnp.asarray(rng.random((problems, targets)) < 0.6)
     host, device = (match(cost, valid, b) for b in BACKENDS)
     np.testing.assert_array_equal(host.query, device.query)
+
+
+def test_backends_agree_on_lanes():
+    """Costs of a training: distances of lanes that are alike, which differ little."""
+    rng = np.random.default_rng(2)
+    true = np.cumsum(rng.normal(size=(4, 1, 30, 33)), -1)
+    found = true[:, :, rng.integers(0, 30, 48)] + rng.normal(size=(4, 3, 48, 33))
+    cost = jnp.asarray(0.025 * np.abs(found[:, :, :, None] - true[:, :, None]).sum(-1), jnp.float32)
+    valid = jnp.asarray(np.arange(30) < np.array([30, 22, 1, 0])[:, None, None])
+    host, device = (match(cost, valid, b) for b in BACKENDS)
+    np.testing.assert_array_equal(host.query, device.query)
+    np.testing.assert_array_equal(host.matched, device.matched)
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0)])
@@ -70,7 +83,7 @@ def test_one_callback_for_all_axes(monkeypatch):
     valid = rng.random((4, 5)) < 0.7
 
     def layers(c, v):
-        return match(c, jnp.broadcast_to(v, (2, 5)))
+        return match(c, jnp.broadcast_to(v, (2, 5)), "scipy")
 
     nested = jax.jit(jax.vmap(jax.vmap(layers), in_axes=(0, None)))
     got = nested(cost, valid)

@@ -132,6 +132,8 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     Raises:
         UserError: an unknown setting (with the names closest to it), or a value of the wrong type.
     """
+    if not arguments:
+        return config
     import tyro
 
     config, arguments = _choose_parts(config, arguments)

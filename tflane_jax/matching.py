@@ -1,8 +1,9 @@
 """Bipartite (Hungarian) matching of queries to targets.
 
-The default backend is scipy on the host, called once per step for every layer, example and seed together: the callback
-receives `vmap`ped axes as batch axes, and the host loops over them. Do not use it in prediction: a program with a
-host callback can be neither exported nor cached.
+Two backends give the same assignments. "jax" runs on the device, in a program that JAX can keep between processes
+(persistent compilation cache), and takes as long as scipy at the sizes of small models. "scipy" runs on the host: one
+call per step for every layer and example, because the callback receives `vmap`ped axes as batch axes and loops over
+them. A program with a host callback can be neither exported nor kept, so do not use it in prediction.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 
 _COST_LIMIT = 1e6
 
@@ -34,7 +34,7 @@ class Assignment:
 
 
 def match(
-    cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"], backend: Literal["scipy", "jax"] = "scipy"
+    cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"], backend: Literal["scipy", "jax"] = "jax"
 ) -> Assignment:
     """Return the assignment of minimum total cost between queries and valid targets; no gradient flows.
 
@@ -66,6 +66,8 @@ def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
     Module-level and numpy-only: jax may call it from any thread.
     """
+    from scipy.optimize import linear_sum_assignment
+
     cost, valid = np.asarray(cost), np.asarray(valid)
     lead = np.broadcast_shapes(cost.shape[:-2], valid.shape[:-1])
     cost = np.broadcast_to(cost, (*lead, *cost.shape[-2:])).reshape(-1, *cost.shape[-2:])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import qmc
 
 from tests.models.cases import BASELINE
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -22,6 +23,13 @@ def test_basis_reaches_every_polyline(points):
     basis = smooth_basis(points)
     anything = np.random.default_rng(0).normal(size=(points, 3))
     np.testing.assert_allclose(basis @ np.linalg.solve(basis, anything), anything, atol=1e-3)
+
+
+def test_initial_anchors_lie_as_in_scipys_halton_sequence():
+    config = BASELINE.decoder
+    sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
+    middle = spread_lanes(config, RANGE, length=0.0)[:, 0, :2]
+    np.testing.assert_allclose(middle, np.clip(sample[:, :2], 0.02, 0.98), atol=1e-6)
 
 
 def test_basis_bends_rather_than_zigzags():

@@ -13,7 +13,7 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Print the two tables, and save them to --out."""
-    configure_jax()
+    configure_jax(keep_programs=False)  # compiling is timed
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)
     example = config.task.shapes(config.data)

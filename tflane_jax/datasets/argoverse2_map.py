@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.polylines import resample
@@ -83,6 +82,7 @@ def _boundaries(areas: list[np.ndarray]) -> tuple[np.ndarray, ...]:
     """Return the closed rings of the union of drivable areas, each point at the height of the nearest map vertex."""
     try:
         import shapely
+        from scipy.spatial import KDTree
     except ImportError as error:
         raise UserError("reading Argoverse 2 needs shapely: pip install 'tflane_jax[data]'") from error
     if not areas:

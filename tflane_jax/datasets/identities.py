@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.optimize import linear_sum_assignment
 
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene import Example
@@ -82,6 +81,8 @@ class Identities:
     def _next(
         self, kind: str, lines: np.ndarray, label: np.ndarray | None, valid: Bool[np.ndarray, " n"], moved: np.ndarray
     ) -> dict[int, str]:
+        from scipy.optimize import linear_sum_assignment
+
         rows = np.flatnonzero(valid)
         now = _Kind(
             np.asarray(lines, np.float64)[rows], np.zeros(len(rows), int) if label is None else np.asarray(label)[rows]

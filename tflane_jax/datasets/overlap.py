@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from tflane_jax.datasets.argoverse2_log import find_logs, read_poses
 from tflane_jax.errors import UserError
@@ -107,6 +106,8 @@ class Overlap:
 
 def overlap(train: Sequence[Drive], validation: Sequence[Drive]) -> Overlap:
     """Compare positions within each area; raises UserError where one side has no drive."""
+    from scipy.spatial import KDTree
+
     for what, drives in (("training", train), ("validation", validation)):
         if not sum(len(drive.positions) for drive in drives):
             raise UserError(f"the {what} split has no frames")

@@ -41,7 +41,7 @@ class LaneShapeLossConfig:
     cell_weight: float = 10.0
     shared_horizon: bool = True
     least_depth: float = 1e-6
-    matcher: Literal["scipy", "jax"] = "scipy"
+    matcher: Literal["scipy", "jax"] = "jax"
 
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: RoadImage, host: LstrConfig

@@ -67,7 +67,7 @@ class TopoNetLossConfig(HostLossConfig):
     successor_weight: float = 5.0
     alpha: float = 0.25
     gamma: float = 2.0
-    matcher: Literal["scipy", "jax"] = "scipy"
+    matcher: Literal["scipy", "jax"] = "jax"
     element_lane_weight: float = 5.0
     elements: ElementLossConfig = ElementLossConfig()
     class_target: Literal["one", "quality"] = "one"

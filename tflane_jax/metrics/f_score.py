@@ -12,7 +12,6 @@ from typing import Self
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from tflane_jax.metrics.chamfer import PaddedLines
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
@@ -112,6 +111,8 @@ def _interpolated(points: Float[np.ndarray, "l n 3"], slope_type: np.dtype | typ
 
 def found_lanes(true: SampledLanes, found: SampledLanes) -> tuple[int, int]:
     """Return the numbers of true lanes found and of detections that find one, in the pairing of least cost."""
+    from scipy.optimize import linear_sum_assignment
+
     cost, near = _costs(true, found)
     g, p = linear_sum_assignment(cost)
     possible = cost[g, p] < _WORST

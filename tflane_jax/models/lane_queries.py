@@ -8,8 +8,7 @@ from typing import Literal
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from scipy.stats import qmc
+from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
@@ -122,7 +121,7 @@ def spread_lanes(
     percent in any direction. `length` is in metres.
     """
     count = config.learned_queries
-    sample = qmc.Halton(3, scramble=False).random(count + 1)[1:]
+    sample = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in (2, 3, 5)], -1)
     middle = np.asarray(range_.low(2)) + sample[:, :2] * np.asarray(range_.size(2))
     fraction = sample[:, 2] / 0.6
     heading = np.where(fraction < 1.0, np.pi * (fraction < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
@@ -132,3 +131,13 @@ def spread_lanes(
     lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
     # Away from 0 and 1, where the sigmoid of the points is flat.
     return np.clip(range_.normalise(lanes), 0.02, 0.98)
+
+
+def _radical_inverse(number: Int[np.ndarray, " n"], base: int) -> Float[np.ndarray, " n"]:
+    """Return the digits of natural numbers in a base, mirrored at the point: a coordinate of the Halton sequence."""
+    found, weight = np.zeros(len(number)), 1.0
+    while number.any():
+        number, digit = np.divmod(number, base)
+        weight /= base
+        found += digit * weight
+    return found

@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from tflane_jax.scene.logs import LaneSegment
 from tflane_jax.world.roads.networks import RoadNetwork
@@ -217,6 +216,8 @@ def _conflicts(
     vehicle: Bool[np.ndarray, " s"],
 ) -> tuple[Int[np.ndarray, "v q"], Float[np.ndarray, "v q"], Bool[np.ndarray, "s s"], Float[np.ndarray, "s s"]]:
     """Return `beside`, `beside_station`, `crosses` and `clear_after` of `LaneTable`."""
+    from scipy.spatial import KDTree
+
     count = len(vehicle)
     follows = np.zeros((count, count), bool)
     for i, following in enumerate(successors):

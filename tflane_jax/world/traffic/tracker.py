@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.signal import lfilter
 
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
 from tflane_jax.scene.logs import Tracks
@@ -179,6 +178,8 @@ def _detections(
 
 def _noise(rng: np.random.Generator, shape: tuple[int, ...], correlation: float) -> np.ndarray:
     """Return unit-variance noise, first-order autoregressive along the first axis."""
+    from scipy.signal import lfilter  # half a second, which a training on cached examples does not need
+
     white = rng.normal(size=shape)
     if not shape[0]:
         return white

@@ -1,0 +1,67 @@
+"""Compiled programs are kept between processes, in the user's cache folder or where the environment says."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.shared import ROOT
+from tflane_jax.training import runtime
+
+PROGRAM = """
+import sys
+import jax
+from tflane_jax.training.runtime import configure_jax
+configure_jax()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+events = []
+jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+print(jax.jit(lambda x: x * 3 + 1)(2.0), events.count("/jax/compilation_cache/cache_hits"))
+"""
+
+
+def start(folder, **environment):
+    others = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        env=others | {"TFLANE_CACHE": str(folder)} | environment,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    result, hits = done.stdout.split()
+    assert result == "7.0"
+    return int(hits)
+
+
+def test_the_second_process_finds_the_programs_of_the_first(tmp_path):
+    assert start(tmp_path / "cache") == 0
+    assert start(tmp_path / "cache") > 0
+    assert list((tmp_path / "cache" / "programs").glob("jit*"))
+
+
+def test_the_environment_chooses_the_folder_and_none(tmp_path):
+    start(tmp_path / "cache", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "other"))
+    assert list((tmp_path / "other").glob("jit*"))
+    assert not (tmp_path / "cache").exists()
+    start(tmp_path / "cache", JAX_ENABLE_COMPILATION_CACHE="false")
+    assert not list((tmp_path / "cache").rglob("jit*"))
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path):
+    (tmp_path / "file").touch()
+    assert start(tmp_path / "file" / "cache") == 0
+
+
+@pytest.mark.parametrize(("limit", "kept"), [(100, {"b", "c"}), (39, {"c"}), (0, set())])
+def test_the_oldest_programs_are_dropped(tmp_path, monkeypatch, limit, kept):
+    monkeypatch.setattr(runtime, "_PROGRAMS", limit)
+    monkeypatch.setattr(runtime.jax.config, "update", lambda name, value: None)
+    for age, (name, size) in enumerate([("c", 39), ("b", 40), ("a", 41)]):
+        (tmp_path / name).write_bytes(b"0" * size)
+        os.utime(tmp_path / name, (1000 - age, 1000 - age))
+    runtime._keep_programs(tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == kept

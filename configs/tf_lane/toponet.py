@@ -67,7 +67,7 @@ def _small(data: WorldData, steps: int) -> RunConfig:
         task=LaneGraphTask(
             _host(data),
             # The topology loss is a mean over all pairs of queries, so that a small model needs a larger weight.
-            TopoNetLossConfig(successor_weight=20.0, class_target="quality", matcher="jax"),
+            TopoNetLossConfig(successor_weight=20.0, class_target="quality"),
         ),
         data=data,
         optim=OptimConfig(

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -30,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
+from benchmarks.timing import Compiled, compile_jax, cores, interleave, machine, markdown_table, save, summarise
 from tflane_jax.layers.attention import masked_attention
 from tflane_jax.layers.masks import SpatialMask
 
@@ -213,7 +212,7 @@ def torch_programs(result: Result, inputs: Inputs) -> dict[str, Compiled]:
         torch = importlib.import_module("torch")
     except ImportError:
         return {}
-    torch.set_num_threads(os.cpu_count())
+    torch.set_num_threads(cores())
     lanes, traffic, gradient = (torch.tensor(np.asarray(x)) for x in (inputs.lanes, inputs.traffic, inputs.gradient))
     mask = spatial_masks(inputs)
     quadrants = {k: None if m is None else torch.tensor(np.asarray(m)) for k, m in quadrants_of(mask).items()}
@@ -321,7 +320,7 @@ def _torch() -> dict[str, Any] | str:
         torch = importlib.import_module("torch")
     except ImportError:
         return "not installed, left out"
-    return {"version": torch.__version__, "threads": os.cpu_count()}
+    return {"version": torch.__version__, "threads": cores()}
 
 
 def main() -> None:

@@ -2,9 +2,9 @@
 
     python -m benchmarks.lstr --out runs/bench
 
-Inference at batch 1 and 8 and a whole training step at batch 16 (normalisation apart: both sides start from normalised
-images), at 360 x 640. PyTorch, where it is installed, runs the network of `benchmarks.torch_lstr` on the same cores in
-the same rounds. Random weights: no number of this table depends on them.
+Inference at batch 1 and 8 and a whole training step at batch 16, at 360 x 640. PyTorch, where it is installed, runs the
+network of `benchmarks.torch_lstr` on the same cores in the same rounds, from normalised images with channels last. For
+inference both sides have the same random weights and must give the same outputs.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import argparse
 import importlib.util
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.timing import Compiled, compile_jax, interleave, machine, markdown_table, save, summarise
+from tflane_jax.convert.lstr import convert_lstr
 from tflane_jax.layers.resnet import ResNetConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.models.lstr import LstrConfig
+from tflane_jax.models.parameters import Params
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
@@ -57,11 +60,12 @@ def lines(batch: int) -> LaneLines:
     return LaneLines(np.broadcast_to(points, (*shape, 2)), np.ones(shape, bool), np.ones(shape[:2], bool))
 
 
-def inference(config: LstrConfig, batch: int) -> Compiled:
-    """Return the network on normalised images."""
+def inference(config: LstrConfig, batch: int, variables: Params | None = None) -> Compiled:
+    """Return the network on normalised images, with random weights if none are given."""
     valid = jnp.ones((batch, HEIGHT, WIDTH), bool)
     pixels = jnp.asarray(images(batch))
-    variables = jax.jit(config.build().init)(jax.random.key(0), pixels[0], valid[0])
+    if variables is None:
+        variables = jax.jit(config.build().init)(jax.random.key(0), pixels[0], valid[0])
 
     def predict(variables, pixels, valid):
         return jax.vmap(lambda image, v: config.build().apply(variables, image, v))(pixels, valid)
@@ -87,36 +91,56 @@ def training(config: LstrConfig, batch: int) -> Compiled:
     return Compiled(run, seconds)
 
 
-def torch_programs(batch: int, *, train: bool) -> dict[str, Compiled]:
-    """Return PyTorch's side of a case, nothing where PyTorch is missing."""
-    if importlib.util.find_spec("torch") is None:
-        return {}
+def with_torch() -> bool:
+    """Return whether PyTorch is installed, and set how its threads wait."""
     # Read when PyTorch is imported. Waiting threads that spin would slow down both sides, PyTorch more than ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
-    from benchmarks.torch_lstr import Batch, build, training_step
-    from benchmarks.torch_lstr import inference as torch_inference
+    return importlib.util.find_spec("torch") is not None
 
-    pixels = np.ascontiguousarray(images(batch).transpose(0, 3, 1, 2))
-    if not train:
-        weights = {name: value.numpy() for name, value in build().state_dict().items()}
-        program = torch_inference(weights)
-        return {TORCH: Compiled(lambda: program(pixels), 0.0)}
+
+def inference_case(batch: int) -> dict[str, Compiled]:
+    """Return both sides of inference, which have given the same outputs; ours alone where PyTorch is missing."""
+    if not with_torch():
+        return {OURS: inference(MODEL, batch)}
+    from benchmarks import torch_lstr
+
+    weights = {name: value.numpy() for name, value in torch_lstr.build().state_dict().items()}
+    ours = inference(MODEL, batch, convert_lstr(weights).variables)
+    network = torch_lstr.inference(weights)
+    pixels = images(batch).transpose(0, 3, 1, 2)  # a view: channels stay last in memory
+    theirs = Compiled(lambda: network(pixels), 0.0)
+    found = ours.program()
+    check_equal((found.logits[:, -1], found.curves[:, -1]), theirs.program())
+    return {OURS: ours, TORCH: theirs}
+
+
+def check_equal(ours: Sequence[Any], theirs: Sequence[Any]) -> None:
+    """Raise AssertionError unless outputs agree within 1e-4 of the largest."""
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-4 * np.abs(b).max())
+
+
+def training_case(batch: int) -> dict[str, Compiled]:
+    """Return both sides of a training step, ours alone where PyTorch is missing."""
+    case = {OURS: training(MODEL, batch)}
+    if not with_torch():
+        return case
+    from benchmarks.torch_lstr import Batch, training_step
+
     truth = lines(batch)
     rows = np.concatenate(
         [np.ones((4, 1)), truth.points[0, :, [0, -1], 1].T, truth.points[0, ..., 0], truth.points[0, ..., 1]], 1
     ).astype(np.float32)
     masks = np.zeros((batch, 1, HEIGHT, WIDTH), np.float32)
-    return {TORCH: Compiled(training_step(Batch(pixels, masks, [rows] * batch)), 0.0)}
+    step = training_step(Batch(images(batch).transpose(0, 3, 1, 2), masks, [rows] * batch))
+    return case | {TORCH: Compiled(step, 0.0)}
 
 
 def measure(seconds: float) -> dict[str, dict[str, Any]]:
     """Return for each case what `timing.summarise` gives, and the seconds of compilation."""
-    cases: dict[str, dict[str, Compiled]] = {}
-    for batch in (1, 8):
-        cases[f"inference, batch {batch}"] = {OURS: inference(MODEL, batch)} | torch_programs(batch, train=False)
-    training_case = {OURS: training(MODEL, TRAINING_BATCH)} | torch_programs(TRAINING_BATCH, train=True)
-    cases[f"training step, batch {TRAINING_BATCH}"] = training_case
+    cases = {f"inference, batch {batch}": inference_case(batch) for batch in (1, 8)}
+    cases[f"training step, batch {TRAINING_BATCH}"] = training_case(TRAINING_BATCH)
     for batch in (1, TRAINING_BATCH):
         encoders = {name: inference(replace(MODEL, encoder=encoder), batch) for name, encoder in ENCODERS.items()}
         cases[f"encoders, inference, batch {batch}"] = encoders

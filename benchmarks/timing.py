@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from tflane_jax.files.atomic import write_json, write_text
-from tflane_jax.training.provenance import provenance
+from tflane_jax.training.provenance import provenance, thread_setting
 
 Program = Callable[[], Any]
 
@@ -86,7 +86,12 @@ def measure(compiled: Mapping[str, Compiled], seconds: float) -> dict[str, dict[
 
 def machine() -> dict[str, Any]:
     """Return provenance, processor and threads."""
-    return provenance() | {"processor": _processor(), "cores": os.cpu_count(), "load": list(os.getloadavg())}
+    return provenance() | {"processor": _processor(), "cores": cores(), "load": list(os.getloadavg())}
+
+
+def cores() -> int:
+    """Return the cores that this process may use, which may be pinned to fewer than the machine has."""
+    return thread_setting()["cores"]
 
 
 def _processor() -> str:

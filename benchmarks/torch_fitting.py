@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Sequence
 from typing import Any
 
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.timing import cores
 from tflane_jax.errors import UserError
 
 # Weights of the loss terms and of the matching costs.
@@ -16,12 +16,12 @@ CLASS, CURVE, EXTENT = 3.0, 5.0, 2.0
 
 
 def import_torch() -> Any:
-    """Return PyTorch, set to use every core; raise UserError where it is not installed."""
+    """Return PyTorch, with a thread for each core of this process; raise UserError where it is not installed."""
     try:
         torch = importlib.import_module("torch")
     except ImportError:
         raise UserError("the baseline needs PyTorch: pip install torch") from None
-    torch.set_num_threads(os.cpu_count())
+    torch.set_num_threads(cores())
     return torch
 
 

@@ -22,6 +22,7 @@ FLOORS = (
     "world.traffic",
     "world.cameras world.front_view",
     "world.simulate",
+    "world.presets",
     "markers",
     "datasets",
     "priors",

@@ -15,6 +15,7 @@ import pytest
 from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_elements, fake_prediction
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser, main
+from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.scene import Prediction
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.records import read_records
@@ -142,7 +143,9 @@ def test_evaluation_prints_and_writes_the_table(trained, capsys):
     assert (written["meta"]["step"], written["meta"]["max_instances"]) == (4, None)
     assert "v2.1" in written["meta"]["protocol"]
     rows = {row["lanes of"]: row for row in written["rows"]}
-    assert {group: row["lanes"] for group, row in rows.items()} == {"all": 10, "occluded": 5, "clear": 5}
+    lanes = {group: row["lanes"] for group, row in rows.items()}
+    assert [lanes[group] for group in ("all", "occluded", "clear")] == [10, 5, 5]
+    assert {*lanes} - {"all", "occluded", "clear"} == {*LANE_GROUPS}
     recorded = [r for r in read_records(trained / "metrics.jsonl") if r["split"] == "val"][-1]
     assert rows["all"]["DET_l"] == recorded["all/DET_l"]
     assert (trained / "evaluations" / "procedural-val-step4.md").read_text().strip() in said
@@ -153,6 +156,13 @@ def test_traffic_flow_can_be_limited(trained, tmp_path, capsys):
     assert json.loads((tmp_path / "none.json").read_text())["meta"]["max_instances"] == 0
     assert main(["eval", str(trained), "--max-instances", "5"]) == 2
     assert "outside 0 to 4" in capsys.readouterr().err
+
+
+def test_evaluation_with_other_traffic(trained, capsys):
+    for traffic, name in (("none", "none"), ("other-scene", "other_scene")):
+        assert main(["eval", str(trained), "--checkpoint", "last", "--traffic", traffic]) == 0
+        stem = trained / "evaluations" / f"procedural-test-step4-traffic_{name}"
+        assert json.loads(stem.with_suffix(".json").read_text())["meta"]["traffic"] == traffic
 
 
 def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
@@ -181,6 +191,8 @@ def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):
     folder = tmp_path / "baseline"
     command = ["train", "--config", f"{config}:baseline", "--out", str(folder), "--training.steps", "2"]
     assert main([*command, *FEW_PICTURES]) == 0
+    assert main(["eval", str(folder), "--traffic", "none"]) == 2
+    assert "this model takes none" in capsys.readouterr().err
     assert main(["eval", str(folder), "--max-instances", "0"]) == 2
     assert "without traffic flow" in capsys.readouterr().err
 
@@ -259,9 +271,9 @@ def test_ctrl_c_prints_the_command_to_resume(config, tmp_path, capsys, monkeypat
 
     from tflane_jax.tasks import lane_graph
 
-    def interrupting(*arguments):
+    def interrupting(*arguments, **options):
         os.kill(os.getpid(), signal.SIGINT)
-        return evaluate(*arguments)
+        return evaluate(*arguments, **options)
 
     evaluate = lane_graph.evaluate_lanes
     monkeypatch.setattr(lane_graph, "evaluate_lanes", interrupting)
@@ -277,7 +289,12 @@ def test_a_comparison_trains_and_tests_and_does_not_repeat_finished_runs(config,
     command += FEW_PICTURES
     assert main(command) == 0
     scores = json.loads((out / "scores.json").read_text())
-    assert list(scores) == ["baseline", "+TFM", "+TFM, no traffic flow at inference"]
+    assert list(scores) == [
+        "baseline",
+        "+TFM",
+        "+TFM, no traffic flow at inference",
+        "+TFM, traffic of another scene",
+    ]
     assert {len(values) for values in scores.values()} == {2}
     assert "+TFM" in (out / "table.md").read_text()
     assert "of 2" in (out / "paired.md").read_text()
@@ -294,6 +311,28 @@ def test_a_comparison_trains_and_tests_and_does_not_repeat_finished_runs(config,
 def test_a_comparison_needs_different_names(config, tmp_path, capsys):
     assert main(["compare", str(config), str(config), "--out", str(tmp_path / "c")]) == 2
     assert "same name" in capsys.readouterr().err
+
+
+def test_data_stats_counts_lanes_and_traffic(capsys):
+    assert main(["data", "stats", "--data", "street", "--split", "val", "--count", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert "procedural-val: 2 examples" in printed
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
+    mean, low, _, high = map(float, rows["lanes"])
+    assert 1.0 <= low <= mean <= high
+    for quantity in ("lanes hidden+traffic", "- standing vehicles", "examples with more than 30"):
+        assert quantity in rows
+    driven = [float(cell) for cell in rows["fraction of lane length driven on"]]
+    assert 0.0 < min(driven) <= max(driven) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--count", "0"], "nothing to count"), (["--data", "front-views"], "are no lane graphs")],
+)
+def test_data_stats_needs_lane_graphs(arguments, message, capsys):
+    assert main(["data", "stats", *arguments]) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_data_show_draws_world_cameras(tmp_path, capsys):

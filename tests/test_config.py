@@ -259,8 +259,8 @@ def test_a_file_takes_precedence_over_a_shipped_name(tmp_path, monkeypatch):
         ("host", "did you mean markers/host"),
         ("configs/tf_lane/toponet_tfm.py:abla1", "the shipped configuration is called tf_lane/toponet_tfm"),
         ("xyz", "the package ships .*gtn_lane/lstr, .*tf_lane/toponet_tfm"),
-        ("tf_lane/toponet_tfm:abla", "no ablation abla, only abla1, .*; did you mean abla"),
-        ("tf_lane/toponet_tfm:xyz", "no ablation xyz, only abla1, .*abla8$"),
+        ("tf_lane/toponet_tfm:abla", "no ablation abla, only street, .*; did you mean abla"),
+        ("tf_lane/toponet_tfm:xyz", "no ablation xyz, only street, .*abla8$"),
         ("gtn_lane/lstr:xyz", r"has no function ablations\(\)"),
     ],
 )

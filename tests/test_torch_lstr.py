@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks import torch_fitting, torch_lstr
+from benchmarks import lstr, torch_fitting, torch_lstr
 from tests.golden import case_id, golden_modules, load_module_case
 from tests.golden_compare import assert_gradients_close, assert_outputs_close
 from tests.shared import shared_path
@@ -24,7 +24,7 @@ def torch_or_skip():
 @pytest.fixture(autouse=True)
 def one_thread(monkeypatch):
     """Keep PyTorch's threads from spinning against those of other tests."""
-    monkeypatch.setattr(torch_fitting.os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(torch_fitting, "cores", lambda: 1)
 
 
 def of_kind(kind):
@@ -131,6 +131,25 @@ def test_training_steps_are_seeded_and_reduce_the_loss():
     assert losses[0] == losses[1]
     assert min(losses[0]) < losses[0][0]
     assert np.isfinite(torch_lstr.training_step(batch([0, 0]))())
+
+
+def test_layout_of_images_changes_nothing():
+    """Weights have their channels last in memory; images may have them last or first."""
+    torch = torch_or_skip()
+    weights = {name: value.numpy() for name, value in torch_lstr.build().state_dict().items()}
+    network = torch_lstr.inference(weights)
+    first = np.random.default_rng(0).standard_normal((2, 3, 64, 96), dtype=np.float32)
+    last = np.ascontiguousarray(first.transpose(0, 2, 3, 1)).transpose(0, 3, 1, 2)
+    assert torch.from_numpy(last).is_contiguous(memory_format=torch.channels_last)
+    for a, b in zip(network(first), network(last), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_both_sides_of_the_benchmark_must_agree():
+    outputs = np.ones((1, 7, 2)), np.linspace(-1.0, 1.0, 56).reshape(1, 7, 8)
+    lstr.check_equal(outputs, outputs)
+    with pytest.raises(AssertionError):
+        lstr.check_equal((outputs[0], outputs[1] + 1e-3), outputs)
 
 
 def test_other_encoders_are_refused():

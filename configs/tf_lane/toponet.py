@@ -1,39 +1,82 @@
 """TopoNet's lane branch on the built-in world, at a size for two cores: the baseline without priors.
 
     tflane train --config tf_lane/toponet
-    tflane train --config tf_lane/toponet:denoising --training.steps 2500
+    tflane train --config tf_lane/toponet:street
 
-5,000 updates take ten minutes on one core. Test split, five seeds, percent: all/DET_l 9.4 +- 1.9,
-occluded/DET_l 9.3 +- 1.8 (docs/tf_lane.md).
+The second runs on simpler roads in a smaller box. Numbers and what each part of the recipe gives: docs/small_models.md.
 """
 
 from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneProposalConfig
+from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
 
 
 def get_config() -> RunConfig:
-    """Return the baseline.
-
-    A small model trained for few steps needs a higher learning rate than TopoNet's, and a larger weight on the topology
-    loss, which is a mean over all pairs of queries.
-    """
-    return RunConfig(
-        task=LaneGraphTask(losses=TopoNetLossConfig(successor_weight=20.0)),
-        data=WorldData(train=1000, val=25, test=150),
-        optim=OptimConfig(lr=1.5e-3, warmup_steps=100, b2=0.99, clip_norm=5.0),
-        training=TrainingConfig(steps=5000, batch_size=4, eval_every=1000, checkpoint_every=1000),
-    )
+    """Return the baseline on the preset `city`."""
+    return _small(WorldData.city(), steps=6000)
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return faster training variants, which the paper does not use (docs/cameras.md, "Small models")."""
-    plain = get_config()
-    model = replace(plain.task.model, denoising=DenoisingConfig())
-    muon = replace(plain, optim=replace(plain.optim, lr=2e-3, optimizer="muon"))
-    return {"muon": muon, "denoising": replace(muon, task=replace(plain.task, model=model))}
+    """Return the baseline on the preset `street`, the same without one part each, and TopoNet's published forms."""
+    street = _small(WorldData.street(), steps=5000)
+    model, losses, optim = _host(WorldData.street()), street.task.losses, street.optim
+    decoder, encoder = model.decoder, model.encoder
+
+    def changed(**changes) -> RunConfig:
+        return replace(street, task=replace(street.task, model=replace(model, **changes)))
+
+    learned = replace(decoder, proposals=None)
+    without_context = replace(encoder, levels=(), dilations=(1, 2, 4, 1), coordinates=False)
+    published = replace(learned, output="sigmoid", layers=3, queries=48)
+    return {
+        "street": street,
+        "street_sigmoid": changed(decoder=replace(decoder, output="sigmoid")),
+        "street_learned_queries": changed(decoder=learned),
+        "street_without_context": changed(encoder=without_context),
+        "street_without_denoising": changed(denoising=None),
+        "street_class_one": replace(street, task=replace(street.task, losses=replace(losses, class_target="one"))),
+        "street_muon_dense": replace(street, optim=replace(optim, muon_kernels="dense")),
+        "street_adam": replace(street, optim=replace(optim, lr=1.5e-3, optimizer="adam")),
+        "street_published": replace(
+            changed(decoder=published, encoder=without_context, denoising=None),
+            optim=replace(optim, lr=1.5e-3, optimizer="adam"),
+        ),
+    }
+
+
+def _host(data: WorldData) -> TopoNetConfig:
+    """Return a host that learns within minutes; docs/small_models.md tells what is TopoNet's and what is not."""
+    encoder = EvidenceEncoderConfig(dim=48, levels=(64, 128), dilations=(), coordinates=True, range=data.example.ground)
+    decoder = LaneDecoderConfig(layers=2, queries=40, output="metric", proposals=LaneProposalConfig(count=28))
+    return TopoNetConfig(
+        encoder=encoder, range=data.example.range, decoder=decoder, denoising=DenoisingConfig(copies=1)
+    )
+
+
+def _small(data: WorldData, steps: int) -> RunConfig:
+    """Return the training of the host; clipping and b2 are those of the earlier small configurations."""
+    return RunConfig(
+        task=LaneGraphTask(
+            _host(data),
+            # The topology loss is a mean over all pairs of queries, so that a small model needs a larger weight.
+            TopoNetLossConfig(successor_weight=20.0, class_target="quality", matcher="jax"),
+        ),
+        data=data,
+        optim=OptimConfig(
+            lr=4e-3,
+            warmup_steps=100,
+            b2=0.99,
+            clip_norm=5.0,
+            optimizer="muon",
+            muon_kernels="dense_and_convolution",
+        ),
+        training=TrainingConfig(steps=steps, batch_size=4, eval_every=1000, checkpoint_every=1000),
+    )

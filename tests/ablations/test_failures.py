@@ -57,6 +57,7 @@ def test_a_failed_training_stops_no_other_and_is_listed(tiny, tmp_path, monkeypa
         "base": ["1", "2", "3"],
         "tfm": ["0", "2", "3"],
         "tfm, no traffic flow at inference": ["0", "2", "3"],
+        "tfm, traffic of another scene": ["0", "2", "3"],
     }
     assert len(content["failed"]) == 2
     last = [row for row in rows(out / "table.md") if row["checkpoint"] == "last"]
@@ -75,7 +76,8 @@ def test_without_a_control_there_is_a_table_and_no_test(tiny, tmp_path, monkeypa
     printed = capsys.readouterr().out
     assert "no paired tests (last checkpoint, test split): no run of base" in printed
     assert "no run of base is complete" in (tmp_path / "table.md").read_text()
-    assert {row["model"] for row in rows(tmp_path / "table.md")} == {"tfm", "tfm, no traffic flow at inference"}
+    interventions = ["tfm, no traffic flow at inference", "tfm, traffic of another scene"]
+    assert {row["model"] for row in rows(tmp_path / "table.md")} == {"tfm", *interventions}
     assert not (tmp_path / "paired.md").exists()
 
 

@@ -1,4 +1,4 @@
-"""Paired differences: against scipy's formula written out, and at the edges."""
+"""Paired differences against scipy's formula written out, Holm's correction, bootstrap samples against loops."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tflane_jax.ablations.statistics import holm, paired_difference
+from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio, scene_weights
 
 
 def test_against_the_formula():
@@ -68,3 +68,34 @@ def test_missing_tests_do_not_count_in_the_correction():
     corrected = holm([0.01, math.nan, 0.04])
     assert math.isnan(corrected[1])
     assert [corrected[0], corrected[2]] == pytest.approx([0.02, 0.04])
+
+
+def test_resampled_ratios_against_a_loop_over_drawn_scenes():
+    rng = np.random.default_rng(0)
+    lanes = rng.integers(0, 9, 12)
+    found = np.stack([rng.binomial(lanes, share) for share in (0.3, 0.5, 0.6)])
+    weights = scene_weights(12, 50, seed=3)
+    expected = []
+    for times in weights:
+        drawn = [scene for scene, count in enumerate(times) for _ in range(count)]
+        assert len(drawn) == 12
+        expected.append(np.mean([seed[drawn].sum() / lanes[drawn].sum() for seed in found]))
+    np.testing.assert_allclose(resampled_ratio(found, lanes, weights), expected)
+    # Every scene once: the ratio itself.
+    whole = resampled_ratio(found, lanes, np.ones((1, 12), int))
+    np.testing.assert_allclose(whole, found.sum() / 3 / lanes.sum())
+
+
+def test_the_interval_of_a_mean_has_the_width_that_theory_gives():
+    rng = np.random.default_rng(1)
+    values = rng.integers(0, 100, 400)
+    samples = resampled_ratio(values[None], np.ones(400, int), scene_weights(400, 10_000))
+    low, high = interval(samples)
+    assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.05)
+    assert low < values.mean() < high
+    np.testing.assert_array_equal(scene_weights(5, 3), scene_weights(5, 3))
+
+
+def test_samples_without_anything_to_count_give_zero():
+    ratio = resampled_ratio(np.array([[3, 0]]), np.array([4, 0]), np.array([[0, 2], [2, 0]]))
+    np.testing.assert_allclose(ratio, [0.0, 0.75])

@@ -10,6 +10,7 @@ from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.examples import make_example, occluder_boxes, traffic_flow
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
 from tflane_jax.geometry.cameras import project
 from tflane_jax.scene import stack_examples
@@ -52,6 +53,43 @@ def test_history_ends_before_the_key_frame_and_is_padded_at_the_front(frame, fra
     flow, _ = traffic_flow(recording, 0, history=20, capacity=2)
     assert flow.valid[0].tolist() == [False] * (20 - frames) + [True] * frames
     np.testing.assert_array_equal(flow.position[0, 20 - frames :, 0], np.arange(frame - frames, frame))
+
+
+@pytest.mark.parametrize("stride", [1, 2, 5])
+@pytest.mark.parametrize("frame", [3, 25, 29])
+def test_a_history_with_a_stride_is_every_kth_frame_of_the_dense_one(frame, stride):
+    rng = np.random.default_rng([frame, stride])
+    position, valid = rng.normal(size=(30, 6, 3)), rng.random((30, 6)) < 0.3
+    recorded = tracks(position, rng.normal(size=(30, 6)), valid=valid, occluded=rng.random((30, 6)) < 0.5)
+    recorded = dataclasses.replace(recorded, size=rng.uniform(1.0, 5.0, (6, 3)))
+    recording = log(ROAD, recorded, POSES, [(frame, POSES[frame])])
+    dense, _ = traffic_flow(recording, 0, history=5 * stride, capacity=6)
+    flow, _ = traffic_flow(recording, 0, history=5, capacity=6, stride=stride)
+    flow.validate()
+    # Who is seen only in frames that are left out is no instance.
+    kept = dense.valid[:, ::stride].any(-1)
+    n = kept.sum()
+    assert not flow.valid[n:].any()
+    for name in ("position", "yaw", "occluded", "valid"):
+        np.testing.assert_array_equal(getattr(flow, name)[:n], getattr(dense, name)[kept][:, ::stride], err_msg=name)
+    np.testing.assert_array_equal(flow.size[:n], dense.size[kept])
+
+
+@pytest.mark.parametrize(("rate", "stride"), [(None, 1), (10.0, 1), (5.0, 2), (2.0, 5), (2.04, 5)])
+def test_the_rate_of_the_history_picks_its_stride(rate, stride):
+    # The x of a box tells its frame; the log has 10 Hz.
+    position = np.zeros((30, 1, 3))
+    position[:, 0, 0] = np.arange(30)
+    recording = log(ROAD, tracks(position), [np.eye(4)] * 30, [(29, np.eye(4))])
+    flow = make_example(recording, 0, ExampleConfig(history=4, history_hz=rate)).traffic_flow
+    assert flow.position[0, :, 0].tolist() == [29 - i * stride for i in (4, 3, 2, 1)]
+
+
+@pytest.mark.parametrize("rate", [3.0, 20.0, 0.0, -2.0])
+def test_a_rate_that_does_not_divide_that_of_the_log_is_refused(rate):
+    recording = log(ROAD, tracks(np.zeros((30, 1, 3))), POSES, [(29, POSES[29])])
+    with pytest.raises(UserError, match="does not divide the 10 Hz"):
+        make_example(recording, 0, ExampleConfig(history_hz=rate))
 
 
 def test_instances_without_a_frame_in_the_window_leave_no_gap():

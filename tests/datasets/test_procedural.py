@@ -13,7 +13,7 @@ from tflane_jax.datasets import procedural
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.loading import load_arrays
-from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset, WorldData
 from tflane_jax.errors import UserError
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
@@ -84,6 +84,39 @@ def test_scenes_are_simulated_once_for_all_their_frames(monkeypatch):
         dataset.example(index)
     assert calls == [10**8 + 5, 10**8 + 6]
     procedural._simulated.cache_clear()
+
+
+@pytest.mark.parametrize("preset", [WorldData.city, WorldData.street])
+def test_every_key_frame_of_a_preset_has_its_whole_history(preset):
+    source = replace(preset(1, 1, 1).source("val"), first=3)
+    dataset = ProceduralDataset(source)
+    log = procedural._simulated(10**8 + 3, source.world, 100)
+    for index in range(len(dataset)):
+        flow, moment = dataset.example(index).traffic_flow, log.keyframes[index]
+        frames = moment.track_frame - 5 * np.arange(20, 0, -1)
+        assert frames.min() >= 0
+        # As many road users as the log has in the frame 10 s ago.
+        assert flow.valid[:, 0].sum() == log.tracks.valid[frames[0]].sum() > 0
+        assert flow.valid.any(-1).sum() == log.tracks.valid[frames].any(0).sum()
+
+
+def test_the_box_of_a_preset_lies_within_its_raster_and_its_map():
+    for data in (WorldData.city(), WorldData.street()):
+        ground, box = data.example.ground, data.example.range
+        assert ground.contains(np.array([[box.x[0], box.y[0]], [box.x[1], box.y[1]]])).all()
+        half_diagonal = np.hypot(box.x[1], box.y[1])
+        for scene in range(6):
+            log = procedural._simulated(scene, data.world, 100)
+            roads = np.concatenate([segment.centerline for segment in log.map.segments.values()])
+            reach = np.abs(roads[:, :2]).max()
+            for moment in log.keyframes:
+                assert np.hypot(*moment.global_from_ego[:2, 3]) + half_diagonal < reach
+
+
+def test_a_scene_too_short_for_the_history_says_so():
+    short = replace(WorldData.city().source("val"), world=replace(WorldData.city().world, duration_s=9.0))
+    with pytest.raises(UserError, match="100 frames of history each do not fit in the 90 frames"):
+        ProceduralDataset(short).example(0)
 
 
 def test_the_cache_holds_the_same_examples(tmp_path, dataset):

@@ -149,7 +149,7 @@ def test_unsuitable_data_sources_are_refused(arguments, config, message):
 
 def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
     for arguments, names in (
-        (["eval", "--help"], "{procedural,world-cameras,argoverse2,openlane-v2,front-views,tusimple}"),
+        (["eval", "--help"], "{procedural,world-cameras,city,street,argoverse2,openlane-v2,front-views,tusimple}"),
         (["data", "check", "--help"], "{argoverse2,openlane-v2,tusimple}"),
     ):
         with pytest.raises(SystemExit) as ended:
@@ -159,7 +159,7 @@ def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["eval", "run", "--data", "toy"])
     assert ended.value.code == 2
-    assert "'toy' is none of procedural, world-cameras, argoverse2" in capsys.readouterr().err
+    assert "'toy' is none of procedural, world-cameras, city, street, argoverse2" in capsys.readouterr().err
 
 
 def test_tusimples_folder_is_checked(tmp_path, capsys):

@@ -9,7 +9,9 @@ import pytest
 
 from tests.fakes import fake_elements, fake_example
 from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, evaluate_lanes
+from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups
 from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.geometry import BevGrid
 from tflane_jax.scene import (
     AreaType,
     CenterlinePrediction,
@@ -146,3 +148,75 @@ def test_predictions_without_topology_are_measured():
 def test_nothing_to_measure_is_an_error():
     with pytest.raises(ValueError, match="nothing to measure"):
         LaneGraphMetrics().update(Prediction(elements=fake_elements()), fake_example())
+
+
+@dataclass(frozen=True)
+class Follower:
+    """Predicts the true lanes, raised by the height of the first road user; without road users far too high."""
+
+    streams: bool = False
+
+    def predict(self, params, example):
+        example = jax.tree.map(jnp.asarray, example)
+        flow = example.traffic_flow
+        raised = example.lanes.points.at[..., 2].add(jnp.where(flow.valid[0, 2], flow.position[0, 2, 2], 500.0))
+        return Prediction(centerlines=CenterlinePrediction(raised, jnp.zeros((5, 1))))
+
+
+def with_groups(count=5):
+    """Return examples whose first lane is driven along, stacked; 0 and 1 are a scene, 2 and 3 the next."""
+    examples = [labelled(i) for i in range(count)]
+    for example in examples:
+        lane, flow = example.lanes.points[0], example.traffic_flow
+        forward = np.gradient(lane, axis=0)
+        flow.position[0] = 300.0, 300.0, 0.0
+        flow.position[1, 2:], flow.yaw[1, 2:], flow.category[1] = lane, np.arctan2(forward[:, 1], forward[:, 0]), 0
+    return stack_examples(examples)
+
+
+def test_lanes_are_grouped_by_evidence_and_traffic():
+    arrays, ground = with_groups(), BevGrid().range
+    found = evaluate_lanes(Oracle(("centerlines",)), {}, arrays, BOTH, ground=ground).compute()
+    expected = dict.fromkeys(LANE_GROUPS, 0)
+    for i in range(5):
+        row = jax.tree.map(lambda leaf, i=i: leaf[i], arrays)
+        for name, members in lane_groups(row.lanes, row.bev, row.traffic_flow, ground).items():
+            expected[name] += int(members.sum())
+    assert {name: found[name]["lanes"] for name in LANE_GROUPS} == expected
+    assert expected["visible+traffic"] > 0
+    assert all(found[name]["recall"] == 1.0 for name in LANE_GROUPS if expected[name])
+    assert list(measured(("centerlines",)).compute()) == ["all", "occluded", "clear"]
+    for lacking in ("bev", "traffic_flow"):
+        without = evaluate_lanes(Oracle(("centerlines",)), {}, arrays.replace(**{lacking: None}), BOTH, ground=ground)
+        assert list(without.compute()) == ["all", "occluded", "clear"]
+
+
+def test_an_intervention_changes_what_the_model_sees_and_neither_truth_nor_groups():
+    arrays, ground = with_groups(), BevGrid().range
+
+    def recall(traffic):
+        config = EvaluationConfig(batch_size=2, traffic=traffic)
+        return evaluate_lanes(Follower(), {}, arrays, config, ground=ground).compute()
+
+    own, none, other = (recall(traffic) for traffic in ("own", "none", "other-scene"))
+    assert own["all"]["recall"] == other["all"]["recall"] == 1.0
+    assert none["all"]["recall"] == 0.0
+    arrays.traffic_flow.position[:2, 0, :, 2] = 500.0  # the first scene's: its receiver fails instead
+    own, other = recall("own"), recall("other-scene")
+    assert own["all"]["recall@3.0"] == pytest.approx(3 / 5)
+    assert other["all"]["recall@3.0"] in (pytest.approx(3 / 5), pytest.approx(4 / 5))
+    assert {name: own[name]["lanes"] for name in own} == {name: other[name]["lanes"] for name in other}
+
+
+def test_recall_is_the_ratio_of_counts_by_scene():
+    metrics = evaluate_lanes(Oracle(("centerlines",), 0.9), {}, with_groups(), BOTH, ground=BevGrid().range)
+    scores, ratios = metrics.compute(), metrics.ratios()
+    assert set(ratios) == {f"{group}/recall" for group in scores}
+    for name, ratio in ratios.items():
+        group = name.partition("/")[0]
+        assert len(ratio.numerator) == len(ratio.denominator) == 3
+        assert sum(ratio.denominator) == 3 * scores[group]["lanes"]
+        assert sum(ratio.numerator) / max(sum(ratio.denominator), 1) == pytest.approx(scores[group]["recall"])
+    assert ratios["all/recall"].denominator == (12, 12, 6)  # two lanes a frame, at three thresholds
+    assert 0 < scores["all"]["recall"] < 1
+    assert measured(("lines",)).ratios() == {}

@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from tflane_jax.losses.costs import focal_cost
-from tflane_jax.losses.toponet import TopoNetLossConfig, lane_graph_loss, matching_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig, lane_graph_loss, lane_losses, lane_quality, matching_cost
+from tflane_jax.matching import Assignment
 from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, stack_examples
 
 CONFIG = TopoNetLossConfig()
@@ -144,3 +145,27 @@ def test_cost_shape_and_value():
     assert cost.shape == (LAYERS, QUERIES, LANES)
     expected = 1.5 * focal_cost(one.logits[1, 2, 0]) + 0.025 * np.abs(one.points[1, 2] - lanes.points[0, 4]).sum()
     assert float(cost[1, 2, 4]) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_quality_falls_with_the_largest_distance_of_a_point():
+    truth = jnp.zeros((3, 4, 3))
+    points = truth.at[1, 2, 0].set(2.0).at[2, :, 1].set(6.0)
+    np.testing.assert_allclose(lane_quality(points, truth), [1.0, 0.5, 0.1], rtol=1e-6)
+
+
+def test_quality_targets_rank_lanes_by_their_precision():
+    """With free logits, the least loss gives every matched query its quality, and others 0."""
+    lanes = stack_examples([LaneGraph.empty(2, POINTS).replace(valid=np.ones(2, bool))])
+    points = jnp.zeros((1, 1, 3, POINTS, 3)).at[0, 0, 1, :, 0].set(2.0).at[0, 0, 2].set(40.0)
+    assignment = Assignment(jnp.array([[[0, 1]]]), jnp.ones((1, 1, 2), bool))
+
+    def loss(logits):
+        prediction = CenterlinePrediction(points, logits, jnp.zeros((1, 1, 3, 3)))
+        return lane_losses(prediction, assignment, lanes, TopoNetLossConfig(class_target="quality"))["class"].sum()
+
+    logits = jnp.zeros((1, 1, 3, 1))
+    step = jax.jit(lambda x: x - 2.0 * jax.grad(loss)(x))
+    for _ in range(400):
+        logits = step(logits)
+    np.testing.assert_allclose(jax.nn.sigmoid(logits[0, 0, :2, 0]), [1.0, 0.5], atol=0.1)
+    assert float(jax.nn.sigmoid(logits[0, 0, 2, 0])) < 0.1

@@ -117,6 +117,8 @@ def test_by_hand():
     # One of three lanes is found at 1 m (A), two at 2 and 3 m.
     assert [result[f"recall@{t}"] for t in LANE_THRESHOLDS] == pytest.approx([1 / 3, 2 / 3, 2 / 3])
     assert result["recall"] == pytest.approx(5 / 9)
+    # Area: at 1 m the first detection takes one of three lanes, at 2 and 3 m the first two take two.
+    assert result["AP_l"] == pytest.approx((1 / 3 + 2 / 3 + 2 / 3) / 3)
     assert (result["frames"], result["lanes"]) == (1, 3)
 
 
@@ -170,6 +172,35 @@ def test_groups_by_hand():
     assert result["clear"]["TOP_ll"] == pytest.approx((0 + 1 + 1) / 6)
     assert "DET_t" not in result["clear"]
     assert "occluded: visibility < 0.5" in metrics.protocol
+
+
+def test_groups_of_lanes_that_the_caller_names():
+    detections, truth = hand_frame()
+    metrics = GroupedCenterlineMetrics(lane_groups=("like clear", "none", "both"))
+    clear, none, both = np.array([1, 0, 0], bool), np.zeros(3, bool), np.array([1, 1, 0], bool)
+    metrics.update(detections, truth, members={"like clear": clear, "none": none, "both": both})
+    result = metrics.compute()
+    assert result["like clear"] == result["clear"]
+    assert (result["none"]["lanes"], result["both"]["lanes"]) == (0, 2)
+    assert result["both"]["recall"] == pytest.approx(5 / 6)
+    # One row for each frame: lanes, and hits at 1, 2 and 3 m.
+    counts = {name: rows.tolist() for name, rows in metrics.merge(metrics).recalled().items()}
+    assert counts == {
+        "all": [[3, 5]] * 2,
+        "occluded": [[2, 2]] * 2,
+        "clear": [[1, 3]] * 2,
+        "like clear": [[1, 3]] * 2,
+        "none": [[0, 0]] * 2,
+        "both": [[2, 5]] * 2,
+    }
+
+
+def test_frames_outside_a_group_of_frames_count_nothing_in_it():
+    metrics = GroupedCenterlineMetrics(frame_groups=("gap",))
+    metrics.update(*hand_frame())
+    metrics.update(*hand_frame(), "gap")
+    assert metrics.recalled()["gap"].tolist() == [[0, 0], [3, 5]]
+    assert metrics.compute()["gap"]["frames"] == 1
 
 
 def test_threshold_of_occlusion_is_strict_and_configurable():

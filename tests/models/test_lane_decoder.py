@@ -1,5 +1,7 @@
 """The parts of the lane decoder that have a geometry of their own."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 
 from tests.models.cases import BASELINE
-from tflane_jax.geometry import BevGrid
-from tflane_jax.models.lane_decoder import PointwiseRefinement, directions, smooth_basis
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.models.lane_decoder import LaneHeads, PointwiseRefinement, clip_with_return, directions, smooth_basis
 from tflane_jax.models.lane_queries import spread_lanes
 
 RANGE = BevGrid().range
@@ -72,3 +74,43 @@ def test_pointwise_refinement_starts_at_zero_and_looks_only_where_the_point_is()
     before, after = (np.asarray(apply(params, queries, reference, b)) for b in (bev, other))
     np.testing.assert_array_equal(before[0], after[0])
     assert not np.allclose(before, after)
+
+
+def metric_heads(reference, unit_change, limits=None):
+    """The output of heads whose every point changes by `unit_change` units."""
+    config = dataclasses.replace(BASELINE.decoder, output="metric", points=reference.shape[1], relation=4)
+    queries, bev = jnp.zeros((len(reference), config.dim)), jnp.zeros((4, 8, 5))
+    heads = LaneHeads(config, RANGE, relations=False, limits=limits)
+    params = jax.tree.map(jnp.zeros_like, heads.init(jax.random.key(0), queries, reference, bev))
+    # Column 0 of the basis moves all points alike.
+    params["params"]["points"]["linear_2"]["bias"] = jnp.zeros((config.points, 3)).at[0].set(unit_change).reshape(-1)
+    return jax.jit(lambda p: heads.apply(p, queries, reference, bev))(params), params, heads, (queries, reference, bev)
+
+
+def test_one_unit_of_the_metric_output_is_one_distance_everywhere():
+    reference = jnp.asarray([[[0.5, 0.5, 0.5]] * 5, [[0.9, 0.1, 0.2]] * 5])
+    output, *_ = metric_heads(reference, jnp.array([0.4, -0.2, 1.0]))
+    moved = np.asarray(output.points) - np.asarray(RANGE.denormalise(reference))
+    np.testing.assert_allclose(moved, np.broadcast_to([2.0, -1.0, 0.3], moved.shape), atol=1e-4)
+
+
+def test_lanes_end_at_the_limits_and_can_come_back_but_not_drift_away():
+    limits = PerceptionRange((-50.0, 50.0), (-25.0, 25.0), (-2.3, 1.7))
+    reference = jnp.full((1, 5, 3), 0.5).at[..., 0].set(0.95)  # 5 m before the border
+    output, params, heads, given = metric_heads(reference, jnp.array([9.0, 0.0, 0.0]), limits)
+    np.testing.assert_allclose(output.points[..., 0], 50.0, rtol=1e-6)
+
+    def slope(sign):
+        grads = jax.grad(lambda p: sign * heads.apply(p, *given).points[..., 0].sum())(params)
+        return grads["params"]["points"]["linear_2"]["bias"].reshape(5, 3)[0, 0]
+
+    np.testing.assert_allclose(slope(1.0), 25.0, rtol=1e-4)  # five points, 5 m each
+    assert slope(-1.0) == 0.0
+
+
+def test_the_clip_keeps_the_gradient_inside():
+    x, low, high = jnp.array([-0.2, 0.5, 1.4]), jnp.zeros(3), jnp.ones(3)
+    np.testing.assert_array_equal(clip_with_return(x, low, high), [0.0, 0.5, 1.0])
+    for weights, expected in (([1.0, 1.0, 1.0], [0.0, 1.0, 1.0]), ([-1.0, -1.0, -1.0], [-1.0, -1.0, 0.0])):
+        slope = jax.vjp(clip_with_return, x, low, high)[1](jnp.array(weights))[0]
+        np.testing.assert_array_equal(slope, expected)

@@ -4,7 +4,6 @@ import dataclasses
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -138,25 +137,3 @@ def test_no_bev_is_an_error(fitted):
     task, params, _ = fitted["baseline"]
     with pytest.raises(UserError, match="bev is None"):
         task.predict(params, make_example().replace(bev=None))
-
-
-@pytest.mark.slow
-def test_overfits_one_example():
-    import optax
-
-    task = LaneGraphTask(model=WITH_TRAFFIC)
-    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], make_example(2))
-    params = jax.jit(task.init)(jax.random.key(0), make_example(2))
-    optimizer = optax.adam(3e-3)
-
-    @jax.jit
-    def step(params, state):
-        loss, gradient = jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(0))[0])(params)
-        update, state = optimizer.update(gradient, state)
-        return optax.apply_updates(params, update), state, loss
-
-    state, losses = optimizer.init(params), []
-    for _ in range(150):
-        params, state, loss = step(params, state)
-        losses.append(float(loss))
-    assert losses[-1] < 0.25 * losses[0]

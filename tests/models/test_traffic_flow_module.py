@@ -12,11 +12,13 @@ from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
+from tflane_jax.models.prior import HostSpec
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
     LANE_FUSIONS,
     SpatialEncoder,
     TemporalEncoder,
+    TrafficFlowConfig,
     TrafficFlowModuleConfig,
 )
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, select_traffic_flow
@@ -69,6 +71,30 @@ def test_token_sees_the_order_of_frames():
     assert not np.allclose(apply(module, params, whole), apply(module, params, back))
 
 
+@pytest.mark.parametrize(("token", "ordered"), [("mean", False), ("mean_and_ends", True)])
+def test_only_the_ends_tell_the_order_of_frames_without_ages(token, ordered):
+    module = TemporalEncoder(dataclasses.replace(CONFIG, token=token), DIM)
+    forward = tokens(2, occluded_frames="keep")
+    params = random_params(module.init, forward)
+    params["params"]["age"] = jnp.zeros_like(params["params"]["age"])
+    whole = forward.replace(frame_valid=jnp.ones_like(forward.frame_valid))
+    back = whole.replace(position=whole.position[:, ::-1], heading=whole.heading[:, ::-1])
+    a, b = (apply(module, params, t) for t in (whole, back))
+    assert np.allclose(a, b, atol=1e-5) is not ordered
+
+
+def test_sines_of_coordinates_in_metres():
+    """Wavelengths are 200, 100 and 50 m in both directions, whatever the host's range."""
+    wide = HostSpec(DIM, PerceptionRange((-90, 90)), PerceptionRange((-90, 90)))
+    prior = TrafficFlowConfig(TrafficFlowPriorConfig(coordinates="metres"), CONFIG).build(wide)
+    position = np.random.default_rng(0).uniform(-50, 50, (4, 20, 3)).astype(np.float32)
+    heading = np.zeros((4, 20, 2), np.float32)
+    encoded = prior.temporal_encoder.apply({}, position, heading, method="_where")
+    angle = 2 * np.pi * position[..., :2, None] / [200.0, 100.0, 50.0]
+    waves = [np.sin(angle).reshape(4, 20, 6), np.cos(angle).reshape(4, 20, 6)]
+    np.testing.assert_allclose(encoded, np.concatenate([*waves, position, heading], -1), atol=1e-5)
+
+
 @pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS, ("L->T",), ("L->L",), ()])
 def test_only_the_chosen_modules_exist(fusions):
     _, params, _ = spatial(dataclasses.replace(CONFIG, fusions=fusions))
@@ -113,6 +139,41 @@ def test_lane_mask_of_the_host_is_used():
     moved = apply(module, params, lanes.at[0].add(1.0), position, traffic, mask)
     np.testing.assert_array_equal(out[1:], moved[1:])
     assert not np.allclose(out[0], moved[0])
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_each_spatial_layer_passes_on_what_lanes_tell_their_neighbours(depth):
+    """Under a mask from each lane to the one before it, the first lane reaches as many lanes as there are layers."""
+    chain = jnp.eye(LANES, dtype=bool) | jnp.eye(LANES, k=-1, dtype=bool)
+    config = dataclasses.replace(CONFIG, spatial_depth=depth)
+    module, params, (lanes, position, traffic, mask) = spatial(config, lane_mask=chain)
+    out = apply(module, params, lanes, position, traffic, mask)
+    moved = apply(module, params, lanes.at[0].add(1.0), position, traffic, mask)
+    changed = (np.asarray(out) != np.asarray(moved)).any(1)
+    np.testing.assert_array_equal(changed, np.arange(LANES) <= depth)
+
+
+def test_a_fusion_without_residual_forgets_its_input():
+    """All lanes read the only instance: without residual they become equal. With no instance they keep their own."""
+    one = jnp.arange(5) < 1
+    config = dataclasses.replace(CONFIG, fusions=("L->T",))
+    module, params, arguments = spatial(dataclasses.replace(config, residual="none"), valid=one)
+    out = apply(module, params, *arguments)
+    np.testing.assert_allclose(out, jnp.broadcast_to(out[:1], out.shape), atol=1e-6)
+    kept = apply(SpatialEncoder(config, DIM), params, *arguments)
+    assert not np.allclose(kept[0], kept[1], atol=1e-2)
+
+    nobody = (*arguments[:3], SpatialMask.from_validity(LANES, jnp.zeros(5, bool)))
+    transform_only = SpatialEncoder(dataclasses.replace(config, fusions=()), DIM)
+    np.testing.assert_array_equal(apply(module, params, *nobody), apply(transform_only, params, *nobody))
+
+
+def test_point_queries_keep_the_original_once():
+    """Eq. (3) adds L_Feat after the last spatial layer, not in each."""
+    module, params, arguments = spatial(dataclasses.replace(CONFIG, spatial_depth=2, residual="none"))
+    point = SpatialEncoder(module.config, DIM, "point")
+    difference = apply(point, params, *arguments) - apply(module, params, *arguments)
+    np.testing.assert_allclose(difference, arguments[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("fusions", [ALL_FUSIONS, LANE_FUSIONS])

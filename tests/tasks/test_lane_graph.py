@@ -1,17 +1,27 @@
 """The task of lane graphs as the program around the training loop sees it."""
 
 from dataclasses import replace
+from functools import partial
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from tests.models.cases import BASELINE, make_example
+from tests.fakes import fake_prediction
+from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
+from tests.parameters import random_params
+from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.lane_groups import LANE_GROUPS
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import stack_examples
-from tflane_jax.tasks.lane_graph import LaneGraphTask, limit_instances
+from tflane_jax.scene import Prediction, stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.traffic import limit_instances
 from tflane_jax.world.bev.sensor import BevSensorConfig
 
 WIDE = PerceptionRange((-60.0, 60.0), (-30.0, 30.0))
@@ -40,3 +50,48 @@ def test_truth_beyond_the_bev_features_is_named():
 def test_limiting_instances_needs_traffic_flow():
     with pytest.raises(UserError, match="baseline without traffic flow"):
         limit_instances(LaneGraphTask(BASELINE), 3)
+
+
+def test_the_matched_control_differs_from_the_treatment_by_the_traffic_alone():
+    """The control of a comparison: the same parameters, no traffic in training and test."""
+    treatment, example = LaneGraphTask(WITH_TRAFFIC), make_example()
+    control = limit_instances(treatment, 0)
+    shapes = [jax.eval_shape(task.init, jax.random.key(0), example) for task in (treatment, control)]
+    assert shapes[0] == shapes[1]
+
+    @jax.jit
+    @partial(jax.grad, has_aux=True)
+    def learn(params, example):
+        points = control.predict(params, example).centerlines.points
+        return (points**2).sum(), points
+
+    params = random_params(treatment.init, example)
+    gradient, points = learn(params, example)
+    np.testing.assert_array_equal(points, learn(params, example.replace(traffic_flow=make_flow(7)))[1])
+    # The layers that the module adds to the queries learn; what reads the traffic stays as it was.
+    learning = {
+        name: max(float(abs(leaf).max()) for leaf in jax.tree.leaves(part))
+        for name, part in (gradient["spatial_encoder_0"] | {"temporal": gradient["temporal_encoder"]}).items()
+    }
+    assert learning.pop("temporal") == learning.pop("L_to_T") == 0.0
+    assert all(learning.values())
+
+
+def test_interventions_are_those_that_change_something():
+    data, config = stack_examples([make_example(0), make_example(1)]), EvaluationConfig(batch_size=2)
+    task = LaneGraphTask(WITH_TRAFFIC)
+    assert {name: each.traffic for name, each in task.interventions(data, config).items()} == {
+        "no traffic flow at inference": "none",
+        "traffic of another scene": "other-scene",
+    }
+    for blind in (LaneGraphTask(BASELINE), limit_instances(task, 0)):
+        assert blind.interventions(data, config) == {}
+    assert task.interventions(data, replace(config, traffic="none")) == {}
+
+
+def test_an_evaluation_keeps_recall_as_counts_by_scene(monkeypatch):
+    answer = jax.tree.map(jnp.asarray, Prediction(centerlines=fake_prediction()))
+    monkeypatch.setattr(LaneGraphTask, "predict", lambda task, params, example: answer)
+    config, task = EvaluationConfig(batch_size=2), LaneGraphTask(BASELINE)
+    evaluation = task.evaluate({}, stack_examples([make_example()]), config)
+    assert {f"{group}/recall" for group in ("all", *LANE_GROUPS)} < set(evaluation.ratios) < set(evaluation.scores())

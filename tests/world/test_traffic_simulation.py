@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from tests.world.crossroads import REACH, STOP, crossroads
 from tflane_jax.scene import RoadUser
+from tflane_jax.world.presets import CITY, STREET
 from tflane_jax.world.roads.networks import RoadConfig, build_road_network
 from tflane_jax.world.traffic.lane_table import build_lane_table
 from tflane_jax.world.traffic.pedestrians import walk_sidewalks
@@ -21,7 +22,9 @@ EMPTY = TrafficConfig(
     vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0
 )
 BUSY = replace(TrafficConfig(), vehicles_per_metre=0.05, range=1e3)
-NETWORKS = ["crossroads", "crossroads yield", "turn", 0, 4, 5, 9]
+PRESETS = {"city": CITY, "street": STREET}
+HAND_MADE = ["crossroads", "crossroads yield", "turn"]
+NETWORKS = [*HAND_MADE, 0, 4, 5, 9, ("city", 1), ("city", 4), ("street", 1), ("street", 2)]
 
 
 @functools.cache
@@ -33,6 +36,9 @@ def scene(which, frames=80):
     }
     if which in hand_made:
         network, config = hand_made[which](), BUSY
+    elif isinstance(which, tuple):
+        world = PRESETS[which[0]]
+        network, config = build_road_network(np.random.default_rng([which[1]]), world.roads), world.traffic
     else:
         network, config = build_road_network(np.random.default_rng([which]), RoadConfig()), TrafficConfig()
     return network, simulate_traffic(np.random.default_rng([7]), network, config, frames=frames, rate_hz=RATE)
@@ -150,6 +156,29 @@ def test_traffic_is_settled_in_the_first_frame():
     assert np.mean(early) == pytest.approx(np.mean(late), rel=0.25)
 
 
+def test_variety_spreads_the_amounts_and_keeps_the_means():
+    network = crossroads("signals")
+    counts = {0.0: [], 0.8: []}
+    for variety, found in counts.items():
+        config = replace(BUSY, variety=variety, vehicles_per_metre=0.02)
+        for seed in range(60):
+            traffic = simulate_traffic(np.random.default_rng([seed]), network, config, frames=2, rate_hz=RATE)
+            found.append((traffic.present[0] & (traffic.category <= RoadUser.MOTORCYCLE)).sum())
+    plain, varied = counts.values()
+    assert np.mean(varied) == pytest.approx(np.mean(plain), rel=0.25)
+    assert np.std(varied) > 1.5 * np.std(plain)
+
+
+@pytest.mark.parametrize("when", [4.0, 7.0])
+def test_the_ego_vehicle_passes_the_middle_of_its_way_in_time(when):
+    network, config = crossroads("yield"), replace(EMPTY, ego_passes_s=when, ego_top_speed=6.0)
+    for seed in range(5):
+        traffic = simulate_traffic(np.random.default_rng([seed]), network, config, frames=90, rate_hz=RATE)
+        at = traffic.ego[round(when * RATE), :2]
+        # It aims at up to 20 m from the middle, and slows down for the junction there.
+        assert np.hypot(*at) < 30.0
+
+
 def test_no_traffic_leaves_the_ego_vehicle_alone():
     network = crossroads("yield")
     traffic = simulate_traffic(np.random.default_rng([1]), network, EMPTY, frames=30, rate_hz=RATE)
@@ -208,3 +237,10 @@ def test_networks_without_lights_have_no_red():
     table = build_lane_table(crossroads("yield"))
     signals = draw_signals(np.random.default_rng(0), table)
     assert not signals.red(table, 3.0).any()
+
+
+def test_more_bicycles_than_a_lane_takes_enter_at_its_capacity():
+    network = build_road_network(np.random.default_rng([0]), RoadConfig(bike=1.0))
+    crowded = replace(EMPTY, bicycles_per_metre=0.5)
+    traffic = simulate_traffic(np.random.default_rng([7]), network, crowded, frames=10, rate_hz=RATE)
+    assert (traffic.category == RoadUser.BICYCLE).any()

@@ -13,8 +13,11 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tflane_jax.ablations.declaration import Declaration, check, declare
+from tflane_jax.ablations.effects import save_effects
 from tflane_jax.ablations.jobs import Failure, Job, Tests, plan_jobs
-from tflane_jax.ablations.report import Results, save_report
+from tflane_jax.ablations.report import save_report, suffixes
+from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
 from tflane_jax.ablations.workers import noted, train_all, worker_threads
 from tflane_jax.config import RunConfig
@@ -32,13 +35,14 @@ def compare(
     jobs: int = 1,
     tests: Tests | None = None,
     retrain: bool = False,
+    declaration: Declaration | None = None,
 ) -> Path:
     """Train what is not trained yet, evaluate on the test sets, print and save tables and pictures.
 
     Every run is evaluated at its last step, which is the primary result because no selection favours a model, and at
-    its best one by `training.best_metric` on the validation split. A model that can be used in several ways (with and
-    without traffic flow at inference) gets a row for each. A training that fails does not stop the others: the tables
-    hold the complete runs, and paired tests the seeds that all models have.
+    its best one by `training.best_metric` on the validation split. A model with interventions (without traffic flow at
+    inference, with that of another scene) gets a row for each, evaluated from the same runs. A training that fails does
+    not stop the others: the tables hold the complete runs, and paired tests the seeds that all models have.
 
     Args:
         configs: by the name that the table shows; the first one is the control.
@@ -47,17 +51,22 @@ def compare(
         jobs: trainings at a time, each on as many cores as the others.
         tests: further test sets by name: settings, `--data.name value`, that differ from the own test split.
         retrain: whether runs of other configurations in the folders are deleted and trained anew.
+        declaration: what is tested. It is written to `declaration.json` before the trainings, and the report gets a
+            table of these tests alone, `effects.md`.
 
     Returns:
         The Markdown file with the table of the configurations' own test split.
 
     Raises:
-        UserError: the configurations do not test on the same examples; a folder holds a run of another configuration;
-            or trainings failed, after the tables of the others were written.
+        UserError: the configurations do not test on the same examples; a folder holds a run of another configuration,
+            or another declaration; or trainings failed, after the tables of the others were written.
     """
     tests = dict(tests or {})
     _check_tests(configs, tests)
+    if declaration is not None:
+        check(declaration, configs)
     plan = plan_jobs(configs, seeds, out, threads=worker_threads(jobs), tests=tests, retrain=retrain)
+    declared = None if declaration is None else declare(declaration, plan, seeds, out)
     # Seed by seed, so that a comparison stopped early has pairs.
     every = [plan[name][i] for i in range(len(seeds)) for name in plan]
     failures = train_all(every, jobs)
@@ -79,6 +88,9 @@ def compare(
         source = first.data.source("test")
         written.append(first.task.draw_comparison(models, source, load_test_data(first), out / "comparison.png"))
     tables = save_report(results, first.task, remarks, out)
+    if declared is not None:
+        for test, suffix in suffixes(results).items():
+            tables += save_effects(results, declared, test, first.task.errors, out / f"effects{suffix}")
     print("\nwritten:", *tables, *written, sep="\n  ")
     if failures:
         raise UserError(_summary(failures, len(every)))

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +21,7 @@ from tflane_jax.ablations.jobs import Job
 from tflane_jax.config import RunConfig, apply_overrides
 from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import SceneRatio
 from tflane_jax.files.atomic import write_json
 from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.training.checkpoint import Checkpoints
@@ -39,12 +40,14 @@ class Measured:
     Attributes:
         step: of the checkpoint.
         protocol: of the metrics, with its version.
-        ways: scores of each way to use the run: "" as trained, others as `Task.inference_variants` names them.
+        ways: scores of each way to use the run: "" as trained, others as `Task.interventions` names them.
+        ratios: parts of the scores that are ratios of counts, by way and score.
     """
 
     step: int
     protocol: str
     ways: dict[str, Scores]
+    ratios: dict[str, dict[str, SceneRatio]]
 
 
 def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
@@ -99,13 +102,27 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
     if mark not in kept:
         run = open_run(job.folder, step)
         task = run.config.task
-        data, ways = load_test_data(config), {"": task} | task.inference_variants()
-        found = {way: used.evaluate(run.params[0], data, config.evaluation) for way, used in ways.items()}
-        scores = {way: evaluation.scores() for way, evaluation in found.items()}
-        kept[mark] = {"code": code_digest(), "step": step, "protocol": found[""].protocol, "ways": scores}
+        data = load_test_data(config)
+        ways = {"": config.evaluation} | task.interventions(data, config.evaluation)
+        found = {way: task.evaluate(run.params[0], data, evaluation) for way, evaluation in ways.items()}
+        kept[mark] = {
+            "code": code_digest(),
+            "step": step,
+            "protocol": found[""].protocol,
+            "ways": {way: evaluation.scores() for way, evaluation in found.items()},
+            "ratios": {way: _counts(evaluation.ratios) for way, evaluation in found.items()},
+        }
         write_json(path, kept)
     entry = kept[mark]
-    return Measured(entry["step"], entry["protocol"], entry["ways"])
+    ratios = {
+        way: {name: SceneRatio(*map(tuple, counts)) for name, counts in of_way.items()}
+        for way, of_way in entry["ratios"].items()
+    }
+    return Measured(entry["step"], entry["protocol"], entry["ways"], ratios)
+
+
+def _counts(ratios: Mapping[str, SceneRatio]) -> dict[str, list[list[int]]]:
+    return {name: [list(ratio.numerator), list(ratio.denominator)] for name, ratio in ratios.items()}
 
 
 def _mark(**parts: Any) -> str:
@@ -117,7 +134,7 @@ def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     with contextlib.suppress(FileNotFoundError, ValueError):
         content = json.loads(path.read_text(encoding="utf-8"))
         for mark, entry in content.items() if isinstance(content, dict) else ():
-            if isinstance(entry, dict) and entry.keys() >= {"code", "step", "protocol", "ways"}:
+            if isinstance(entry, dict) and entry.keys() >= {"code", "step", "protocol", "ways", "ratios"}:
                 yield mark, entry
 
 

@@ -1,4 +1,4 @@
-"""Paired tests over seeds, and the correction of p-values for several tests."""
+"""Paired tests over seeds, the correction of p-values for several tests, and bootstrap samples of scenes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
 @dataclass(frozen=True)
@@ -67,3 +67,34 @@ def holm(p_values: Sequence[float]) -> list[float]:
     corrected = np.full(values.shape, math.nan)
     corrected[order] = np.maximum.accumulate(np.minimum(factors * values[order], 1.0))
     return corrected.tolist()
+
+
+def scene_weights(scenes: int, samples: int, *, seed: int = 0) -> Int[np.ndarray, "b c"]:
+    """Return bootstrap samples of scenes: how often each scene is drawn when as many are drawn with replacement.
+
+    Scenes, not frames: frames of one drive are alike, so intervals over frames would be far too narrow.
+    """
+    return np.random.default_rng(seed).multinomial(scenes, np.full(scenes, 1.0 / scenes), samples)
+
+
+def resampled_ratio(
+    numerators: Int[np.ndarray, "s c"], denominator: Int[np.ndarray, " c"], weights: Int[np.ndarray, "b c"]
+) -> Float[np.ndarray, " b"]:
+    """Return a ratio of sums over scenes, such as recall, in each bootstrap sample; the mean over seeds.
+
+    Args:
+        numerators: of each seed and scene.
+        denominator: of each scene; the same for all seeds.
+        weights: see `scene_weights`.
+
+    Returns:
+        Ratios; 0 where a sample has nothing to count.
+    """
+    total = weights @ np.asarray(denominator)
+    return weights @ np.asarray(numerators).mean(0) / np.maximum(total, 1)
+
+
+def interval(samples: Float[np.ndarray, " b"], level: float = 0.95) -> tuple[float, float]:
+    """Return the percentile interval of bootstrap samples."""
+    low, high = np.quantile(samples, [(1 - level) / 2, (1 + level) / 2])
+    return float(low), float(high)

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from tflane_jax.ablations.declaration import Declaration
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.errors import UserError
@@ -17,7 +18,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Train, evaluate and compare."""
     from tflane_jax.ablations.compare import compare
 
-    references = dict(_named(reference) for reference in options.configs)
+    rows = [_named(argument) for argument in options.configs]
+    references = {name: (reference, settings) for name, reference, settings in rows}
     if len(references) < len(options.configs):
         raise UserError("two of the configurations have the same name: write NAME=FILE to tell them apart")
     if len(set(options.seeds)) < len(options.seeds):
@@ -25,7 +27,10 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if options.jobs < 1:
         raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
     configure_jax()
-    configs = {name: apply_overrides(load_config(path), overrides) for name, path in references.items()}
+    configs = {
+        name: apply_overrides(load_config(reference), [*overrides, *settings])
+        for name, (reference, settings) in references.items()
+    }
     compare(
         configs,
         options.seeds,
@@ -33,6 +38,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         jobs=options.jobs,
         tests=_test_sets(options.test),
         retrain=options.retrain,
+        declaration=_declaration(options, list(configs)),
     )
     return 0
 
@@ -50,10 +56,28 @@ def _test_sets(arguments: Sequence[str]) -> dict[str, list[str]]:
     return tests
 
 
-def _named(reference: str) -> tuple[str, str]:
-    """Return name and reference of [NAME=]FILE[:ABLATION]; the default name is that of the ablation or file."""
-    name, separator, path = reference.partition("=")
-    if separator:
-        return name, path
-    path, ablation = split_reference(reference)
-    return ablation or Path(path).stem, reference
+def _declaration(options: argparse.Namespace, names: Sequence[str]) -> Declaration | None:
+    """Return what is tested, from --primary and the options that belong to it; None without --primary."""
+    if options.primary is None:
+        for option in ("treatment", "negative_control", "alpha"):
+            if getattr(options, option) is not None:
+                raise UserError(f"--{option.replace('_', '-')} belongs to a declared comparison: add --primary")
+        return None
+    if options.treatment is None and len(names) != 2:
+        raise UserError("--treatment NAME: say which configuration's effect --primary tests")
+    treatment = names[1] if options.treatment is None else options.treatment
+    alpha = 0.05 if options.alpha is None else options.alpha
+    return Declaration(options.primary, treatment, options.negative_control, alpha)
+
+
+def _named(argument: str) -> tuple[str, str, list[str]]:
+    """Return name, reference and settings of [NAME=]FILE[:ABLATION][ --setting value ...].
+
+    The default name is that of the ablation or file.
+    """
+    row, dashes, settings = argument.partition(" --")
+    name, separator, reference = row.partition("=")
+    if not separator:
+        path, ablation = split_reference(row)
+        name, reference = ablation or Path(path).stem, row
+    return name, reference.strip(), shlex.split(dashes + settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tflane_jax.commands.sources import chosen_source, limited_task, opened
+from tflane_jax.commands.sources import chosen_source, limited_task, opened, with_chosen_traffic
 from tflane_jax.config_io import to_json
 from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
@@ -20,12 +20,15 @@ def run(options: argparse.Namespace) -> int:
     trained, rest = opened(options)
     if rest:
         raise UserError(f"tflane eval takes one run: leave {rest[0]} out")
+    trained = with_chosen_traffic(trained, options)
     source = chosen_source(trained.config, options)
     protocol, rows = evaluate_run(trained, source, task=limited_task(trained, options))
 
     name = f"{source_name(source)}-step{trained.step}"
     if options.max_instances is not None:
         name += f"-max_instances{options.max_instances}"
+    if (traffic := trained.config.evaluation.traffic) != "own":
+        name += f"-traffic_{traffic.replace('-', '_')}"
     title = f"{trained.name}, {name}: {protocol}"
     print(format_table(rows, title=title))
     meta = {
@@ -33,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
         "step": trained.step,
         "protocol": protocol,
         "max_instances": options.max_instances,
+        "traffic": traffic,
         "source": to_json(source),
     }
     folder = Path("runs" if options.config else trained.name) / "evaluations"

@@ -14,8 +14,9 @@ from tflane_jax.datasets.sources import SOURCES, named_source, source_names, sou
 from tflane_jax.errors import UserError
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
-from tflane_jax.tasks.lane_graph import LaneGraphTask, limit_instances
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.tasks.traffic import limit_instances
 
 _KINDS = {Example: "lane graphs", RoadImage: "images"}
 
@@ -42,6 +43,17 @@ def limited_task(run: Run, options: argparse.Namespace) -> Any:
     if not isinstance(run.config.task, LaneGraphTask):
         raise UserError("--max-instances limits traffic flow, and this model takes none")
     return limit_instances(run.config.task, options.max_instances)
+
+
+def with_chosen_traffic(run: Run, options: argparse.Namespace) -> Run:
+    """Return the run evaluated with the traffic flow of --traffic; raise UserError for a model that takes none."""
+    if options.traffic is None:
+        return run
+    task = run.config.task
+    if not isinstance(task, LaneGraphTask) or task.model.priors.traffic_flow is None:
+        raise UserError("--traffic changes the traffic flow that a model sees, and this model takes none")
+    evaluation = replace(run.config.evaluation, traffic=options.traffic)
+    return replace(run, config=replace(run.config, evaluation=evaluation))
 
 
 def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split | None = None) -> Any:

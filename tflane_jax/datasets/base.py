@@ -7,6 +7,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.markers.simulation import MarkerConfig
@@ -37,6 +38,9 @@ class ExampleConfig:
         segments, segment_points: lane segments and points on each.
         areas, area_points: crossings with road boundaries and points on each.
         history: frames N of traffic flow before the key frame.
+        history_hz: rate of these frames: at 2 Hz, 20 frames look back 10 s, and the latest is 0.5 s before the key
+            frame, as in nuScenes and OpenLane-V2. It must divide the rate of the log's tracks. None takes every track
+            frame: 2 s at the 10 Hz of the built-in world and of Argoverse 2.
         tracks: instances K of traffic flow.
         elements: traffic lights and signs.
         bike_lanes: whether bicycle lanes are ground truth.
@@ -54,6 +58,7 @@ class ExampleConfig:
     areas: int = 32
     area_points: int = 20
     history: int = 20
+    history_hz: float | None = None
     tracks: int = 96
     elements: int = 24
     bike_lanes: Literal["include", "exclude"] = "include"
@@ -63,6 +68,22 @@ class ExampleConfig:
     def ground(self) -> PerceptionRange:
         """The ground area that the rasters of an example and its pictures cover."""
         return BevGrid().range if self.sensor is None else self.sensor.grid.range
+
+    def history_stride(self, rate_hz: float) -> int:
+        """Return every how many track frames of a log with this rate the history has one.
+
+        Raises UserError if `history_hz` does not divide the rate up to 5 %, the jitter of real timestamps.
+        """
+        if self.history_hz is None:
+            return 1
+        ratio = rate_hz / self.history_hz if self.history_hz > 0.0 else 0.0
+        stride = round(ratio)
+        if stride < 1 or abs(ratio - stride) > 0.05 * stride:
+            raise UserError(
+                f"history_hz = {self.history_hz:g} does not divide the {rate_hz:.3g} Hz of the log's tracks: choose "
+                f"{rate_hz:.3g} / n for a whole n, or None for every frame"
+            )
+        return stride
 
 
 class TruncationWarning(UserWarning):

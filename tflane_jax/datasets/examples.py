@@ -21,15 +21,17 @@ from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
 from tflane_jax.world.roads.sd_map import make_sd_map
 
 
-def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int) -> tuple[TrafficFlow, int]:
-    """Return the tracks of the `history` frames before the key frame, and how many exceeded the capacity.
+def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int, stride: int = 1) -> tuple[TrafficFlow, int]:
+    """Return the tracks in `history` frames before the key frame, and how many exceeded the capacity.
 
-    The log holds each frame's boxes in the ego frame of that frame; TF-Lane Eq. (1) moves them into the ego frame of
-    the key frame. Where the log starts later, the first frames of the result are invalid. Of more instances than
-    `capacity`, those whose nearest position is farthest are left out.
+    The frames are `stride` track frames apart, the latest one `stride` before the key frame. The log holds each frame's
+    boxes in the ego frame of that frame; TF-Lane Eq. (1) moves them into the ego frame of the key frame. Where the log
+    starts later, the first frames of the result are invalid. Of more instances than `capacity`, those whose nearest
+    position is farthest are left out.
     """
     moment, tracks = log.keyframes[keyframe], log.tracks
-    frames = np.arange(max(moment.track_frame - history, 0), moment.track_frame)
+    frames = np.arange(moment.track_frame - history * stride, moment.track_frame, stride)
+    frames = frames[frames >= 0]
     flow = TrafficFlow.empty(capacity, history)
     found = np.flatnonzero(tracks.valid[frames].any(0))
     if not len(found):
@@ -115,7 +117,8 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         capacity=config.elements,
         seen=None if rig is None else visible_elements(log, keyframe, rig),
     )
-    flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks)
+    stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)
+    flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks, stride=stride)
     sd_map, lines_dropped = (None, 0) if config.sd_map is None else make_sd_map(log, keyframe, config.sd_map)
     _warn_dropped(
         config,

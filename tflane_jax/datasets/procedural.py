@@ -15,10 +15,13 @@ from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
+from tflane_jax.world.bev.sensor import BevSensorConfig
 from tflane_jax.world.cameras.ring import CameraRigConfig
-from tflane_jax.world.simulate import WorldConfig, simulate
+from tflane_jax.world.presets import CITY, STREET
+from tflane_jax.world.simulate import HISTORY, WorldConfig, simulate
 
 # Scene ids of a split: [first, first + SCENES_PER_SPLIT).
 SCENES_PER_SPLIT = 100_000_000
@@ -82,12 +85,16 @@ class ProceduralDataset:
         return FIRST_SCENE[self.config.split] + self.config.first + index // self.config.world.keyframes
 
     def _frame(self, index: int) -> tuple[Log, int]:
-        return _simulated(self.scene_id(index), self.config.world), index % self.config.world.keyframes
+        world, example = self.config.world, self.config.example
+        history = HISTORY
+        if example.history_hz is not None:
+            history = example.history * example.history_stride(world.rate_hz)
+        return _simulated(self.scene_id(index), world, history), index % world.keyframes
 
 
 @functools.lru_cache(maxsize=4)
-def _simulated(scene_id: int, config: WorldConfig) -> Log:
-    return simulate(scene_id, config)
+def _simulated(scene_id: int, config: WorldConfig, history: int) -> Log:
+    return simulate(scene_id, config, history)
 
 
 @dataclass(frozen=True)
@@ -110,9 +117,35 @@ class WorldData:
         """Return the dataset of a split."""
         return ProceduralConfig(split, scenes=getattr(self, split), world=self.world, example=self.example)
 
+    @classmethod
+    def city(cls, train: int = 1000, val: int = 25, test: int = 150) -> WorldData:
+        """Return the preset `city`: every kind of junction, perceived within +-50 m x +-25 m."""
+        return cls(train, val, test, CITY, CITY_EXAMPLE)
+
+    @classmethod
+    def street(cls, train: int = 1000, val: int = 25, test: int = 150) -> WorldData:
+        """Return the preset `street`: simple roads, perceived within +-30 m x +-15 m.
+
+        The host must perceive the same box: `task.model.range` equal to `STREET_EXAMPLE.range`, and
+        `task.model.encoder.range` equal to `STREET_EXAMPLE.ground`.
+        """
+        return cls(train, val, test, STREET, STREET_EXAMPLE)
+
+
+CITY_EXAMPLE = ExampleConfig(history_hz=2.0, tracks=192)
+"""20 frames at 2 Hz, so 10 s."""
+STREET_EXAMPLE = replace(
+    CITY_EXAMPLE,
+    range=PerceptionRange((-30.0, 30.0), (-15.0, 15.0)),
+    # Cells of 0.48 m; 64 x 128 can be halved four times and more.
+    sensor=BevSensorConfig(grid=BevGrid(PerceptionRange((-30.72, 30.72), (-15.36, 15.36)), rows=64, columns=128)),
+)
+"""The same history; MapTR's box, and a raster that extends it by half a feature cell, as that of `city` does."""
+
 
 # Scenes of --data procedural and world-cameras where the configuration has other data.
 _SCENES = 100
+_PRESET = (_SCENES, _SCENES, _SCENES)
 
 
 def _choose(choice: Choice) -> ProceduralConfig:
@@ -146,3 +179,5 @@ SOURCE = DataSource(
 )
 CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
 """The same world with a ring of cameras, under a name of its own for `tflane data show`."""
+CITY_SOURCE = replace(SOURCE, name="city", choose=lambda choice: WorldData.city(*_PRESET).source(choice.split))
+STREET_SOURCE = replace(SOURCE, name="street", choose=lambda choice: WorldData.street(*_PRESET).source(choice.split))

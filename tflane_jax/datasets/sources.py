@@ -14,6 +14,8 @@ from tflane_jax.scene import Example, RoadImage
 SOURCES: tuple[DataSource[Any], ...] = (
     procedural.SOURCE,
     procedural.CAMERAS,
+    procedural.CITY_SOURCE,
+    procedural.STREET_SOURCE,
     argoverse2.SOURCE,
     openlane_v2.SOURCE,
     front_views.SOURCE,

@@ -2,26 +2,33 @@
 
 | predicted part | protocol | groups of numbers |
 |---|---|---|
-| `centerlines` (with `elements`) | OpenLane-V2 centerline | all, occluded, clear; seen, gap, before for markers |
+| `centerlines` (with `elements`) | OpenLane-V2 centerline | all, occluded, clear; those of `lane_groups`; seen, gap, |
+| | | before for markers |
 | `segments` | OpenLane-V2 lane segment; LaneSegNet | segments; lanesegnet |
 | `lines` | MapTR | lines |
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 from scipy.special import expit
 
+from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.evaluation.centerlines import detections_from_prediction, element_detections, truth_from_example
+from tflane_jax.evaluation.interventions import with_traffic
+from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups
 from tflane_jax.evaluation.lane_segments import segment_detections, segment_truth
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
-from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
 from tflane_jax.evaluation.vector_maps import map_detections, map_lines, map_truth
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
@@ -35,7 +42,8 @@ class LaneGraphMetrics:
 
     Args:
         versions: versions of the OpenLane-V2 centerline metrics.
-        frame_groups: names of the groups of frames, see `GroupedCenterlineMetrics`.
+        frame_groups, lane_groups: names of the groups of frames and of further groups of lanes, see
+            `GroupedCenterlineMetrics`.
         parts: predicted parts that are measured as long as no frame was seen.
     """
 
@@ -44,8 +52,12 @@ class LaneGraphMetrics:
         versions: Sequence[Version] = ("v2.1",),
         frame_groups: Sequence[str] = (),
         parts: Sequence[str] = ("centerlines",),
+        lane_groups: Sequence[str] = (),
     ) -> None:
-        self._centerlines = GroupedCenterlineMetrics(versions=versions, frame_groups=frame_groups)
+        self._centerlines = GroupedCenterlineMetrics(
+            versions=versions, frame_groups=frame_groups, lane_groups=lane_groups
+        )
+        self._continues: list[bool] = []  # whether a frame belongs to the scene of the frame before
         self._segments = {"segments": LaneSegmentMetrics("OpenLane-V2"), "lanesegnet": LaneSegmentMetrics("LaneSegNet")}
         self._lines = VectorMapMetrics()
         self._measured = tuple(parts)
@@ -55,13 +67,20 @@ class LaneGraphMetrics:
         """Names and versions of the protocols that apply."""
         return "; ".join(metrics.protocol for metrics in self._applied().values())
 
-    def update(self, prediction: Prediction, example: Example, frame_group: str | None = None) -> None:
-        """Add one frame.
+    def update(
+        self,
+        prediction: Prediction,
+        example: Example,
+        frame_group: str | None = None,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
+    ) -> None:
+        """Add one frame; the frames of a scene come in succession.
 
         Args:
             prediction: the last decoder layer's prediction for this example.
             example: ground truth of all predicted parts. Traffic elements are measured if both have them.
             frame_group: the group that this frame belongs to.
+            members: for each of `lane_groups`, which of the valid true lanes belong to it.
 
         Raises:
             ValueError: no protocol measures any predicted part.
@@ -70,11 +89,12 @@ class LaneGraphMetrics:
         if not parts:
             raise ValueError("this task predicts no lanes, so there is nothing to measure")
         self._measured = parts
+        self._continues.append(bool(example.has_previous))
         both = prediction.elements is not None and example.traffic_elements is not None
         found, true = (prediction.elements, example.traffic_elements) if both else (None, None)
         if prediction.centerlines is not None:
             detections = detections_from_prediction(prediction.centerlines, found)
-            self._centerlines.update(detections, truth_from_example(example.lanes, true), frame_group)
+            self._centerlines.update(detections, truth_from_example(example.lanes, true), frame_group, members)
         if prediction.segments is not None:
             self._update_segments(prediction.segments, found, true, example)
         if prediction.lines is not None:
@@ -110,6 +130,17 @@ class LaneGraphMetrics:
             groups |= metrics.compute() if name == "centerlines" else {name: metrics.compute()}
         return groups
 
+    def ratios(self) -> dict[str, SceneRatio]:
+        """Return the recall of every group of centerlines as hits and lanes of each scene."""
+        if "centerlines" not in self._measured or not self._continues:
+            return {}
+        scene = np.cumsum(~np.array([True, *self._continues[1:]]))
+        ratios = {}
+        for group, counts in self._centerlines.recalled().items():
+            lanes, hits = (np.bincount(scene, column).astype(int).tolist() for column in counts.T)
+            ratios[f"{group}/recall"] = SceneRatio(tuple(hits), tuple(len(LANE_THRESHOLDS) * n for n in lanes))
+        return ratios
+
     def _applied(self) -> dict[str, Any]:
         """Return the accumulators that apply, by the part that they measure."""
         applied: dict[str, Any] = {"centerlines": self._centerlines} if "centerlines" in self._measured else {}
@@ -135,33 +166,58 @@ def _true_lines(example: Example) -> MapTruth:
 
 
 def evaluate_lanes(
-    task: Predictor, params: Params, arrays: Example | Streamed, config: EvaluationConfig | None = None
+    task: Predictor,
+    params: Params,
+    arrays: Example | Streamed,
+    config: EvaluationConfig | None = None,
+    *,
+    ground: PerceptionRange | None = None,
 ) -> LaneGraphMetrics:
     """Return the filled accumulator of a dataset.
 
-    Frames of examples with markers are grouped by marker visibility as well, see `Sightings`.
+    Frames of examples with markers are grouped by marker visibility as well, see `Sightings`. Lanes of examples with
+    BEV evidence and traffic flow are grouped by both, see `evaluation.lane_groups`, whatever traffic the model sees.
 
     Args:
         task: a model that predicts lanes of any kind.
         params: its parameters.
         arrays: examples with ground truth, see `datasets.batches`.
-        config: batch size and versions.
+        config: batch size, versions, and traffic flow that the model sees.
+        ground: the range that the BEV evidence covers; None for a model that does not see it, without those groups.
 
     Raises:
         ValueError: the task predicts no lanes.
+        UserError: the examples do not allow the configured traffic flow, see `with_traffic`.
     """
     config = config or EvaluationConfig()
     sightings, metrics = Sightings(), LaneGraphMetrics(config.versions)
-    for number, (indices, batch, answer) in enumerate(predicted_batches(task, params, arrays, config.batch_size)):
-        if number == 0 and batch.markers is not None:
-            metrics = LaneGraphMetrics(config.versions, sightings.groups)
+    changed = with_traffic(arrays, config.traffic)
+    predicted = predicted_batches(task, params, changed, config.batch_size)
+    originals = None if changed is arrays else ordered_batches(arrays, config.batch_size)
+    for number, (indices, batch, answer) in enumerate(predicted):
+        if originals is not None:
+            _, batch = next(originals)
+        if number == 0:
+            metrics = LaneGraphMetrics(
+                config.versions,
+                () if batch.markers is None else sightings.groups,
+                lane_groups=() if _members(batch, 0, ground) is None else LANE_GROUPS,
+            )
         for row in range(len(indices)):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
             group = None
             if batch.markers is not None:
                 group = sightings.next(batch.markers.valid[row].any(), batch.has_previous[row])
-            metrics.update(prediction, example, group)
+            metrics.update(prediction, example, group, _members(batch, row, ground))
     return metrics
+
+
+def _members(batch: Example, row: int, ground: PerceptionRange | None) -> dict[str, Bool[np.ndarray, " g"]] | None:
+    """Return the lane groups of one example; None without a raster, its range, or traffic flow."""
+    if ground is None or batch.bev is None or batch.traffic_flow is None:
+        return None
+    lanes, flow = jax.tree.map(lambda leaf: leaf[row], (batch.lanes, batch.traffic_flow))
+    return lane_groups(lanes, np.asarray(batch.bev[row]), flow, ground)
 
 
 def _labels(batch: Example) -> Example:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from tflane_jax.metrics.topology import Version
+
+Traffic = Literal["own", "none", "other-scene"]
+"""Traffic flow at inference: that of the frame, none, or that of a frame of another scene."""
 
 
 @dataclass(frozen=True)
@@ -17,11 +21,25 @@ class EvaluationConfig:
         pictures: number of validation examples that are drawn, spread evenly over the split.
         versions: versions of OpenLane-V2's metrics. Columns of the first one have no version in their names; the others
             add columns for metrics that differ, such as "OLS_v1.0".
+        traffic: traffic flow that the model sees: that of the frame, none, or that of a frame of another scene.
     """
 
     batch_size: int = 16
     pictures: int = 4
     versions: tuple[Version, ...] = ("v2.1",)
+    traffic: Traffic = "own"
+
+
+@dataclass(frozen=True)
+class SceneRatio:
+    """A score that is the ratio of two sums over scenes, for bootstraps over scenes.
+
+    Attributes:
+        numerator, denominator: of each scene; the score is the ratio of their sums.
+    """
+
+    numerator: tuple[int, ...]
+    denominator: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -32,11 +50,13 @@ class Evaluation:
         protocol: name and version of the metrics.
         groups: metrics by name, for each measured group ("all", "occluded", ...).
         counts: names of the entries that are counts, not scores.
+        ratios: parts of the scores that are ratios of counts, by "group/name".
     """
 
     protocol: str
     groups: Mapping[str, Mapping[str, float]]
     counts: tuple[str, ...] = ("frames", "lanes")
+    ratios: Mapping[str, SceneRatio] = field(default_factory=dict)
 
     def scores(self) -> dict[str, float]:
         """Return the scores by "group/name", without counts. Runs record them and rate checkpoints by them."""

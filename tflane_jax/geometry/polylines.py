@@ -32,10 +32,18 @@ def resample(points: Float[AnyArray, "n d"], count: int) -> Float[np.ndarray, "c
     return sample_at(points, np.linspace(0.0, arc_length(points)[-1], count))
 
 
-def sample_at(points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"]) -> Float[np.ndarray, "k d"]:
-    """Return the points at the given ground-plane distances along the line, clamped to its ends."""
+def sample_at(
+    points: Float[AnyArray, "n d"], distances: Float[AnyArray, " k"], along: Float[np.ndarray, " n"] | None = None
+) -> Float[np.ndarray, "k d"]:
+    """Return the points at the given ground-plane distances along the line, clamped to its ends.
+
+    Args:
+        points: of the line.
+        distances: metres.
+        along: `arc_length(points)`, if the caller has it.
+    """
     points = np.asarray(points)
-    along = arc_length(points)
+    along = arc_length(points) if along is None else along
     if len(points) == 1 or along[-1] == 0.0:
         return np.repeat(points[:1], len(distances), axis=0)
     distances = np.clip(distances, 0.0, along[-1])
@@ -84,50 +92,85 @@ def clip_to_range(points: Float[AnyArray, "n d"], range_: PerceptionRange) -> li
     interpolated). A line wholly outside, or only touching the border at a point, gives no piece.
     """
     points = np.asarray(points, np.float64)
-    if len(points) > 1 and range_.contains(points).all():
-        # The common case, several times faster than the general one below.
+    if len(points) < 2:
+        return []
+    within = range_.contains(points)
+    if within.all():
         return [points] if _has_length(points) else []
-    a, b = points[:-1], points[1:]
-    enter, leave, inside = _inside_interval(a, b, range_)
-    enter_point, leave_point = (_on_segment(a, b, t, range_) for t in (enter, leave))
-    # A segment continues the piece of the one before it unless the line left the box in between.
-    continues = inside[1:] & inside[:-1] & (leave[:-1] == 1.0) & (enter[1:] == 0.0)
-    starts = np.flatnonzero(inside & ~np.concatenate([[False], continues]))
-    stops = np.flatnonzero(inside & ~np.concatenate([continues, [False]])) + 1
-    pieces = [np.concatenate([enter_point[i : i + 1], leave_point[i:j]]) for i, j in zip(starts, stops, strict=True)]
-    return [p for p in pieces if _has_length(p)]
+    both = within[:-1] & within[1:]
+    # Of the other segments, only those can meet the box that do not lie beyond one of its four borders.
+    (x0, x1), (y0, y1) = range_.x, range_.y
+    x, y = points[:, 0], points[:, 1]
+    beyond = np.stack([x < x0, x > x1, y < y0, y > y1])
+    cut = {}
+    for i in np.flatnonzero(~(both | (beyond[:, :-1] & beyond[:, 1:]).any(0))).tolist():
+        if (ends := _cut(points[i], points[i + 1], range_)) is not None:
+            cut[i] = ends
+    return [p for p in _pieces(points, both, cut) if _has_length(p)]
+
+
+def _pieces(
+    points: np.ndarray, both: np.ndarray, cut: dict[int, tuple[np.ndarray, np.ndarray, bool, bool]]
+) -> list[np.ndarray]:
+    """Return the pieces of a line inside the box.
+
+    Args:
+        points: the line.
+        both: for each segment, whether both of its ends are inside.
+        cut: by number, the segments that the border cuts: where they enter and leave, and whether these are their ends.
+    """
+    pieces: list[list[np.ndarray]] = []
+    i, count, goes_on = 0, len(both), False
+    stops = np.append(np.flatnonzero(~both), count)
+    while i < count:
+        if both[i]:
+            # A run of segments inside: all of its vertices at once.
+            j = int(stops[np.searchsorted(stops, i)])
+            start, inner, begins, ends = points[i : i + 1], points[i + 1 : j + 1], True, True
+        elif i in cut:
+            (enter, leave, begins, ends), j = cut[i], i + 1
+            start, inner = enter[None], leave[None]
+        else:
+            i, goes_on = i + 1, False
+            continue
+        if not (goes_on and begins):
+            pieces.append([start])
+        pieces[-1].append(inner)
+        i, goes_on = j, ends
+    return [np.concatenate(parts) for parts in pieces]
 
 
 def _has_length(points: np.ndarray) -> bool:
     return bool((points[1:, :2] != points[:-1, :2]).any())
 
 
-def _inside_interval(
-    a: np.ndarray, b: np.ndarray, range_: PerceptionRange
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where each segment a-b enters and leaves the box (Liang-Barsky), and whether it meets it."""
-    enter, leave, inside = np.zeros(len(a)), np.ones(len(a)), np.ones(len(a), bool)
-    for axis, (low, high) in enumerate((range_.x, range_.y)):
-        step = b[:, axis] - a[:, axis]
-        parallel = step == 0.0
-        inside &= ~parallel | ((low <= a[:, axis]) & (a[:, axis] <= high))
-        t0, t1 = _crossing(a, b, axis, low), _crossing(a, b, axis, high)
-        enter = np.where(parallel, enter, np.maximum(enter, np.minimum(t0, t1)))
-        leave = np.where(parallel, leave, np.minimum(leave, np.maximum(t0, t1)))
-    return enter, leave, inside & (enter <= leave)
+def _cut(a: np.ndarray, b: np.ndarray, range_: PerceptionRange) -> tuple[np.ndarray, np.ndarray, bool, bool] | None:
+    """Return where a segment enters and leaves the box (Liang-Barsky), and whether at its ends; None if outside."""
+    enter, leave = 0.0, 1.0
+    # Plain floats: an array operation on one segment costs more than all of this.
+    ends = list(zip((range_.x, range_.y), a[:2].tolist(), b[:2].tolist(), strict=True))
+    for (low, high), start, stop in ends:
+        if stop == start:
+            if not low <= start <= high:
+                return None
+            continue
+        t0, t1 = (low - start) / (stop - start), (high - start) / (stop - start)
+        enter, leave = max(enter, min(t0, t1)), min(leave, max(t0, t1))
+    if enter > leave:
+        return None
+    return _on_segment(a, b, enter, ends), _on_segment(a, b, leave, ends), enter == 0.0, leave == 1.0
 
 
-def _crossing(a: np.ndarray, b: np.ndarray, axis: int, border: float) -> np.ndarray:
-    """Return where each segment a-b meets the border, 0 at a and 1 at b; NaN for a parallel one."""
-    step = b[:, axis] - a[:, axis]
-    return (border - a[:, axis]) / np.where(step == 0.0, np.nan, step)
-
-
-def _on_segment(a: np.ndarray, b: np.ndarray, t: np.ndarray, range_: PerceptionRange) -> np.ndarray:
-    point = a + t[:, None] * (b - a)
-    # Despite rounding, a cut end lies exactly on the border and a vertex of the line stays where it is.
-    for axis, borders in enumerate((range_.x, range_.y)):
-        point[:, axis] = np.clip(point[:, axis], *borders)
+def _on_segment(
+    a: np.ndarray, b: np.ndarray, t: float, ends: list[tuple[tuple[float, float], float, float]]
+) -> np.ndarray:
+    if t in (0.0, 1.0):
+        return b if t else a
+    point = a + t * (b - a)
+    # Despite rounding, a cut end lies exactly on the border.
+    for axis, (borders, start, stop) in enumerate(ends):
+        point[axis] = min(max(point[axis], borders[0]), borders[1])
         for border in borders:
-            point[_crossing(a, b, axis, border) == t, axis] = border
-    return np.where(t[:, None] == 0.0, a, np.where(t[:, None] == 1.0, b, point))
+            if stop != start and (border - start) / (stop - start) == t:
+                point[axis] = border
+    return point

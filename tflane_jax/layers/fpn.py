@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from tflane_jax.layers.pointwise import convolve
+
 _INIT = nn.initializers.xavier_uniform()
 
 
@@ -57,7 +59,14 @@ class FeaturePyramid(nn.Module):
     def _conv(self, size: int, stride: int, name: str) -> nn.Conv:
         padding = [(size // 2, size // 2)] * 2
         return nn.Conv(
-            self.config.dim, (size, size), (stride, stride), padding, kernel_init=_INIT, dtype=self.dtype, name=name
+            self.config.dim,
+            (size, size),
+            (stride, stride),
+            padding,
+            kernel_init=_INIT,
+            dtype=self.dtype,
+            conv_general_dilated=convolve,
+            name=name,
         )
 
 

@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.batch_norm import BatchNorm
+from tflane_jax.layers.pointwise import convolve
 
 # PyTorch's default: uniform within 1 / sqrt(fan in).
 _INIT = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
@@ -195,5 +196,6 @@ def _conv(channels: int, size: int, stride: int, name: str, dtype: Any) -> nn.Co
         use_bias=False,
         kernel_init=_INIT,
         dtype=dtype,
+        conv_general_dilated=convolve,
         name=name,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.common import Report, Terms, last_layer
 from tflane_jax.losses.lane_cells import lane_cell_loss
+from tflane_jax.losses.lane_proposals import lane_proposal_sums
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryName, AuxiliaryOutputs
 from tflane_jax.scene import CenterlinePrediction, LaneGraph
@@ -23,6 +25,7 @@ def auxiliary_losses(
     *,
     bev_range: PerceptionRange,
     cell_weight: float,
+    proposal_weights: tuple[float, float],
     denoising: Callable[[CenterlinePrediction, LaneGraph], Terms],
 ) -> tuple[list[Float[Array, ""]], Report]:
     """Return the weighted auxiliary losses of a batch, to be summed in this order, and the numbers to record.
@@ -33,6 +36,7 @@ def auxiliary_losses(
         lanes: ground truth, leading axis batch; padding may hold anything.
         bev_range: the box that the BEV features cover, metres.
         cell_weight: weight of the loss on BEV cells.
+        proposal_weights: weights of the heat map and of the shapes of proposed lanes.
         denoising: from predictions of denoised lanes and the ground truth to weighted losses per layer.
 
     Raises:
@@ -48,6 +52,15 @@ def auxiliary_losses(
             each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
             report["cells"] = cell_weight * each(outputs.lane_cells, lanes, bev_range).mean()
             losses.append(report["cells"])
+        elif name == "lane_proposals" and outputs.lane_proposals is not None:
+            each = jax.vmap(partial(lane_proposal_sums, range_=bev_range))
+            count = jnp.maximum(lanes.valid.sum(), 1).astype(jnp.float32)
+            heat, shapes = (
+                weight * value.sum() / count
+                for weight, value in zip(proposal_weights, each(outputs.lane_proposals, lanes), strict=True)
+            )
+            report |= {"proposal_heat": heat, "proposal_points": shapes}
+            losses += [heat, shapes]
         else:
             raise ValueError(f"the host declares the auxiliary output {name}, but it is missing or has no loss")
     return losses, report

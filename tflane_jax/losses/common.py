@@ -95,6 +95,18 @@ def focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], alpha: float, 
     return optax.losses.sigmoid_focal_loss(logits, target, alpha=alpha, gamma=gamma)
 
 
+def quality_focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], gamma: float) -> Float[Array, "*b"]:
+    """Return the quality focal loss |target - p|^gamma * cross entropy (Li et al. 2020, Eq. 2), elementwise.
+
+    Args:
+        logits: of the probability p.
+        target: quality in [0, 1]; 0 for negatives.
+        gamma: exponent, beta in the paper.
+    """
+    apart = jnp.abs(target - jax.nn.sigmoid(logits))
+    return apart**gamma * optax.losses.sigmoid_binary_cross_entropy(logits, target)
+
+
 def last_layers(assignment: Assignment, layers: int) -> Assignment:
     """Return the assignments (B, D, N) of the last `layers` layers."""
     return jax.tree.map(lambda leaf: leaf[:, leaf.shape[1] - layers :], assignment)

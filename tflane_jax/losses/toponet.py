@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
@@ -28,6 +29,7 @@ from tflane_jax.losses.common import (
     last_layers,
     matched,
     positives,
+    quality_focal,
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
@@ -54,6 +56,9 @@ class TopoNetLossConfig(HostLossConfig):
         alpha, gamma: parameters of every focal term.
         matcher: backend of `matching.match`.
         elements: weights for traffic elements.
+        class_target: of a query matched with a lane: "one", or "quality", which falls with its distance from the lane
+            (`lane_quality`), so that scores rank lanes by their precision (Li et al. 2020, quality focal loss).
+        proposal_weight: of the heat map of lane proposals; their shapes have `points_weight`.
         cell_weight: see `HostLossConfig`.
     """
 
@@ -65,6 +70,8 @@ class TopoNetLossConfig(HostLossConfig):
     matcher: Literal["scipy", "jax"] = "jax"
     element_lane_weight: float = 5.0
     elements: ElementLossConfig = ElementLossConfig()
+    class_target: Literal["one", "quality"] = "one"
+    proposal_weight: float = 1.5
 
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
@@ -106,6 +113,7 @@ def lane_graph_host_loss(
         batch.lanes,
         bev_range=host.encoder.bev_range,
         cell_weight=config.cell_weight,
+        proposal_weights=(config.proposal_weight, config.points_weight),
         denoising=partial(lane_denoising_losses, config=config, control_points=control_points),
     )
     for term in further:
@@ -265,9 +273,24 @@ def _lane_sums(
     """Return the sums of class losses and of point errors, for one layer of one example."""
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
-    is_lane = jnp.zeros(logits.shape).at[query, 0].set(1.0, mode="drop")
     error = jnp.abs(_lines(points[assignment.query], control_points) - _lines(lanes.points, control_points)).sum(-1)
-    return focal(logits, is_lane, config.alpha, config.gamma).sum(), jnp.where(assignment.matched, error, 0.0).sum()
+    if config.class_target == "one":
+        is_lane = jnp.zeros(logits.shape).at[query, 0].set(1.0, mode="drop")
+        classes = focal(logits, is_lane, config.alpha, config.gamma)
+    else:
+        quality = lax.stop_gradient(lane_quality(points[assignment.query], lanes.points))
+        target = jnp.zeros(logits.shape).at[query, 0].set(quality, mode="drop")
+        classes = quality_focal(logits, target, config.gamma)
+    return classes.sum(), jnp.where(assignment.matched, error, 0.0).sum()
+
+
+def lane_quality(points: Float[Array, "n p 3"], truth: Float[Array, "n p 3"]) -> Float[Array, " n"]:
+    """Return 1 / (1 + (d / 2 m)^2), where d is the largest distance between corresponding points, metres.
+
+    d bounds the Frechet distance, which the metrics compare with 1, 2 and 3 m.
+    """
+    squared = ((points - truth) ** 2).sum(-1).max(-1)
+    return 1.0 / (1.0 + squared / 4.0)
 
 
 def _lines(points: Float[Array, "*b p 3"], control_points: int | None) -> Float[Array, "*b d"]:

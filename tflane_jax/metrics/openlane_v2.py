@@ -2,25 +2,25 @@
 
 The topology score changed between devkit v1.0 and v1.1 (= v2.1) and differs by a factor of about four, so the version
 is part of every result: TF-Lane reports v2.1, the marker-fusion paper v1.0. DET is the same in both. Source:
-openlanev2/centerline/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md describes the rules. The groups by
-occlusion are this project's own (docs/metrics.md).
+openlanev2/centerline/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md describes the rules. Recall, AP_l
+and the groups of lanes are this project's own (docs/metrics.md).
 """
 
 from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
-from tflane_jax.metrics.matching import average_precision_11, pooled
+from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled
 from tflane_jax.metrics.topology import Version, check_versions
 
 
@@ -87,6 +87,8 @@ class CenterlineMetrics:
           lane nor a detection, as officially);
         - `recall` and `recall@1.0`, `recall@2.0`, `recall@3.0`: fraction of the true lanes that some detection takes,
           whatever its score. Not official; it changes smoothly, whereas DET_l is a mean over eleven recall levels;
+        - `AP_l`: as DET_l, with the area under the precision-recall curve in place of the mean over eleven recall
+          levels. Not official;
         - `TOP_ll`: 0 without true lanes in v2.1; missing in v1.0, whose official program stops with an error;
         - only if every frame had traffic elements on both sides: `DET_t` and, per attribute, `DET_t@0` ...
           `DET_t@12`; `TOP_lt` (missing like `TOP_ll`); `OLS`, missing if one of its parts is;
@@ -97,6 +99,7 @@ class CenterlineMetrics:
         precisions = [average_precision_11(scores, row, self._lanes) for row in hits]
         result["DET_l"] = float(np.mean(precisions))
         result |= {f"DET_l@{t}": value for t, value in zip(LANE_THRESHOLDS, precisions, strict=True)}
+        result["AP_l"] = float(np.mean([average_precision_area(scores, row, self._lanes) for row in hits]))
         found = hits.sum(1) / max(self._lanes, 1)
         result["recall"] = float(found.mean())
         result |= {f"recall@{t}": float(value) for t, value in zip(LANE_THRESHOLDS, found, strict=True)}
@@ -154,11 +157,13 @@ class GroupedCenterlineMetrics:
     `all` is the official number. `occluded` and `clear` partition its lanes and its vertices, and its detections in
     frames with lanes. Traffic elements count only in `all`.
 
-    A frame may also belong to a group of frames, which is measured like `all` on these frames alone.
+    The caller may name further groups of lanes, which may overlap, and tell their members with every frame. A frame may
+    also belong to a group of frames, which is measured like `all` on these frames alone.
 
     Args:
         groups: the groups to report.
         frame_groups: names of groups of frames.
+        lane_groups: names of further groups of lanes.
         occluded_below: visibility (fraction of the lane in direct line of sight) below which a lane is occluded.
         versions: of the topology score, see `CenterlineMetrics`.
     """
@@ -168,30 +173,59 @@ class GroupedCenterlineMetrics:
         groups: Sequence[str] = ("all", "occluded", "clear"),
         *,
         frame_groups: Sequence[str] = (),
+        lane_groups: Sequence[str] = (),
         occluded_below: float = 0.5,
         versions: Sequence[Version] = ("v2.1",),
     ) -> None:
         self.versions = check_versions(versions)
         self.occluded_below = occluded_below
         self._frame_groups = frozenset(frame_groups)
-        self._metrics = {group: CenterlineMetrics(versions) for group in (*groups, *frame_groups)}
+        self._lane_groups = frozenset(lane_groups)
+        self._metrics = {group: CenterlineMetrics(versions) for group in (*groups, *lane_groups, *frame_groups)}
+        # Of every frame: true lanes and hits, summed over the thresholds.
+        self._recalled: dict[str, list[tuple[int, int]]] = {group: [] for group in self._metrics}
 
     @property
     def protocol(self) -> str:
         """Name and version, the title of every table of these numbers."""
         return f"{_protocol(self.versions)}, occluded: visibility < {self.occluded_below:g}"
 
-    def update(self, detections: LaneDetections, truth: LaneTruth, frame_group: str | None = None) -> None:
+    def update(
+        self,
+        detections: LaneDetections,
+        truth: LaneTruth,
+        frame_group: str | None = None,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
+    ) -> None:
         """Add one frame, which may belong to a group of frames.
 
-        Raises UserError for arrays that do not fit together or a visibility that is not known.
+        Args:
+            detections, truth: of the frame.
+            frame_group: the group of frames.
+            members: for each of `lane_groups`, which of the true lanes belong to it.
+
+        Raises:
+            UserError: arrays that do not fit together, or a visibility that is not known.
         """
         frame = match_frame(detections, truth, self.versions)
         for group, metrics in self._metrics.items():
-            if group in ("all", frame_group):
-                metrics.add(frame)
-            elif group not in self._frame_groups:
-                metrics.add(frame.select(self._members(group, truth, frame.lanes)))
+            lanes = hits = 0
+            if group not in self._frame_groups or group == frame_group:
+                part = frame
+                if group in self._lane_groups:
+                    part = frame.select((members or {})[group])
+                elif group not in ("all", frame_group):
+                    part = frame.select(self._members(group, truth, frame.lanes))
+                metrics.add(part)
+                lanes, hits = part.lanes, int(part.hits.sum())
+            self._recalled[group].append((lanes, hits))
+
+    def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:
+        """Return by group, for every frame: true lanes, and hits summed over the three thresholds.
+
+        Recall is the sum of the hits over frames, divided by three times the sum of the lanes.
+        """
+        return {group: np.array(counts, int).reshape(-1, 2) for group, counts in self._recalled.items()}
 
     def merge(self, other: Self) -> Self:
         """Return an accumulator of the frames of both, in this order (neither changes)."""
@@ -199,6 +233,7 @@ class GroupedCenterlineMetrics:
             raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
         merged = copy.copy(self)
         merged._metrics = {group: metrics.merge(other._metrics[group]) for group, metrics in self._metrics.items()}
+        merged._recalled = {group: counts + other._recalled[group] for group, counts in self._recalled.items()}
         return merged
 
     def compute(self) -> dict[str, dict[str, float]]:

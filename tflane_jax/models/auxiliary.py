@@ -17,7 +17,20 @@ AUXILIARY = "auxiliary"
 CELL_CHANNELS = 5
 """Channels per BEV cell: occupancy logit, offset to the nearest lane in cells (2), direction of that lane (2)."""
 
-AuxiliaryName = Literal["denoised", "lane_cells", "line_cells"]
+AuxiliaryName = Literal["denoised", "lane_cells", "lane_proposals", "line_cells"]
+
+
+@struct.dataclass
+class LaneProposalOutputs:
+    """What `losses.lane_proposals` reads.
+
+    Attributes:
+        heat: (h, w, K) logits: is there the middle of a lane in this cell, with a heading in this bin?
+        lanes: (N, P, 3) metres, the shapes proposed near the middle of each true lane.
+    """
+
+    heat: Float[Array, "*b h w k"]
+    lanes: Float[Array, "*b n p 3"]
 
 
 @struct.dataclass
@@ -27,11 +40,13 @@ class AuxiliaryOutputs:
     Attributes:
         denoised: centerlines of the denoising queries, leading axes (copy, layer); see `models.lane_denoising`.
         lane_cells: (h, w, `CELL_CHANNELS`) lanes per BEV cell.
+        lane_proposals: of the heads that propose lanes, see `models.lane_proposals`.
         line_cells: (h, w) logit per cell of the image features: does a lane line pass through it?
     """
 
     denoised: CenterlinePrediction | None = None
     lane_cells: Float[Array, "*b h w c"] | None = None
+    lane_proposals: LaneProposalOutputs | None = None
     line_cells: Float[Array, "*b h w"] | None = None
 
 

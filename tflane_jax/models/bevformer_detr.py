@@ -20,7 +20,7 @@ from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDeco
 from tflane_jax.models.encoders import EncoderConfig, check_elements
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, LaneHeads, make_prediction
-from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes
+from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
@@ -52,8 +52,8 @@ class BevFormerDetrConfig(HostConfig):
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Denoised lanes if configured, and those of every host."""
-        return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
+        """Those of the lane decoder, and those of every host."""
+        return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit together."""
@@ -102,7 +102,7 @@ class BevFormerDetr(Host):
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
         """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
-        controls, config = self.config.control_points, self._lines()
+        controls, config, spec = self.config.control_points, self._lines(), self.config.spec
         queries, position, reference = start
         outputs = []
         for i in range(config.layers):
@@ -112,7 +112,7 @@ class BevFormerDetr(Host):
             queries = layer(queries, position, reference, bev, None, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             element_queries = None if elements is None else elements.queries[i]
-            heads = LaneHeads(config, self.config.spec.bev_range, relations=last, name=f"heads_{i}")
+            heads = LaneHeads(config, spec.bev_range, last, spec.range, name=f"heads_{i}")
             output = heads(queries, reference, bev, element_queries)
             if controls is not None:
                 basis = jnp.asarray(bezier_basis(self.config.decoder.points, controls), output.points.dtype)

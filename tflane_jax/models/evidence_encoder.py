@@ -24,14 +24,18 @@ class EvidenceEncoderConfig:
     Attributes:
         dim: channels of the BEV features.
         cell: a block of `cell` x `cell` raster cells becomes one feature cell.
-        dilations: of the convolutions, one residual block each.
+        levels: channels of a U-Net's coarser levels, each half as fine as the one before: context from the whole box.
+        dilations: of the convolutions after it, one residual block each.
+        coordinates: whether x, y, abs x and abs y of the cells are input channels.
         cells: see `CameraEncoderConfig.cells`.
         range: the box that the raster covers, metres; equal to that of `BevSensorConfig.grid`, which training checks.
     """
 
     dim: int = 32
     cell: int = 4
+    levels: tuple[int, ...] = ()
     dilations: tuple[int, ...] = (1, 2, 4, 1)
+    coordinates: bool = False
     cells: bool = False
     range: PerceptionRange = BevGrid().range
 
@@ -42,7 +46,7 @@ class EvidenceEncoderConfig:
 
 
 class EvidenceEncoder(nn.Module):
-    """Raster cells folded into channels, then dilated residual blocks."""
+    """Raster cells folded into channels, a U-Net if it has levels, then dilated residual blocks."""
 
     config: EvidenceEncoderConfig
 
@@ -52,8 +56,8 @@ class EvidenceEncoder(nn.Module):
 
         Args:
             bev: (h, w, c) evidence, row 0 at the smallest y.
-            fuse: how priors change the features after each residual block. The positions that it receives are a sine
-                encoding of (x, y).
+            fuse: how priors change the features: before the U-Net, if there is one, and after each residual block. The
+                positions that it receives are a sine encoding of (x, y).
 
         Raises:
             ValueError: `cell` does not divide the size of the raster.
@@ -64,19 +68,63 @@ class EvidenceEncoder(nn.Module):
         x = bev.astype(jnp.float32) / 255.0
         # Folding is lossless and avoids convolutions at full resolution, the most expensive ones on a CPU.
         x = x.reshape(h // n, n, w // n, n, c).transpose(0, 2, 1, 3, 4).reshape(h // n, w // n, n * n * c)
+        if self.config.coordinates:
+            places = 2.0 * cell_points(BevGrid(rows=h // n, columns=w // n)).reshape(h // n, w // n, 2) - 1.0
+            x = jnp.concatenate([x, jnp.asarray(np.concatenate([places, np.abs(places)], -1))], -1)
         x = nn.relu(_norm("stem_norm")(nn.Conv(self.config.dim, (3, 3), name="stem")(x)))
+        fused = 0
+        if self.config.levels:
+            x, fused = _fused(fuse, fused, x), 1
+            x = UNet(self.config.levels, name="context")(x)
         for i, dilation in enumerate(self.config.dilations):
             y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
-            x = nn.relu(x + _norm(f"block_{i}_norm")(y))
-            # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
-            x = lax.optimization_barrier(x)
-            if fuse is not None:
-                places = cell_points(BevGrid(rows=x.shape[0], columns=x.shape[1]))
-                x = fuse(i, places, x.reshape(-1, x.shape[-1]), _positions(places, x)).reshape(x.shape)
-                x = lax.optimization_barrier(x)
+            x = _fused(fuse, fused + i, nn.relu(x + _norm(f"block_{i}_norm")(y)))
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x
+
+
+class UNet(nn.Module):
+    """Levels of half the resolution each and back, with skip connections (Ronneberger et al. 2015).
+
+    Attributes:
+        channels: of each coarser level.
+    """
+
+    channels: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "h w d"]) -> Float[Array, "h w d"]:
+        """Return features of the same shape."""
+        if not self.channels:
+            return x
+        channels, rest = self.channels[0], self.channels[1:]
+        y = nn.relu(_norm("down_norm")(nn.Conv(channels, (3, 3), (2, 2), name="down")(x)))
+        y = _Block(name="coarse")(y)
+        y = UNet(rest, name="context")(y)
+        y = nn.Dense(x.shape[-1], use_bias=False, name="up")(y)
+        y = jnp.repeat(jnp.repeat(y, 2, 0), 2, 1)[: x.shape[0], : x.shape[1]]
+        return _Block(name="fine")(nn.relu(x + y))
+
+
+class _Block(nn.Module):
+    """Residual convolution."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "h w d"]) -> Float[Array, "h w d"]:
+        y = nn.Conv(x.shape[-1], (3, 3), name="conv")(x)
+        return nn.relu(x + _norm("norm")(y))
+
+
+def _fused(fuse: BevHook | None, layer: int, x: Float[Array, "h w d"]) -> Float[Array, "h w d"]:
+    """Return the features with the priors of one layer fused in."""
+    # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
+    x = lax.optimization_barrier(x)
+    if fuse is None:
+        return x
+    places = cell_points(BevGrid(rows=x.shape[0], columns=x.shape[1]))
+    x = fuse(layer, places, x.reshape(-1, x.shape[-1]), _positions(places, x)).reshape(x.shape)
+    return lax.optimization_barrier(x)
 
 
 def _positions(places: np.ndarray, x: Float[Array, "h w d"]) -> Float[Array, "h*w d"]:

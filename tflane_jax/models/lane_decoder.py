@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -146,11 +147,13 @@ class LaneHeads(nn.Module):
         config: sizes.
         range: the box that normalised coordinates span.
         relations: whether the layer predicts topology.
+        limits: the box at whose border lanes end, output "metric" only.
     """
 
     config: LaneDecoderConfig
     range: PerceptionRange
     relations: bool = True
+    limits: PerceptionRange | None = None
 
     @nn.compact
     def __call__(
@@ -168,18 +171,53 @@ class LaneHeads(nn.Module):
             x = nn.relu(nn.LayerNorm(epsilon=1e-5, name=f"class_norm_{i}")(x))
         # Bias -log 99: the initial probability is 0.01 (focal loss prior, Lin et al. 2017).
         logits = nn.Dense(1, bias_init=nn.initializers.constant(-np.log(99.0)), name="class_out")(x)
-        # The change of the reference, in logits of [0, 1].
+        # The change of the reference, in logits of [0, 1] or in units of `metres`.
         change = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries).reshape(reference.shape)
         if config.refine == "iterative":
             change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
             change = change + PointwiseRefinement(config, self.range, name="pointwise")(queries, reference, bev)
-        unit = nn.sigmoid(change + inverse_sigmoid(reference))
+        if config.output == "sigmoid":
+            unit = nn.sigmoid(change + inverse_sigmoid(reference))
+        else:
+            unit = self._moved(reference, change)
         successor = element_lane = None
         if self.relations:
             successor = RelationshipHead(config.relation, name="successor")(queries, queries)
             if elements is not None:
                 element_lane = RelationshipHead(config.relation, name="element_lane")(queries, elements)
         return LaneOutput(self.range.denormalise(unit), unit, logits, successor, element_lane)
+
+    def _moved(self, reference: Float[Array, "q p 3"], change: Float[Array, "q p 3"]) -> Float[Array, "q p 3"]:
+        """Return the reference plus the change in units of `metres`, clipped to the limits."""
+        scale = jnp.asarray(self.config.metres) / jnp.asarray(self.range.size())
+        unit = reference + change * scale[None, None]
+        box = self.limits or self.range
+        corners = self.range.normalise(jnp.array([[axis[end] for axis in (box.x, box.y, box.z)] for end in (0, 1)]))
+        low, high = (jnp.broadcast_to(corners[i], unit.shape[1:]) for i in (0, 1))
+        return jax.vmap(clip_with_return, in_axes=(0, None, None))(unit, low, high)
+
+
+@jax.custom_vjp
+def clip_with_return(x: Float[Array, "*b"], low: Float[Array, "*b"], high: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Clip to [low, high], with a gradient for a value outside if descent along it moves the value back inside.
+
+    The gradient of a plain clip is 0 outside, so that a lane which leaves the range could never return. Passing every
+    gradient would let a rounding error between a clipped value and a target on the border push it outwards for ever.
+    """
+    return jnp.clip(x, low, high)
+
+
+def _clip_forward(x, low, high):
+    return jnp.clip(x, low, high), (x, low, high)
+
+
+def _clip_backward(residuals, gradient):
+    x, low, high = residuals
+    outward = ((x > high) & (gradient < 0.0)) | ((x < low) & (gradient > 0.0))
+    return jnp.where(outward, 0.0, gradient), jnp.zeros_like(low), jnp.zeros_like(high)
+
+
+clip_with_return.defvjp(_clip_forward, _clip_backward)
 
 
 def make_prediction(outputs: list[LaneOutput], elements: ElementOutput | None) -> Prediction:

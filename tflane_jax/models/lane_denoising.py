@@ -17,8 +17,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange, transform_points, yaw_pose
-from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.element_decoder import ElementOutput
+from tflane_jax.models.lane_proposals import LaneProposals
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
 from tflane_jax.scene import LaneGraph, Prediction
 
@@ -63,13 +64,21 @@ class NoisedQueries(nn.Module):
         config, copies = self.config, self.noise.copies
         keys = jax.random.split(self.make_rng("dropout"), copies)
         lines = jax.vmap(lambda key: noised_lanes(key, lanes, config.queries, self.range, self.noise))(keys)
-        reference = jnp.clip(self.range.normalise(lines), 0.01, 0.99)
+        # Away from 0 and 1, where the sigmoid of the points is flat.
+        border = 0.01 if config.output == "sigmoid" else 0.0
+        reference = jnp.clip(self.range.normalise(lines), border, 1.0 - border)
         position = nn.Dense(config.dim, name="position")(reference.reshape(copies, config.queries, -1))
         if config.refine == "fixed":
             middle = config.points // 2
             reference = jnp.broadcast_to(reference[:, :, middle : middle + 1], reference.shape)
         content = self.param("content", nn.initializers.normal(1.0), (config.dim,))
         return jnp.broadcast_to(content, position.shape), position, lax.stop_gradient(reference)
+
+
+def lane_auxiliary(config: LaneDecoderConfig, noise: DenoisingConfig | None) -> tuple[AuxiliaryName, ...]:
+    """Return the auxiliary outputs of `decode_lanes`."""
+    denoised: tuple[AuxiliaryName, ...] = () if noise is None else ("denoised",)
+    return denoised if config.proposals is None else (*denoised, "lane_proposals")
 
 
 def decode_lanes(
@@ -92,10 +101,14 @@ def decode_lanes(
         bev, elements, tokens, deterministic: passed to `decode_queries`.
         lanes: ground truth to denoise; not used otherwise.
     """
-    start, noise = LaneQueries(config, host.config.spec.bev_range, name="queries")(), host.config.denoising
+    range_, noise = host.config.spec.bev_range, host.config.denoising
+    start = LaneQueries(config, range_, name="queries")()
+    if config.proposals is not None:
+        proposed = LaneProposals(config, range_, name="proposals")(bev, lanes)
+        start = jax.tree.map(lambda *parts: jnp.concatenate(parts), start, proposed)
     if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
         return host.decode_queries(start, bev, elements, tokens, deterministic)
-    noised = NoisedQueries(config, noise, host.config.spec.bev_range, name="noised")(lanes)
+    noised = NoisedQueries(config, noise, range_, name="noised")(lanes)
     starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
     decode = nn.vmap(
         type(host).decode_queries,

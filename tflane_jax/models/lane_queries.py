@@ -15,6 +15,25 @@ from tflane_jax.layers.positions import inverse_sigmoid
 
 
 @dataclass(frozen=True)
+class LaneProposalConfig:
+    """Dense lane proposals (`models.lane_proposals`); not part of the lane papers.
+
+    Attributes:
+        count: how many of the decoder's queries are proposals.
+        headings: heading bins of the heat map.
+        hidden: channels of the heads.
+        jitter: standard deviation of the places at which the shape head is trained, along and across the lane, metres.
+        turn: the same of the heading, radians.
+    """
+
+    count: int = 40
+    headings: int = 8
+    hidden: int = 64
+    jitter: tuple[float, float] = (2.0, 0.8)
+    turn: float = 0.25
+
+
+@dataclass(frozen=True)
 class LaneDecoderConfig:
     """Sizes of the decoder. The defaults train on two CPU cores; `PAPER_LANE_DECODER` has TopoNet's.
 
@@ -30,6 +49,11 @@ class LaneDecoderConfig:
         edge_weight: weight of neighbours in the scene graph.
         bands: frequencies per coordinate in the position encoding of a refined lane.
         refine: see `models.lane_decoder`.
+        output: "sigmoid" adds the change of a lane to the logit of its reference, as in Deformable DETR. "metric" adds
+            it in units of `metres` and clips at the border of the perception range, where the sigmoid is flat: lanes
+            that leave the range end there.
+        metres: unit of change along x, y and z of output "metric".
+        proposals: queries from a heat map of lanes beside the learned ones; None for learned ones only.
         dropout: probability, for attention weights, hidden channels, messages and every residual branch.
     """
 
@@ -44,7 +68,15 @@ class LaneDecoderConfig:
     edge_weight: float = 0.6
     bands: int = 6
     refine: Literal["fixed", "iterative"] = "iterative"
+    output: Literal["sigmoid", "metric"] = "sigmoid"
+    metres: tuple[float, float, float] = (5.0, 5.0, 0.3)
+    proposals: LaneProposalConfig | None = None
     dropout: float = 0.0
+
+    @property
+    def learned_queries(self) -> int:
+        """Number of queries that are not proposals."""
+        return self.queries - (0 if self.proposals is None else self.proposals.count)
 
 
 PAPER_LANE_DECODER = LaneDecoderConfig(
@@ -70,13 +102,13 @@ class LaneQueries(nn.Module):
         "fixed": one point per lane, a linear function of the position; "iterative": learned anchor lanes.
         """
         config = self.config
-        embedding = self.param("embedding", nn.initializers.normal(1.0), (config.queries, 2 * config.dim))
+        embedding = self.param("embedding", nn.initializers.normal(1.0), (config.learned_queries, 2 * config.dim))
         position, content = jnp.split(embedding, 2, -1)
         if config.refine == "iterative":
             anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config, self.range))))
             return content, position, nn.sigmoid(anchors)
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
-        shape = (config.queries, config.points, 3)
+        shape = (config.learned_queries, config.points, 3)
         return content, position, jnp.broadcast_to(spot[:, None], shape)
 
 
@@ -88,13 +120,14 @@ def spread_lanes(
     Centres and headings follow a Halton sequence: 30 percent head along the ego's x axis, 30 percent against it, 40
     percent in any direction. `length` is in metres.
     """
-    sample = np.stack([_radical_inverse(np.arange(1, config.queries + 1), base) for base in (2, 3, 5)], -1)
+    count = config.learned_queries
+    sample = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in (2, 3, 5)], -1)
     middle = np.asarray(range_.low(2)) + sample[:, :2] * np.asarray(range_.size(2))
     fraction = sample[:, 2] / 0.6
     heading = np.where(fraction < 1.0, np.pi * (fraction < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
     along = np.linspace(-length / 2, length / 2, config.points)
     direction = np.stack([np.cos(heading), np.sin(heading)], -1)
-    lanes = np.zeros((config.queries, config.points, 3), np.float32)
+    lanes = np.zeros((count, config.points, 3), np.float32)
     lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
     # Away from 0 and 1, where the sigmoid of the points is flat.
     return np.clip(range_.normalise(lanes), 0.02, 0.98)

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 import flax.linen as nn
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.scene import Example
 
 
@@ -44,8 +44,8 @@ class HostSpec:
 
 BevHook = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]
 """Fusion of all priors into the BEV features of an encoder layer: (layer, cell centers (q, 2) in [0, 1], features
-(q, c), position encodings (q, c)) -> features. The hook creates its modules when called, so their parameters belong to
-the layer."""
+(q, c), position encodings (q, c)) -> features. Centers are the numpy array that `geometry.pillars.cell_points` gives.
+The hook creates its modules when called, so their parameters belong to the layer."""
 
 
 class BevCells(NamedTuple):
@@ -55,11 +55,13 @@ class BevCells(NamedTuple):
         features: (Q, C).
         position: (Q, C) position encoding of the cells.
         centers: (Q, 2) cell centers (x, y), metres, ego frame.
+        grid: the cells, row by row; a layer may have fewer of them than another.
     """
 
     features: Float[Array, "q c"]
     position: Float[Array, "q c"]
     centers: Float[Array, "q 2"]
+    grid: BevGrid
 
 
 class HostQueries(NamedTuple):
@@ -119,7 +121,7 @@ class Prior:
         return queries.features
 
     def fuses_into_bev(self) -> bool:
-        """Return whether the prior overrides `into_bev`."""
+        """Return whether the prior uses `into_bev`: by default, whether it overrides it."""
         return type(self).into_bev is not Prior.into_bev
 
 

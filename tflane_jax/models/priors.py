@@ -12,9 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from tflane_jax.geometry import BevGrid
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.prior import BevCells, BevHook, HostQueries, HostSpec, Prior, PriorConfig
 from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
@@ -30,7 +32,7 @@ class PriorsConfig:
     """The priors of a host, None for an absent one; they are fused in this order.
 
     Attributes:
-        traffic_flow: tracks of other road users, into the queries (TF-Lane).
+        traffic_flow: tracks of other road users, into the queries (TF-Lane) and, if chosen, into the BEV features.
         sd_map: an SD map, into the BEV features (SMERF).
         markers: fiducial markers, into the BEV features (Wu and Hu).
     """
@@ -92,10 +94,12 @@ def bev_hook(priors: Mapping[str, Prior], tokens: ByPrior, host: HostSpec) -> Be
     if not fusing:
         return None
 
-    def fuse(layer: int, places: Any, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
+    def fuse(layer: int, places: np.ndarray, bev: Float[Array, "q c"], position: Float[Array, "q c"]):
         centers = host.bev_range.denormalise(jnp.asarray(places))
+        columns, rows = (len(np.unique(places[:, axis])) for axis in (0, 1))
+        grid = BevGrid(host.bev_range, rows, columns)
         for name, prior in fusing.items():
-            bev = prior.into_bev(tokens[name], layer, BevCells(bev, position, centers))
+            bev = prior.into_bev(tokens[name], layer, BevCells(bev, position, centers, grid))
         return bev
 
     return fuse

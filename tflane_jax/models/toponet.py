@@ -28,7 +28,7 @@ from tflane_jax.models.lane_decoder import (
     make_prediction,
     next_reference,
 )
-from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes
+from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
@@ -55,8 +55,8 @@ class TopoNetConfig(HostConfig):
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Denoised lanes if configured, and those of every host."""
-        return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
+        """Those of the lane decoder, and those of every host."""
+        return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""
@@ -95,7 +95,7 @@ class TopoNet(Host):
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
         """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
-        config, (queries, position, reference) = self.config.decoder, start
+        config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         # No edges in the first layer.
         adjacency = jnp.zeros((config.queries, config.queries))
         element_edges = None if elements is None else jnp.zeros((config.queries, elements.logits.shape[1]))
@@ -116,7 +116,8 @@ class TopoNet(Host):
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
             queries = layer(queries, placed, reference, bev, adjacency, nodes, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
-            output = LaneHeads(config, self.config.spec.bev_range, name=f"heads_{i}")(queries, reference, bev, embedded)
+            heads = LaneHeads(config, spec.bev_range, limits=spec.range, name=f"heads_{i}")
+            output = heads(queries, reference, bev, embedded)
             outputs.append(output)
             reference = next_reference(reference, output.unit, config)
             if output.successor is not None:

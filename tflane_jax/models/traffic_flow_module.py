@@ -4,33 +4,36 @@ Two parts, as in Fig. 2 of the paper. The temporal encoder turns the history of 
 3.3, "Temporal Domain Encoder", Fig. 4). In the spatial encoder, lane queries and tokens attend to each other under the
 spatial mask M_s (Fig. 5, Eq. (2) and (3)). Both are independent of the host detector.
 
-The paper leaves open, and we chose: each fusion module is multi-head attention with a residual connection and a
-LayerNorm; the transformation T of Eq. (3) is a residual two-layer perceptron with a LayerNorm; an instance's token is
-computed from the mean of its valid frames after self-attention, and from position and heading in its first and last
-valid frame.
+The paper leaves much open; docs/tf_lane.md lists what we chose, and the settings that choose otherwise.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.models.prior import HostQueries, HostSpec, Prior
+from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
+from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
+from tflane_jax.priors.traffic_raster import rasterise_traffic_flow
 from tflane_jax.scene import Example, RoadUser, TrafficFlow
 
 Fusion = Literal["T->T", "T->L", "L->T", "L->L"]
 ALL_FUSIONS: tuple[Fusion, ...] = ("T->T", "T->L", "L->T", "L->L")
 LANE_FUSIONS: tuple[Fusion, ...] = ("L->T", "L->L")
+
+SINE_METRES = 100.0
+"""The sine encoding of coordinates in metres divides them by this; its longest wavelength is twice as long."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,15 @@ class TrafficFlowModuleConfig:
 
     Attributes:
         fusions: which of the four fusion modules are used, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
-        depth: temporal self-attention layers, "Dep." in Table 5.
-        position_encoding: "sine" for normalised coordinates, "linear" for metres.
+        depth: temporal self-attention layers, "Dep." in Table 5 as we read it.
+        spatial_depth: how often the spatial encoder repeats the fusion modules, each time with separate parameters;
+            Eq. (3) follows once. The other reading of "Dep.": the text speaks of cross-attention layers.
+        residual: "fusion" adds to each fusion module its input; "none" leaves the original features to Eq. (3) alone,
+            and only a query without a valid key keeps its own.
+        token: an instance's token is computed from the mean of its valid frames after self-attention ("mean") and, in
+            "mean_and_ends", from position and heading in its first and last valid frame.
+        position_encoding: "sine" adds sines and cosines to the coordinates, "linear" nothing. Independent of
+            `TrafficFlowPriorConfig.coordinates`, "Norm." in Table 5.
         bands: frequencies per coordinate of the sine encoding.
         width: channels inside the temporal encoder.
         heads: attention heads in both encoders.
@@ -48,6 +58,9 @@ class TrafficFlowModuleConfig:
 
     fusions: tuple[Fusion, ...] = LANE_FUSIONS
     depth: int = 1
+    spatial_depth: int = 1
+    residual: Literal["fusion", "none"] = "fusion"
+    token: Literal["mean_and_ends", "mean"] = "mean_and_ends"
     position_encoding: Literal["sine", "linear"] = "sine"
     bands: int = 7
     width: int = 32
@@ -62,30 +75,53 @@ class TrafficFlowConfig:
         prior: selection of instances.
         module: the TFM.
         insert: "before_decoder" enhances the queries once, as in the paper (section 3.3); "every_layer" enhances them
-            before each decoder layer, with separate parameters.
+            before each decoder layer, with separate parameters; "nowhere" leaves the TFM out, and `bev` must be set.
+        bev: writes the selected tracks into the BEV features as well, which the paper does not; None: queries only.
     """
 
     prior: TrafficFlowPriorConfig = TrafficFlowPriorConfig()
     module: TrafficFlowModuleConfig = TrafficFlowModuleConfig()
-    insert: Literal["before_decoder", "every_layer"] = "before_decoder"
+    insert: Literal["before_decoder", "every_layer", "nowhere"] = "before_decoder"
+    bev: TrafficRasterConfig | None = None
 
     def build(self, host: HostSpec) -> TrafficFlowPrior:
-        """Return the prior for a host."""
+        """Return the prior for a host; raises UserError where the traffic flow would enter nowhere."""
+        if self.insert == "nowhere" and self.bev is None:
+            raise UserError(
+                "traffic flow enters nowhere: choose traffic_flow.insert or traffic_flow.bev, or leave traffic_flow out"
+            )
         return TrafficFlowPrior(self, host)
 
 
+class EncodedTrafficFlow(NamedTuple):
+    """Traffic flow of a frame as the two hooks read it.
+
+    Attributes:
+        features: (T, D) TF_Feat, one token per instance; None without the TFM.
+        tracks: the selected instances.
+    """
+
+    features: Float[Array, "t d"] | None
+    tracks: TrafficFlowTokens
+
+
 class TrafficFlowPrior(Prior):
-    """Selects instances, encodes each to a token, and enhances the host's queries."""
+    """Selects instances, encodes each to a token, and enhances the host's queries; optionally, BEV features too.
+
+    Without traffic flow, the queries get what they get in an empty scene, and BEV features stay exactly as they are.
+    """
 
     reads = ("traffic_flow",)
 
     def __init__(self, config: TrafficFlowConfig, host: HostSpec):
         self.config, self.host = config, host
-        self.temporal_encoder = TemporalEncoder(config.module, host.dim)
+        coordinates = config.prior.coordinates
+        encoder = None if config.insert == "nowhere" else TemporalEncoder(config.module, host.dim, coordinates)
+        self.temporal_encoder = encoder
 
     def modules(self) -> dict[str, nn.Module]:
         """Return the temporal encoder."""
-        return {"temporal_encoder": self.temporal_encoder}
+        return {} if self.temporal_encoder is None else {"temporal_encoder": self.temporal_encoder}
 
     def observe(self, example: Example, memory: None) -> tuple[TrafficFlowTokens, None]:
         """Return reTF_i; without traffic flow, all instances are invalid."""
@@ -94,24 +130,33 @@ class TrafficFlowPrior(Prior):
             flow = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames))
         return select_traffic_flow(flow, prior, self.host.range, self.host.bev_range), None
 
-    def encode(
-        self, observation: TrafficFlowTokens, *, deterministic: bool
-    ) -> tuple[Float[Array, "t d"], Bool[Array, " t"]]:
-        """Return TF_Feat (T, D) and which instances are valid (T,)."""
+    def encode(self, observation: TrafficFlowTokens, *, deterministic: bool) -> EncodedTrafficFlow:
+        """Return TF_Feat (T, D) beside the tracks that it encodes."""
         del deterministic
-        return self.temporal_encoder(observation), observation.valid
+        features = None if self.temporal_encoder is None else self.temporal_encoder(observation)
+        return EncodedTrafficFlow(features, observation)
 
-    def into_queries(
-        self, tokens: tuple[Float[Array, "t d"], Bool[Array, " t"]], layer: int, queries: HostQueries
-    ) -> Float[Array, "q d"]:
+    def fuses_into_bev(self) -> bool:
+        """Return whether `TrafficFlowConfig.bev` is set."""
+        return self.config.bev is not None
+
+    def into_bev(self, tokens: EncodedTrafficFlow, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+        """Return the BEV features with the tracks written into the cells that they pass."""
+        config = self.config.bev
+        if config is None or (layer > 0 and config.layers == "first"):
+            return cells.features
+        tracks = jax.tree.map(jnp.asarray, tokens.tracks)
+        raster = rasterise_traffic_flow(tracks, self.config.prior.coordinates, cells.grid, config.between)
+        return TrafficRasterFusion(config, name=f"traffic_flow_{layer}")(cells.features, raster)
+
+    def into_queries(self, tokens: EncodedTrafficFlow, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
         """Return L'_Feat before the layers selected by `insert`."""
-        if layer > 0 and self.config.insert == "before_decoder":
+        if tokens.features is None or (layer > 0 and self.config.insert == "before_decoder"):
             return queries.features
-        features, valid = tokens
-        mask = SpatialMask.from_validity(len(queries.features), valid, queries.mask)
+        mask = SpatialMask.from_validity(len(queries.features), tokens.tracks.valid, queries.mask)
         name = f"spatial_encoder_{layer}"
         spatial = SpatialEncoder(self.config.module, self.host.dim, self.host.query_type, name=name)
-        return spatial(queries.features, queries.position, features, mask)
+        return spatial(queries.features, queries.position, tokens.features, mask)
 
 
 class TemporalEncoder(nn.Module):
@@ -120,10 +165,12 @@ class TemporalEncoder(nn.Module):
     Attributes:
         config: shape.
         dim: channels of the token.
+        coordinates: of the positions, see `TrafficFlowPriorConfig.coordinates`.
     """
 
     config: TrafficFlowModuleConfig
     dim: int
+    coordinates: Literal["normalised", "metres"] = "normalised"
 
     @nn.compact
     def __call__(self, tokens: TrafficFlowTokens) -> Float[Array, "t d"]:
@@ -134,6 +181,8 @@ class TemporalEncoder(nn.Module):
         x = nn.LayerNorm(name="norm")(x)
         weight = tokens.frame_valid.astype(x.dtype)
         mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
+        if self.config.token == "mean":
+            return Mlp((self.dim, self.dim), name="token")(mean)
         # The mean blurs the positions of a moving instance; its first and last valid frames keep them.
         first = tokens.frame_valid.argmax(-1)
         last = weight.shape[1] - 1 - tokens.frame_valid[:, ::-1].argmax(-1)
@@ -145,7 +194,8 @@ class TemporalEncoder(nn.Module):
     def _where(self, position: Float[Array, "t n 3"], heading: Float[Array, "t n 2"]) -> Float[Array, "t n e"]:
         """Encode position and heading."""
         if self.config.position_encoding == "sine":
-            position = jnp.concatenate([sine_encoding(position[..., :2], self.config.bands), position], -1)
+            plane = position[..., :2] / SINE_METRES if self.coordinates == "metres" else position[..., :2]
+            position = jnp.concatenate([sine_encoding(plane, self.config.bands), position], -1)
         return jnp.concatenate([position, heading], -1)
 
     def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
@@ -209,24 +259,29 @@ class SpatialEncoder(nn.Module):
             mask: M_s; quadrants of unused fusion modules are never built.
         """
 
-        def fuse(name: Fusion, x, x_position, y, y_position, quadrant):
+        config = self.config
+
+        def fuse(name: Fusion, layer: int, x, x_position, y, y_position, quadrant):
             """Eq. (2): one fusion module, F_fusion(. ; M_s^(i))."""
-            if name not in self.config.fusions:
+            if name not in config.fusions:
                 return x
-            label = name.replace("->", "_to_")
-            attended = MultiHeadAttention(self.dim, self.config.heads, name=label)(
-                x + x_position, y + y_position, y, quadrant
-            )
-            return nn.LayerNorm(name=f"{label}_norm")(x + attended)
+            label = name.replace("->", "_to_") + (f"_{layer}" if layer else "")
+            found = MultiHeadAttention(self.dim, config.heads, name=label)(x + x_position, y + y_position, y, quadrant)
+            norm = nn.LayerNorm(name=f"{label}_norm")
+            if config.residual == "fusion":
+                return norm(x + found)
+            return norm(found) if quadrant is None else jnp.where(quadrant.any(-1, keepdims=True), norm(found), x)
 
         # An instance that no lane may attend to is padding and may hold anything, NaN included.
         traffic = jnp.where(mask.lane_traffic.any(0)[:, None], traffic, 0.0)
         # A traffic token carries its own position already.
         none = jnp.zeros_like(traffic)
-        traffic = fuse("T->T", traffic, none, traffic, none, mask.traffic_traffic)
-        traffic = fuse("T->L", traffic, none, lanes, lane_position, mask.traffic_lane)
-        fused = fuse("L->T", lanes, lane_position, traffic, none, mask.lane_traffic)
-        fused = fuse("L->L", fused, lane_position, fused, lane_position, mask.lane_lane)
+        fused = lanes
+        for i in range(config.spatial_depth):
+            traffic = fuse("T->T", i, traffic, none, traffic, none, mask.traffic_traffic)
+            traffic = fuse("T->L", i, traffic, none, fused, lane_position, mask.traffic_lane)
+            fused = fuse("L->T", i, fused, lane_position, traffic, none, mask.lane_traffic)
+            fused = fuse("L->L", i, fused, lane_position, fused, lane_position, mask.lane_lane)
 
         # Eq. (3): L' = T(F^(4)) + I(Q_type) * L.
         transformed = fused + Mlp((2 * self.dim, self.dim), name="transform")(fused)

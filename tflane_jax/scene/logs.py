@@ -172,3 +172,8 @@ class Log:
     paint_wear: float = 0.0
     seed: int = 0
     markers: PlacedMarkers | None = None
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Track frames per second, from the median interval; None for a log of fewer than two frames."""
+        return None if len(self.timestamps_ns) < 2 else 1e9 / float(np.median(np.diff(self.timestamps_ns)))

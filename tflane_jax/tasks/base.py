@@ -146,8 +146,17 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
     # -----------------------------------------------------------------------------------------------------------------
     # Comparing
 
-    def inference_variants(self) -> dict[str, Task[ExampleT, DataT, SourceT, MemoryT]]:
-        """Return variants of a trained model at inference, as further rows of a comparison, by suffix of its name."""
+    def interventions(self, data: DataT, config: EvaluationConfig) -> dict[str, EvaluationConfig]:
+        """Return further evaluations of a trained model on a split, which a comparison shows as rows.
+
+        Args:
+            data: the split.
+            config: the evaluation without intervention.
+
+        Returns:
+            By the suffix of the row's name.
+        """
+        del data, config
         return {}
 
     def remarks(self, params: Params) -> dict[str, str]:

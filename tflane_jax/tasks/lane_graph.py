@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -22,10 +22,13 @@ from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.interventions import traffic_interventions
 from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, Sightings, evaluate_lanes
+from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.openlane import ATTRIBUTES
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
@@ -67,6 +70,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         "DET_t",
         "TOP_ll",
         "TOP_lt",
+        "recall",
+        "AP_l",
         "DET_l@1.0",
         "DET_l@2.0",
         "DET_l@3.0",
@@ -82,6 +87,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             for name in ("DET_l", "TOP_ll", "recall")
             for group in ("all", "occluded", "clear", *Sightings.groups)
         ),
+        *(f"{group}/{name}" for name in ("recall", "AP_l") for group in LANE_GROUPS[:2]),
     )
 
     # -----------------------------------------------------------------------------------------------------------------
@@ -229,14 +235,21 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def evaluate(self, params: Params, data: Example | Streamed, config: EvaluationConfig) -> Evaluation:
         """Return the metrics of all parts that the host predicts and the examples label."""
-        metrics = evaluate_lanes(self, params, data, config)
-        return Evaluation(metrics.protocol, metrics.compute())
+        metrics = evaluate_lanes(self, params, data, config, ground=self._ground)
+        return Evaluation(metrics.protocol, metrics.compute(), ratios=metrics.ratios())
+
+    @property
+    def _ground(self) -> PerceptionRange | None:
+        """The range of the BEV evidence that the model sees; None for a model with cameras."""
+        encoder = self.model.encoder
+        return encoder.range if isinstance(encoder, EvidenceEncoderConfig) else None
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
         """Return the names of the host's metrics by group, with those of traffic elements if it predicts them."""
         marked = data.source("val").example.markers is not None
         groups = Sightings.groups if marked else ()
-        metrics = LaneGraphMetrics(config.versions, groups, self.model.predicts)
+        of_lanes = () if self._ground is None else LANE_GROUPS
+        metrics = LaneGraphMetrics(config.versions, groups, self.model.predicts, of_lanes)
         names = set(Evaluation("", metrics.compute()).scores())
         if self.model.elements is not None:
             of_elements = ["OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
@@ -295,30 +308,15 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     # -----------------------------------------------------------------------------------------------------------------
     # Comparing
 
-    def inference_variants(self) -> dict[str, Task[Example, Example | Streamed, LaneGraphSource, HostMemory | None]]:
-        """Return the variant without traffic flow at inference, for models with it (TF-Lane, Table 7)."""
-        if self.model.priors.traffic_flow is None:
-            return {}
-        return {"no traffic flow at inference": limit_instances(self, 0)}
+    def interventions(self, data: Example | Streamed, config: EvaluationConfig) -> dict[str, EvaluationConfig]:
+        """Return the evaluations of a model with traffic flow without it (TF-Lane, Table 7) and with that of others."""
+        traffic = self.model.priors.traffic_flow
+        blind = traffic is None or traffic.prior.top_instances == 0
+        return {} if blind else traffic_interventions(data, config)
 
 
 def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:
     return augment_example(example, config, key)
-
-
-def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
-    """Return the task with at most `count` instances of traffic flow, those with the largest weights; 0 is without.
-
-    Parameters stay the same. Raises UserError if the model takes no traffic flow or has fewer slots.
-    """
-    traffic = task.model.priors.traffic_flow
-    if traffic is None:
-        raise UserError("this run is a baseline without traffic flow: --max-instances has nothing to limit")
-    if not 0 <= count <= traffic.prior.max_instances:
-        raise UserError(f"--max-instances {count} is outside 0 to {traffic.prior.max_instances}, the model's slots")
-    limited = replace(traffic, prior=replace(traffic.prior, top_instances=count))
-    priors = replace(task.model.priors, traffic_flow=limited)
-    return replace(task, model=replace(task.model, priors=priors))
 
 
 def centerlines_of(prediction: Prediction) -> CenterlinePrediction:

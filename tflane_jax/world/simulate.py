@@ -22,7 +22,7 @@ from tflane_jax.world.traffic.simulation import Traffic, TrafficConfig, simulate
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
 
 ROOT = 20_250_711
-# Frames of history that every key frame has before it.
+# Frames that a scene has before its first key frame, unless its examples look back farther.
 HISTORY = 20
 
 
@@ -45,7 +45,8 @@ class WorldConfig:
         severity: 0 (clear) to 1 (worst): scales weather and paint wear and, weakly, traffic density and tracker
             noise.
         duration_s, rate_hz: length of a scene and its frame rate.
-        keyframes: moments at which examples are made, evenly spaced, each with 20 frames of history before it.
+        keyframes: moments at which examples are made, evenly spaced from the end of the first history to the end of
+            the scene.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -63,17 +64,22 @@ class WorldConfig:
         return round(self.duration_s * self.rate_hz)
 
 
-def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
+def simulate(scene_id: int, config: WorldConfig = WorldConfig(), history: int = HISTORY) -> Log:
     """Return the scene with this number (not negative).
+
+    Args:
+        scene_id: its number.
+        config: the world.
+        history: frames before the first key frame.
 
     Raises UserError if the scene is too short for its key frames or the severity is not between 0 and 1.
     """
     frames = config.frames
     if not 0.0 <= config.severity <= 1.0:
         raise UserError(f"severity must be between 0 and 1, not {config.severity}")
-    if config.keyframes > max(frames - HISTORY, 0):
+    if config.keyframes > max(frames - history, 0):
         raise UserError(
-            f"{config.keyframes} key frames with {HISTORY} frames of history each do not fit in the {frames} frames of "
+            f"{config.keyframes} key frames with {history} frames of history each do not fit in the {frames} frames of "
             f"{config.duration_s} s at {config.rate_hz} Hz: raise duration_s or lower keyframes"
         )
     network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
@@ -108,7 +114,7 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig()) -> Log:
         actors=actors,
         keyframes=tuple(
             KeyFrame(int(timestamps[f]), global_from_ego[f], int(f))
-            for f in np.linspace(HISTORY, frames - 1, config.keyframes).round().astype(int)
+            for f in np.linspace(history, frames - 1, config.keyframes).round().astype(int)
         ),
         element_attribute=attribute,
         weather=float(weather),

@@ -38,7 +38,8 @@ def compare(commands) -> None:
         "configs",
         metavar="[NAME=]FILE[:ABLATION]",
         nargs="+",
-        help="config files; the others are compared with the first one",
+        help="config files; the others are compared with the first one. One argument may also hold settings of this "
+        "row, such as 'NAME=FILE --optim.lr 1e-3'",
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="default 0 1 2 3 4")
     parser.add_argument(
@@ -55,6 +56,19 @@ def compare(commands) -> None:
     parser.add_argument(
         "--retrain", action="store_true", help="delete runs of other configurations in --out, and train again"
     )
+    declared = parser.add_argument_group("declared comparison", "written to --out before the trainings")
+    declared.add_argument(
+        "--primary", metavar="GROUP/SCORE", help="score that decides, for example hidden+traffic/recall"
+    )
+    declared.add_argument(
+        "--treatment", metavar="NAME", help="configuration whose effect is tested (default: the second of two)"
+    )
+    declared.add_argument(
+        "--negative-control",
+        metavar="GROUP/SCORE",
+        help="score on which the treatment should change nothing, for example hidden-traffic/recall",
+    )
+    declared.add_argument("--alpha", type=float, help="level of the corrected tests (default 0.05)")
     parser.set_defaults(takes_overrides=True)
 
 

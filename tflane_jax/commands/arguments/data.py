@@ -20,6 +20,18 @@ def data(commands) -> None:
     show.add_argument(
         "--out", metavar="FILE", type=Path, default=Path("samples.png"), help="picture (default samples.png)"
     )
+    stats = command(
+        inner,
+        "stats",
+        "count lanes, evidence and traffic of a split",
+        module="data_stats",
+        function="stats",
+        epilog=OVERRIDES,
+    )
+    stats.add_argument("--config", metavar="FILE[:NAME]", help="config file whose data to count")
+    split_arguments(stats, "test")
+    stats.add_argument("--count", type=int, default=400, help="examples, spread evenly (default 400)")
+    stats.set_defaults(takes_overrides=True)
     check = command(
         inner, "check", "count the content of a dataset's folder and list its faults", module="data", function="check"
     )

@@ -41,6 +41,11 @@ def evaluate(commands) -> None:
     model_arguments(parser)
     example_arguments(parser, "test")
     parser.add_argument(
+        "--traffic",
+        choices=("own", "none", "other-scene"),
+        help="traffic flow that the model sees: of the frame, none, or of another scene (default: the configuration's)",
+    )
+    parser.add_argument(
         "--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
     )
 

@@ -6,6 +6,8 @@ over the roof of a low box.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -13,6 +15,30 @@ from jaxtyping import Bool, Float, Int
 _ANGLE_MARGIN = 1e-9
 # Replaces a zero component of a ray direction: far smaller than any real one, and its inverse is finite.
 _NO_DIRECTION = 1e-30
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Points sorted by direction from the sensor.
+
+    Attributes:
+        order: (2 n,) point numbers by direction, twice.
+        angle: (2 n,) their directions over two turns, ascending, radians.
+        radius: (n,) distance of each point, metres.
+    """
+
+    order: Int[np.ndarray, " m"]
+    angle: Float[np.ndarray, " m"]
+    radius: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "n 2"]) -> Directions:
+        """Sort points."""
+        angle = np.arctan2(points[:, 1], points[:, 0])
+        order = np.argsort(angle)
+        # Two turns, so that an interval across +-pi is one slice as well.
+        turns = np.concatenate([angle[order], angle[order] + 2 * np.pi])
+        return cls(np.concatenate([order, order]), turns, np.hypot(points[:, 0], points[:, 1]))
 
 
 def hidden_points(
@@ -23,6 +49,7 @@ def hidden_points(
     sensor_height: float = 1.8,
     target_height: float | Float[np.ndarray, " n"] = 0.0,
     exclude: Int[np.ndarray, " n"] | None = None,
+    directions: Directions | None = None,
 ) -> Bool[np.ndarray, " n"]:
     """Return which points the sensor at (0, 0, `sensor_height`) cannot see.
 
@@ -38,10 +65,11 @@ def hidden_points(
         target_height: height of the points, a scalar or one value per point.
         exclude: for each point the row of `boxes` that must not hide it (the actor's own box); any other number
             excludes nothing.
+        directions: `Directions.of(points)`, for points at which one looks again and again.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     occluders = _occluders(boxes, buildings)
-    pair_point, pair_box = _pairs_in_angle(points, occluders)
+    pair_point, pair_box = _pairs_in_angle(Directions.of(points) if directions is None else directions, occluders)
     if exclude is not None:
         keep = np.asarray(exclude)[pair_point] != pair_box
         pair_point, pair_box = pair_point[keep], pair_box[keep]
@@ -63,7 +91,7 @@ def _occluders(boxes: np.ndarray, buildings: np.ndarray) -> Float[np.ndarray, "o
     return np.concatenate([np.concatenate([boxes[:, :5], low_high], -1), np.concatenate([buildings, unlimited], -1)])
 
 
-def _pairs_in_angle(points: np.ndarray, occluders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pairs_in_angle(points: Directions, occluders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (point, occluder) index pairs in which the occluder may hide the point.
 
     Seen from the origin a convex footprint covers one interval of directions below half a turn, so sorting
@@ -88,18 +116,14 @@ def _pairs_in_angle(points: np.ndarray, occluders: np.ndarray) -> tuple[np.ndarr
     low = (middle + offset.min(-1) - _ANGLE_MARGIN + np.pi) % (2 * np.pi) - np.pi
     span = offset.max(-1) - offset.min(-1) + 2 * _ANGLE_MARGIN
 
-    angle = np.arctan2(points[:, 1], points[:, 0])
-    order = np.argsort(angle)
-    # Two turns of sorted directions, so that an interval across +-pi is one slice as well.
-    turns = np.concatenate([angle[order], angle[order] + 2 * np.pi])
-    first = np.searchsorted(turns, low, side="left")
-    count = np.where(around_ego, 0, np.searchsorted(turns, low + span, side="right") - first)
+    first = np.searchsorted(points.angle, low, side="left")
+    count = np.where(around_ego, 0, np.searchsorted(points.angle, low + span, side="right") - first)
     box = np.repeat(np.arange(len(occluders)), count)
     within = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
-    point = np.concatenate([order, order])[first[box] + within]
+    point = points.order[first[box] + within]
 
     nearest = np.hypot(x, y) - np.hypot(length, width) / 2
-    behind = np.hypot(points[:, 0], points[:, 1])[point] > nearest[box]
+    behind = points.radius[point] > nearest[box]
     return point[behind], box[behind]
 
 

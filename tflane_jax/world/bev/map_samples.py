@@ -47,14 +47,15 @@ def sample_map(vector_map: VectorMap) -> MapSamples:
     points, along = [np.zeros((0, 3))], [np.zeros(0)]
     number = [np.zeros(0, int)]
     for i, (line, kind) in enumerate(lines):
-        at, length = _stations(line)
+        at, reached = _stations(line)
+        length = reached[-1]
         if kind == LineType.DASHED:
             # Anchored at the middle, so that the dashes do not depend on the direction of travel.
             at = at[(at - length / 2 + DASH / 2) % DASH_PERIOD < DASH]
-        points.append(sample_at(line, at))
+        points.append(sample_at(line, at, reached))
         along.append(at)
         number.append(np.full(len(at), i))
-    edges = [np.zeros((0, 3)), *(sample_at(line, _stations(line)[0]) for line in vector_map.road_boundaries)]
+    edges = [np.zeros((0, 3)), *(sample_at(line, *_stations(line)) for line in vector_map.road_boundaries)]
     crossings = [np.zeros((0, 3)), *map(_fill, vector_map.crossings)]
     return MapSamples(
         paint=np.concatenate(points),
@@ -78,7 +79,8 @@ def painted_lines(vector_map: VectorMap) -> list[tuple[np.ndarray, int]]:
 def line_key(line: np.ndarray) -> tuple[float, ...]:
     """Return a key that is equal for two copies of one line, in either direction."""
     ends = sorted(tuple(np.round(point[:2], 1)) for point in (line[0], line[-1]))
-    middle = np.round(sample_at(line, np.array([arc_length(line)[-1] / 2]))[0, :2], 0)
+    along = arc_length(line)
+    middle = np.round(sample_at(line, along[-1:] / 2, along)[0, :2], 0)
     return (*ends[0], *ends[1], *middle)
 
 
@@ -88,10 +90,10 @@ def _boundaries(vector_map: VectorMap) -> Iterable[tuple[np.ndarray, int]]:
         yield segment.right, segment.right_type
 
 
-def _stations(line: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return distances along a line, `SPACING` apart, and its length."""
-    length = arc_length(line)[-1]
-    return np.arange(0.0, length + SPACING / 2, SPACING), length
+def _stations(line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances along a line, `SPACING` apart, and those of its vertices."""
+    along = arc_length(line)
+    return np.arange(0.0, along[-1] + SPACING / 2, SPACING), along
 
 
 def _fill(ring: np.ndarray) -> np.ndarray:

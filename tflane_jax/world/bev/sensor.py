@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from tflane_jax.geometry import BevGrid, PerceptionRange, transform_points
 from tflane_jax.scene import BevChannel
-from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.bev.line_of_sight import Directions, hidden_points
 from tflane_jax.world.bev.map_samples import MapSamples
 
 # Range to which the blur and error settings refer, metres.
@@ -65,7 +65,9 @@ def hidden_cells(
     grid: BevGrid, boxes: Float[np.ndarray, "k 7"], buildings: Float[np.ndarray, "b 5"]
 ) -> Bool[np.ndarray, "h w"]:
     """Return the cells whose centre on the ground the sensor cannot see (see `hidden_points`)."""
-    return hidden_points(_lattice(grid).centres, boxes, buildings).reshape(grid.rows, grid.columns)
+    lattice = _lattice(grid)
+    hidden = hidden_points(lattice.centres, boxes, buildings, directions=lattice.directions)
+    return hidden.reshape(grid.rows, grid.columns)
 
 
 def render_bev(
@@ -118,10 +120,11 @@ def render_bev(
 
 @dataclass(frozen=True)
 class _Lattice:
-    """A grid with values that every frame needs: cell centres (H W, 2) and their range (H, W), metres."""
+    """A grid with values that every frame needs: cell centres (H W, 2), their directions and range (H, W), metres."""
 
     grid: BevGrid
     centres: np.ndarray
+    directions: Directions
     range: np.ndarray
 
     def noise(self, rng: np.random.Generator, channels: int, patch: float) -> Float[np.ndarray, "c h w"]:
@@ -158,7 +161,7 @@ class _Lattice:
 def _lattice(grid: BevGrid) -> _Lattice:
     x, y = np.meshgrid(*grid.centers())
     centres = np.stack([x.ravel(), y.ravel()], -1)
-    return _Lattice(grid, centres, np.hypot(x, y).astype(np.float32))
+    return _Lattice(grid, centres, Directions.of(centres), np.hypot(x, y).astype(np.float32))
 
 
 @functools.lru_cache(maxsize=32)
@@ -256,10 +259,7 @@ def _soften(crisp: np.ndarray, lattice: _Lattice, severity: float, far_blur: flo
 
 def _smooth(image: np.ndarray) -> np.ndarray:
     """Blur by (1, 2, 1) / 4 along rows and columns, repeating the border."""
-    for axis in (1, 2):
-        pad = [(0, 0), (0, 0), (0, 0)]
-        pad[axis] = (1, 1)
-        wide = np.pad(image, pad, mode="edge")
-        low, high = (slice(None),) * axis + (slice(None, -2),), (slice(None),) * axis + (slice(2, None),)
-        image = 0.25 * (wide[low] + wide[high]) + 0.5 * image
-    return image
+    rows = np.concatenate([image[:, :1], image, image[:, -1:]], 1)
+    image = 0.25 * (rows[:, :-2] + rows[:, 2:]) + 0.5 * image
+    columns = np.concatenate([image[:, :, :1], image, image[:, :, -1:]], 2)
+    return 0.25 * (columns[:, :, :-2] + columns[:, :, 2:]) + 0.5 * image

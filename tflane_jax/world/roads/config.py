@@ -51,6 +51,7 @@ class RoadConfig:
         pocket: length of a turning lane, taper included.
         skew: largest deviation of the arms of an intersection from the right angle.
         arm_offset: largest sideways shift of an arm from the intersection's centre.
+        junction_lanes: largest number of through lanes per direction of a T or four-way intersection's main road.
         one_way, median, bike, parking: probability for a street.
         mid_block_crossing: probability for a street without intersection.
         signals: probability for an intersection.
@@ -95,6 +96,7 @@ class RoadConfig:
     pocket: Range = (38.0, 46.0)
     skew: float = 25.0
     arm_offset: float = 2.0
+    junction_lanes: int = 3
     one_way: float = 0.2
     median: float = 0.35
     bike: float = 0.25

@@ -64,6 +64,7 @@ def plan_junctions(rng: np.random.Generator, kind: SceneKind, config: RoadConfig
         return _plan_roundabout(rng, heading, config)
     four = kind is SceneKind.FOUR_WAY
     major = int(rng.choice([1, 2, 3], p=[0.35, 0.5, 0.15] if four else [0.4, 0.4, 0.2]))
+    major = min(major, config.junction_lanes)
     minor = int(rng.integers(1, 3)) if major == 2 else 1
     main = _draw_main(rng, major, config)
     signalised = chance(rng, config.signals if major > 1 else 0.5 * config.signals)

@@ -67,6 +67,10 @@ class Trips:
     drivers: Drivers
     enters: Float[np.ndarray, " n"]
 
+    def take(self, rows: Int[np.ndarray, " m"]) -> Trips:
+        """Return some trips."""
+        return Trips(self.routes.take(rows), self.drivers.take(rows), self.enters[rows])
+
 
 def draw_trips(
     rng: np.random.Generator,
@@ -111,7 +115,7 @@ def draw_trips(
             at_edge = (rng.random(len(times)) < 0.5 * ratio) & shared
             kind = np.where(at_edge, int(RoadUser.BICYCLE), kind)
         else:
-            times = _arrivals(rng, start, stop, busy * bicycles_per_metre * 5.0)
+            times = _arrivals(rng, start, stop, min(busy * bicycles_per_metre * 5.0, _LANE_CAPACITY))
             kind, at_edge = np.full(len(times), int(RoadUser.BICYCLE)), np.zeros(len(times), bool)
         enters.append(times)
         category.append(kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -70,7 +71,7 @@ class LaneTable:
     intersection: Int[np.ndarray, " s"]
     phase: Int[np.ndarray, " s"]
 
-    @property
+    @cached_property
     def is_gate(self) -> Bool[np.ndarray, " s"]:
         """(S,) segments before which a driver must check signals or priority."""
         return (self.intersection >= 0) | self.yields.any(1) | self.crosses.any(1)

@@ -30,27 +30,27 @@ class Signals:
     green: Float[np.ndarray, "i p"]
     offset: Float[np.ndarray, " i"]
 
-    def green_phase(self, time: float) -> Int[np.ndarray, " i"]:
+    def green_phase(self, time: float | Float[np.ndarray, "*t"]) -> Int[np.ndarray, "*t i"]:
         """Return which phase is green at each intersection, -1 between phases."""
         phase, left = self._phase(time)
         return np.where(left > _CLEARANCE, phase, -1)
 
-    def shown(self, time: float) -> Int[np.ndarray, "i p"]:
+    def shown(self, time: float | Float[np.ndarray, "*t"]) -> Int[np.ndarray, "*t i p"]:
         """Return the light state of each phase at each intersection: red, green, or yellow after green."""
         phase, left = self._phase(time)
-        state = np.full(self.green.shape, RED)
         now = np.where(left > _CLEARANCE, GREEN, np.where(left > _CLEARANCE - _YELLOW, YELLOW, RED))
-        state[np.arange(len(phase)), phase] = now
-        return state
+        return np.where(np.arange(self.green.shape[1]) == phase[..., None], now[..., None], RED)
 
-    def _phase(self, time: float) -> tuple[Int[np.ndarray, " i"], Float[np.ndarray, " i"]]:
+    def _phase(
+        self, time: float | Float[np.ndarray, "*t"]
+    ) -> tuple[Int[np.ndarray, "*t i"], Float[np.ndarray, "*t i"]]:
         """Return the current phase of each intersection and its remaining time (seconds, clearance included)."""
         slot = np.where(self.green > 0.0, self.green + _CLEARANCE, 0.0)
         ends = np.cumsum(slot, 1)
-        at = (time + self.offset) % np.maximum(ends[:, -1], 1e-9)
-        phase = (ends <= at[:, None]).sum(1)
+        at = (np.asarray(time)[..., None] + self.offset) % np.maximum(ends[:, -1], 1e-9)
+        phase = (ends <= at[..., None]).sum(-1)
         phase = np.minimum(phase, self.green.shape[1] - 1)
-        return phase, ends[np.arange(len(phase)), phase] - at
+        return phase, ends[np.arange(len(ends)), phase] - at
 
     def red(self, table: LaneTable, time: float) -> Bool[np.ndarray, " s"]:
         """Return the segments that must not be entered now."""
@@ -84,7 +84,7 @@ def element_states(network: RoadNetwork, signals: Signals, times: Float[np.ndarr
     """Return the attribute of each map element at each time: a light follows its
     signals, every other element keeps its attribute."""
     state = np.tile(np.array([element.attribute for element in network.map.elements], int), (len(times), 1))
-    shown = np.stack([signals.shown(float(time)) for time in times])
+    shown = signals.shown(times)
     for number, element in enumerate(network.map.elements):
         onward = [j for i in element.lanes for j in (i, *network.map.segments[i].successors)]
         governed = [network.signal_phase[j] for j in onward if j in network.signal_phase]

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.scene import RoadUser
 from tflane_jax.world.roads.networks import RoadNetwork
-from tflane_jax.world.traffic.demand import draw_trips
+from tflane_jax.world.traffic.demand import Trips, draw_trips
 from tflane_jax.world.traffic.lane_table import LaneTable, build_lane_table
 from tflane_jax.world.traffic.pedestrians import Walkers, crossing_places, draw_crossers, walk_sidewalks
 from tflane_jax.world.traffic.rollout import Rollout
 from tflane_jax.world.traffic.signals import Signals, draw_signals, turn_green
-from tflane_jax.world.traffic.vehicles import draw_drivers
+from tflane_jax.world.traffic.vehicles import Drivers, draw_drivers
 
-# Warm-up before the log begins, its time step, and how long before its end the ego vehicle joins, seconds.
-_WARM_UP, _WARM_UP_STEP, _EGO_JOINS = 20.0, 0.4, 3.2
-# Largest time step while logging, seconds; frames in between assume constant acceleration within the step.
-_LONGEST_STEP = 0.2
+# Time step of the warm-up, and how long before its end the ego vehicle joins, seconds.
+_WARM_UP_STEP, _EGO_JOINS = 0.4, 3.2
 # Places tried for the ego vehicle.
 _EGO_CHOICES = 6
+# Its mean speed as a fraction of the free speed, and how far from the middle of its route it may aim, metres.
+_EGO_PACE, _EGO_AIM = 0.95, 20.0
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,16 @@ class TrafficConfig:
         pedestrians_per_metre: on sidewalks.
         crossers_per_minute: crossing pedestrians, for each crossing.
         ego_top_speed: m/s.
+        ego_passes_s: time at which the ego vehicle passes the middle of its route, so the central feature of the roads,
+            up to 20 m and what traffic allows, seconds after the first frame; None starts it anywhere on the route.
+        variety: how much the amounts differ between scenes: moving vehicles, parked vehicles and pedestrians of a
+            scene are each multiplied by exp(variety * z - variety^2 / 2), z standard normal, so that the means stay.
         green_wave: probability that the first light on the ego vehicle's way turns green about when the log begins.
         range: distance from the ego vehicle up to which road users are reported, metres.
+        warm_up_s: time for which traffic settles before the log begins, seconds: at least 3.2, when the ego vehicle
+            joins.
+        early_s: time before the warm-up from which vehicles are on their way, seconds: a slow drive through the map.
+        step_s: largest time step, seconds; frames within a step assume constant acceleration.
     """
 
     vehicles_per_metre: float = 0.032
@@ -51,9 +59,14 @@ class TrafficConfig:
     parked_share: float = 0.55
     pedestrians_per_metre: float = 0.015
     crossers_per_minute: float = 3.0
+    variety: float = 0.0
     ego_top_speed: float = 14.0
+    ego_passes_s: float | None = None
     green_wave: float = 0.6
     range: float = 90.0
+    warm_up_s: float = 20.0
+    early_s: float = 40.0
+    step_s: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -83,20 +96,21 @@ def simulate_traffic(
     rng: np.random.Generator, network: RoadNetwork, config: TrafficConfig, *, frames: int, rate_hz: float
 ) -> Traffic:
     """Let traffic settle, then record `frames` frames."""
+    config = _varied(rng, config)
     table = build_lane_table(network)
     times = np.arange(frames) / rate_hz
     stop = times[-1] if frames else 0.0
-    start = -_WARM_UP
+    steps = max(round((config.warm_up_s - _EGO_JOINS) / _WARM_UP_STEP), 0)
+    start = -(steps * _WARM_UP_STEP + _EGO_JOINS)
 
     index = {int(segment): i for i, segment in enumerate(table.ids)}
     way = tuple(index[i] for i in network.ego_routes[rng.integers(len(network.ego_routes))])
     signals = _signals_for_ego(rng, table, way, config.green_wave)
-    # Look back by the duration of a slow drive through the map: older trips have left it by now.
     trips = draw_trips(
         rng,
         table,
         way,
-        start=start - 40.0,
+        start=start - config.early_s,
         stop=stop + 5.0,
         vehicles_per_metre=config.vehicles_per_metre,
         bicycles_per_metre=config.bicycles_per_metre,
@@ -107,18 +121,35 @@ def simulate_traffic(
     places = crossing_places(network.walk_across, table)
     road = Rollout(table, signals, trips, crossers, places, len(network.walk_across))
     road.place_early_trips(start)
-    ego_starts = _ego_starts(rng, road, stop + _EGO_JOINS)
-    joins = round((_WARM_UP - _EGO_JOINS) / _WARM_UP_STEP)
-    road.drive(start, _WARM_UP_STEP, joins, 1)
-    road.put_ego(ego_starts)
+    road.drive(start, _WARM_UP_STEP, steps, 1)
+    road.put_ego(_ego_starts(rng, road, stop + _EGO_JOINS, config.ego_passes_s))
     road.drive(-_EGO_JOINS, _WARM_UP_STEP, round(_EGO_JOINS / _WARM_UP_STEP), 1)
 
-    substeps = max(1, int(_LONGEST_STEP * rate_hz + 1e-9))
+    substeps = max(1, int(config.step_s * rate_hz + 1e-9))
     position, progress = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
-    driven = _driven(road, position[:frames])
+    position = position[:frames]
+    # Most trips end before the log begins or start after it ends; the ego vehicle's is the first.
+    here = ((position >= 0.0) & (position <= road.trips.routes.length)).any(0)
+    rows = np.flatnonzero(here | (np.arange(position.shape[1]) == 0))
+    driven = _driven(road.trips.take(rows), road.table, position[:, rows])
     walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]
     walking.append(crossers.paths(progress[:frames]))
-    return _assemble(rng, network, config, road, driven, walking)
+    return _assemble(rng, network, config, driven, walking, signals)
+
+
+def _varied(rng: np.random.Generator, config: TrafficConfig) -> TrafficConfig:
+    """Draw the amounts of one scene."""
+    if config.variety == 0.0:
+        return config
+    vehicles, parked, people = np.exp(config.variety * rng.standard_normal(3) - 0.5 * config.variety**2)
+    return replace(
+        config,
+        vehicles_per_metre=vehicles * config.vehicles_per_metre,
+        bicycles_per_metre=vehicles * config.bicycles_per_metre,
+        parked_share=min(parked * config.parked_share, 1.0),
+        pedestrians_per_metre=people * config.pedestrians_per_metre,
+        crossers_per_minute=people * config.crossers_per_minute,
+    )
 
 
 def _signals_for_ego(rng: np.random.Generator, table: LaneTable, way: tuple[int, ...], green_wave: float) -> Signals:
@@ -131,13 +162,22 @@ def _signals_for_ego(rng: np.random.Generator, table: LaneTable, way: tuple[int,
     return signals
 
 
-def _ego_starts(rng: np.random.Generator, road: Rollout, duration: float) -> Float[np.ndarray, " c"]:
+def _ego_starts(
+    rng: np.random.Generator, road: Rollout, duration: float, passes_s: float | None
+) -> Float[np.ndarray, " c"]:
     """Draw candidate start positions on the ego route: early enough to stay on it, and not inside a junction."""
     routes, table = road.trips.routes, road.table
     way = routes.segment[0, np.isfinite(routes.start[0])]
     speed = min(float(np.median(table.speed_at_start[way])), road.trips.drivers.top_speed[0])
     # The continuation of the route to the border of the map must not be driven; 50 m is more than half of it.
     starts = rng.uniform(5.0, max(routes.length[0] - 50.0 - speed * duration, 10.0), _EGO_CHOICES)
+    if passes_s is not None:
+        aim = 0.5 * routes.length[0] + rng.uniform(-_EGO_AIM, _EGO_AIM, _EGO_CHOICES)
+        rows = np.flatnonzero(road.active)
+        on_way = rows[np.isin(routes.take(rows).place(road.position[rows])[0], way)]
+        if len(on_way):
+            speed = min(speed, float(road.speed[on_way].mean()))
+        starts = np.maximum(aim - _EGO_PACE * speed * (_EGO_JOINS + passes_s), 5.0)
     for i, at in enumerate(starts):
         leg = int((routes.start[0] <= at).sum()) - 1
         while leg > 0 and table.is_gate[routes.segment[0, leg]]:
@@ -146,11 +186,19 @@ def _ego_starts(rng: np.random.Generator, road: Rollout, duration: float) -> Flo
     return np.maximum(starts, 3.0)
 
 
-def _driven(
-    road: Rollout, position: Float[np.ndarray, "f n"]
-) -> tuple[Float[np.ndarray, "f n 2"], Float[np.ndarray, "f n"], Bool[np.ndarray, "f n"]]:
-    """Return box centres, headings and presence of all trips: front and rear wheels stay on the lane."""
-    routes, drivers, table = road.trips.routes, road.trips.drivers, road.table
+@dataclass(frozen=True)
+class _Driven:
+    """Vehicles of N trips over F frames: box centres, headings, presence, sizes and categories."""
+
+    xy: Float[np.ndarray, "f n 2"]
+    yaw: Float[np.ndarray, "f n"]
+    present: Bool[np.ndarray, "f n"]
+    drivers: Drivers
+
+
+def _driven(trips: Trips, table: LaneTable, position: Float[np.ndarray, "f n"]) -> _Driven:
+    """Return the vehicles at distances along their routes: front and rear wheels stay on the lane."""
+    routes, drivers = trips.routes, trips.drivers
     present = (position >= 0.0) & (position <= routes.length)
     at = np.where(present, position, 0.0)
     wheelbase = 0.6 * drivers.size[:, 0]
@@ -163,19 +211,19 @@ def _driven(
     )
     xy = xy + sway[..., None] * np.stack([-np.sin(heading), np.cos(heading)], -1)
     middle, axis = xy.mean(2), xy[:, :, 1] - xy[:, :, 0]
-    return middle.transpose(1, 0, 2), np.arctan2(axis[..., 1], axis[..., 0]).T, present
+    return _Driven(middle.transpose(1, 0, 2), np.arctan2(axis[..., 1], axis[..., 0]).T, present, drivers)
 
 
 def _assemble(
     rng: np.random.Generator,
     network: RoadNetwork,
     config: TrafficConfig,
-    road: Rollout,
-    driven: tuple[np.ndarray, np.ndarray, np.ndarray],
+    driven: _Driven,
     walking: list[Walkers],
+    signals: Signals,
 ) -> Traffic:
     """Join vehicles, parked vehicles and pedestrians; drop those that never come near the ego vehicle."""
-    xy, yaw, present = driven
+    xy, yaw, present, drivers = driven.xy, driven.yaw, driven.present, driven.drivers
     frames = len(xy)
     slots = network.parking[rng.random(len(network.parking)) < config.parked_share]
     lorry = rng.random(len(slots)) < 0.06
@@ -188,7 +236,6 @@ def _assemble(
     def still(values: np.ndarray) -> np.ndarray:
         return np.broadcast_to(values, (frames, *values.shape))
 
-    drivers = road.trips.drivers
     xy = np.concatenate([xy, still(slots[:, :2]), *(w.xy for w in walking)], 1)
     yaw = np.concatenate([yaw, still(slots[:, 2]), *(w.yaw for w in walking)], 1)
     present = np.concatenate([present, still(np.ones(len(slots), bool)), *(w.present for w in walking)], 1)
@@ -198,4 +245,4 @@ def _assemble(
     present = present & (np.hypot(*(xy - ego[:, None, :2]).transpose(2, 0, 1)) < config.range)
     present[:, 0] = False
     seen = present.any(0)
-    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, road.signals)
+    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, signals)

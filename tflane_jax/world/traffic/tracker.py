@@ -18,8 +18,6 @@ from tflane_jax.world.bev.line_of_sight import hidden_points
 
 # Points of a box tested for line of sight, in half lengths and half widths: middle and near the corners.
 _PROBES = 0.9 * np.array([[0.0, 0.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-# Line of sight is computed this often and interpolated, seconds.
-_LOOK_EVERY = 0.3
 
 
 @dataclass(frozen=True)
@@ -40,6 +38,7 @@ class TrackerConfig:
         coast: frames for which a lost track is continued.
         switch_rate: identity switches per second between two neighbours nearer than `switch_distance`.
         switch_distance: metres.
+        look_every_s: interval at which line of sight is computed, seconds; it is interpolated in between.
     """
 
     range: float = 60.0
@@ -55,6 +54,7 @@ class TrackerConfig:
     coast: int = 5
     switch_rate: float = 0.02
     switch_distance: float = 3.5
+    look_every_s: float = 0.3
 
     def with_noise(self, scale: float) -> TrackerConfig:
         """Return the tracker with noise and misses scaled."""
@@ -170,7 +170,7 @@ def _detections(
     else:
         chance = np.where(distance <= config.range, 1.0, 0.0)
     if config.view_needed > 0.0:
-        stride = max(1, int(_LOOK_EVERY * rate_hz + 1e-9))
+        stride = max(1, int(config.look_every_s * rate_hz + 1e-9))
         share = visible_share(actors, global_from_ego, buildings, stride)
         chance = chance * np.clip(share / config.view_needed, 0.0, 1.0)
     return actors.valid & (rng.random(distance.shape) < chance * (1.0 - config.drop))
@@ -237,8 +237,11 @@ def _switch(
     there[1:] &= identity[:-1] >= 0
     there[:1] = False
     x, y = np.where(there[..., None], xy, np.inf).transpose(2, 0, 1)
-    near_x = np.abs(np.where(there, x, 0.0)[:, :, None] - np.where(there, x, 1e6)[:, None]) < config.switch_distance
+    seen = np.flatnonzero(there.any(0))
+    at, elsewhere = np.where(there, x, 0.0)[:, seen], np.where(there, x, 1e6)[:, seen]
+    near_x = np.abs(at[:, :, None] - elsewhere[:, None]) < config.switch_distance
     frame, a, b = np.nonzero(np.triu(near_x, 1))
+    a, b = seen[a], seen[b]
     close = there[frame, a] & there[frame, b]
     frame, a, b = frame[close], a[close], b[close]
     close = np.hypot(x[frame, a] - x[frame, b], y[frame, a] - y[frame, b]) < config.switch_distance

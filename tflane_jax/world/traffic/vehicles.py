@@ -68,6 +68,10 @@ class Drivers:
     offset: Float[np.ndarray, " n"]
     phase: Float[np.ndarray, " n"]
 
+    def take(self, rows: Int[np.ndarray, " m"]) -> Drivers:
+        """Return some of them."""
+        return Drivers(**{name: values[rows] for name, values in vars(self).items()})
+
 
 def draw_drivers(rng: np.random.Generator, category: Int[np.ndarray, " n"]) -> Drivers:
     """Draw one road user for each given category. The number of draws from `rng` depends on N alone."""

@@ -1,0 +1,101 @@
+"""Declared comparisons on the command line: what is tested is written down first and never changes."""
+
+import json
+
+import pytest
+
+from tests.ablations.test_identity import QUICK
+from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations import workers
+from tflane_jax.cli import main
+
+pytestmark = pytest.mark.usefixtures("cheap")
+PRIMARY = ["--primary", "all/recall"]
+
+
+def compare(config, out, seeds, *arguments, rows=("base={}:baseline", "tfm={}")):
+    named = [row.format(config) for row in rows]
+    return main(["compare", *named, "--seeds", *seeds, "--out", str(out), *QUICK, *arguments])
+
+
+def test_a_declaration_is_written_first_and_kept(tiny, tmp_path, monkeypatch, capsys):
+    out, seen = tmp_path / "out", []
+    train_run = workers.train_run
+
+    def train(config, folder, **options):
+        seen.append(json.loads((out / "declaration.json").read_text()))
+        return train_run(config, folder, **options)
+
+    monkeypatch.setattr(workers, "train_run", train)
+    arguments = [*PRIMARY, "--negative-control", "all/DET_l", "--alpha", "0.01"]
+    assert compare(tiny, out, "012", *arguments) == 0
+    declared = json.loads((out / "declaration.json").read_text())
+    assert seen == [declared] * 6
+    assert declared["begun"] == 0
+    assert (declared["primary"], declared["negative_control"], declared["treatment"]) == (
+        "all/recall",
+        "all/DET_l",
+        "tfm",
+    )
+    text = (out / "effects.md").read_text()
+    assert "Declared before any run" in text
+    assert "level 0.01, 3 seeds" in text
+    assert "tfm, traffic of another scene" in text
+
+    # Fewer seeds are an interim look, other measures or further seeds another comparison.
+    assert compare(tiny, out, "01", *arguments) == 0
+    assert "**Interim**: 2 of 3 declared seeds (0, 1)." in (out / "effects.md").read_text()
+    capsys.readouterr()
+    for changed in (
+        ["0123", *arguments],
+        ["012", *PRIMARY],
+        ["012", "--primary", "all/DET_l", "--negative-control", "all/recall", "--alpha", "0.01"],
+    ):
+        assert compare(tiny, out, *changed) == 2
+        assert "holds another declaration" in capsys.readouterr().err
+    assert json.loads((out / "declaration.json").read_text()) == declared
+
+
+def test_a_late_declaration_says_so(tiny, tmp_path):
+    assert compare(tiny, tmp_path, "01") == 0
+    assert not (tmp_path / "effects.md").exists()
+    assert compare(tiny, tmp_path, "01", *PRIMARY) == 0
+    assert "Declared when 4 runs had begun already" in (tmp_path / "effects.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--primary", "hiden+traffic/recall"], "base is not measured by hiden+traffic/recall, only by "),
+        ([*PRIMARY, "--negative-control", "all/recal"], "not measured by all/recal"),
+        ([*PRIMARY, "--negative-control", "all/recall"], "cannot be primary measure and negative control"),
+        ([*PRIMARY, "--treatment", "base"], "choose one of the others (tfm)"),
+        ([*PRIMARY, "--alpha", "1"], "--alpha 1 is no significance level"),
+        (["--treatment", "tfm"], "--treatment belongs to a declared comparison: add --primary"),
+        (["--negative-control", "all/recall"], "--negative-control belongs to a declared comparison"),
+    ],
+)
+def test_mistakes_are_named_before_anything_is_trained(tiny, tmp_path, capsys, arguments, message):
+    assert compare(tiny, tmp_path / "out", "0", *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_row_may_have_settings_of_its_own(tiny, tmp_path, capsys):
+    matched = "matched={} --task.model.priors.traffic-flow.prior.top-instances 0"
+    rows = ("base={}:baseline", "tfm={}", matched)
+    assert compare(tiny, tmp_path, "0", *PRIMARY, rows=rows) == 2
+    assert "--treatment NAME" in capsys.readouterr().err
+    assert compare(tiny, tmp_path, "0", *PRIMARY, "--treatment", "tfm", rows=rows) == 0
+    saved = {name: (tmp_path / name / "seed_0" / "config.txt").read_text() for name in ("tfm", "matched")}
+    setting = "task.model.priors.traffic_flow.prior.top_instances"
+    assert f"{setting} = None" in saved["tfm"]
+    assert f"{setting} = 0" in saved["matched"]
+    # The matched control sees no traffic: it has no interventions.
+    assert list(json.loads((tmp_path / "scores.json").read_text())) == [
+        "base",
+        "tfm",
+        "tfm, no traffic flow at inference",
+        "tfm, traffic of another scene",
+        "matched",
+    ]

@@ -1,0 +1,166 @@
+"""Effects of a declared comparison: differences, intervals and findings, on results made by hand."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tflane_jax.ablations.declaration import Declaration, Declared
+from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence
+from tflane_jax.ablations.results import Results
+from tflane_jax.ablations.scores import Measured
+from tflane_jax.ablations.statistics import holm, paired_difference, scene_weights
+from tflane_jax.evaluation.results import SceneRatio
+
+SCENES, SEEDS = 40, (0, 1, 2, 3)
+PRIMARY, CONTROL = "hidden+traffic/recall", "hidden-traffic/recall"
+NEGATIVE, DIFFERENCE = f"negative control {CONTROL}", "difference of the two"
+DECLARED = Declaration(PRIMARY, "+TFM", CONTROL)
+LANES = {name: np.random.default_rng([7, i]).integers(0, 20, SCENES) for i, name in enumerate((PRIMARY, CONTROL))}
+
+
+def measured(seed, **ways):
+    """Return a measurement whose recall is about that given for each way: (primary, control)."""
+    scores, ratios = {}, {}
+    for way, recalls in ways.items():
+        rng = np.random.default_rng([seed, *(round(1000 * recall) for recall in recalls)])
+        way = "" if way == "own" else way
+        scores[way], ratios[way] = {}, {}
+        for name, recall in zip((PRIMARY, CONTROL), recalls, strict=True):
+            found, lanes = rng.binomial(LANES[name], recall), LANES[name]
+            ratios[way][name] = SceneRatio(tuple(found.tolist()), tuple(lanes.tolist()))
+            scores[way][name] = found.sum() / lanes.sum()
+        scores[way]["all/AP_l"] = 0.5 + 0.01 * rng.random()
+    return Measured(4, "a protocol", scores, ratios)
+
+
+@pytest.fixture(scope="module")
+def results():
+    """The treatment finds more lanes with traffic, and as many without; taking the traffic away undoes it."""
+    found = Results(("baseline", "+TFM", "matched"), SEEDS, {})
+    for which in ("last", "best"):
+        for seed in SEEDS:
+            found.add("", which, "baseline", seed, measured(seed, own=(0.3, 0.3)))
+            found.add("", which, "+TFM", seed, measured(seed, own=(0.6, 0.3), none=(0.2, 0.3)))
+            found.add("", which, "matched", seed, measured(seed, own=(0.31, 0.3), none=(0.9, 0.9)))
+    return found
+
+
+def test_differences_and_tests_are_those_of_the_scores(results):
+    found = effects(results, DECLARED, "", "last")
+    names = [PRIMARY, NEGATIVE, DIFFERENCE]
+    # Interventions on other models than the treatment are not compared with.
+    assert [(e.measure, e.row) for e in found] == [
+        (name, row) for name in names for row in ("baseline", "+TFM, none", "matched")
+    ]
+    table = results.rows("", "last")
+    value = {
+        PRIMARY: lambda row, seed: table[row][seed][PRIMARY],
+        NEGATIVE: lambda row, seed: table[row][seed][CONTROL],
+        DIFFERENCE: lambda row, seed: table[row][seed][PRIMARY] - table[row][seed][CONTROL],
+    }
+    for name in names:
+        of_measure = [e for e in found if e.measure == name]
+        for e in of_measure:
+            treated, other = (np.array([value[name](row, seed) for seed in SEEDS]) for row in ("+TFM", e.row))
+            test = paired_difference(treated, other)
+            assert (e.difference, e.p, e.better) == (pytest.approx(test.mean), pytest.approx(test.p_value), test.better)
+            assert e.mean == pytest.approx(other.mean())
+            assert e.low < e.difference < e.high
+        assert [e.p_holm for e in of_measure] == holm([e.p for e in of_measure])
+
+
+def test_intervals_against_a_loop_over_drawn_scenes(results):
+    effect = effects(results, DECLARED, "", "last")[6]  # primary minus control, against the baseline
+    counts = results.ratios["", "last"]
+
+    def recall(row, name, drawn):
+        ratios = [counts[row][seed][name] for seed in SEEDS]
+        return np.mean([np.array(r.numerator)[drawn].sum() / np.array(r.denominator)[drawn].sum() for r in ratios])
+
+    samples = []
+    for times in scene_weights(SCENES, SAMPLES)[:: SAMPLES // 200]:
+        drawn = np.repeat(np.arange(SCENES), times)
+        both = [recall(row, PRIMARY, drawn) - recall(row, CONTROL, drawn) for row in ("+TFM", "baseline")]
+        samples.append(both[0] - both[1])
+    low, high = np.quantile(samples, [0.025, 0.975])
+    assert (effect.low, effect.high) == (pytest.approx(low, abs=0.01), pytest.approx(high, abs=0.01))
+
+
+def test_findings(results):
+    finding = {(e.measure, e.row): e.finding for e in effects(results, DECLARED, "", "last")}
+    for row in ("baseline", "+TFM, none", "matched"):
+        assert finding[PRIMARY, row] == finding[DIFFERENCE, row] == "shown"
+        assert finding[NEGATIVE, row] == "not shown"
+    worse = Declaration(PRIMARY, "matched")
+    assert {e.row: e.finding for e in effects(results, worse, "", "last")} == {
+        "baseline": "not shown",
+        "+TFM": "contradicted",
+        "matched, none": "contradicted",
+    }
+    # The same numbers, read as errors.
+    as_errors = {e.row: (e.finding, e.better) for e in effects(results, worse, "", "last", [PRIMARY])}
+    assert as_errors["+TFM"] == ("shown", 4)
+    strict = Declaration(PRIMARY, "+TFM", alpha=1e-9)
+    assert {e.finding for e in effects(results, strict, "", "last")} == {"not shown"}
+
+
+def test_an_effect_of_few_scenes_is_not_shown():
+    """All seeds agree, but one scene makes the whole difference."""
+    found = Results(("baseline", "+TFM"), SEEDS, {})
+    for seed in SEEDS:
+        for model, hits in (("baseline", [5, 5, 0]), ("+TFM", [5, 5, 5 + seed % 2])):
+            ratio = SceneRatio(tuple(hits), (10, 10, 10))
+            scores = Measured(1, "a protocol", {"": {PRIMARY: sum(hits) / 30}}, {"": {PRIMARY: ratio}})
+            found.add("", "last", model, seed, scores)
+    (effect,) = effects(found, Declaration(PRIMARY, "+TFM"), "", "last")
+    assert effect.p_holm < 0.01
+    assert effect.low == 0.0
+    assert effect.finding == "not shown"
+
+
+def test_scores_that_are_no_ratio_have_no_interval(results):
+    found = effects(results, Declaration("all/AP_l", "+TFM"), "", "last")
+    assert all(math.isnan(e.low) and math.isnan(e.high) and not math.isnan(e.p) for e in found)
+    assert "95 %" not in sentence(found[:1], Declaration("all/AP_l", "+TFM"))
+
+
+def test_rows_of_other_scenes_are_refused():
+    found = Results(("baseline", "+TFM"), (0,), {})
+    for model, lanes in (("baseline", (4, 4)), ("+TFM", (4, 5))):
+        ratio = SceneRatio((1, 2), lanes)
+        found.add("", "last", model, 0, Measured(1, "a protocol", {"": {PRIMARY: 0.3}}, {"": {PRIMARY: ratio}}))
+    with pytest.raises(ValueError, match="not measured on the same lanes"):
+        effects(found, Declaration(PRIMARY, "+TFM"), "", "last")
+
+
+def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
+    declared = Declared(DECLARED, (0, 1, 2, 3, 4), "2026-01-01T00:00:00+00:00", 0)
+    (path,) = save_effects(results, declared, "", (), tmp_path / "effects")
+    text = path.read_text()
+    assert text.strip() in capsys.readouterr().out
+    assert f"Declared before any run (2026-01-01T00:00:00+00:00): primary measure {PRIMARY}" in text
+    assert "**Interim**: 4 of 5 declared seeds (0, 1, 2, 3)." in text
+    line = next(line for line in text.splitlines() if "*matched*" in line)
+    assert line.startswith(f"- **shown**: +TFM is better than *matched* in {PRIMARY}, +")
+    assert f"; not shown in the negative control {CONTROL}, " in line
+    assert "; shown in the difference of the two, +" in line
+    assert line.count("better in 4 of 4 seeds") >= 2
+    assert line.count("95 % ") == line.count("p 0.") == 3
+    rows = json.loads(path.with_suffix(".json").read_text())["rows"]
+    assert {row["checkpoint"] for row in rows} == {"last", "best"}
+    assert [row["model"] for row in rows[:4]] == ["+TFM", "baseline", "+TFM, none", "matched"]
+    assert "finding" not in rows[0]
+    late = Declared(DECLARED, SEEDS, "2026-01-01T00:00:00+00:00", 3)
+    (path,) = save_effects(results, late, "", (), tmp_path / "late")
+    assert "Declared when 3 runs had begun already" in path.read_text()
+    assert "Interim" not in path.read_text()
+
+
+def test_without_shared_seeds_nothing_is_written(tmp_path, capsys):
+    found = Results(("baseline", "+TFM"), (0, 1), {})
+    found.add("", "last", "baseline", 0, measured(0, own=(0.3, 0.3)))
+    found.add("", "last", "+TFM", 1, measured(1, own=(0.3, 0.3)))
+    assert save_effects(found, Declared(DECLARED, (0, 1), "now", 0), "", (), tmp_path / "effects") == []
+    assert "no effects (test split)" in capsys.readouterr().out

@@ -1,0 +1,119 @@
+"""What a comparison tests, written down in its folder before the runs.
+
+The file is never changed. A comparison with another declaration needs another folder; one that was declared when runs
+existed already says so in its report.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.config import RunConfig
+from tflane_jax.config_io import first_difference
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
+from tflane_jax.training.provenance import provenance
+
+FILE = "declaration.json"
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What is tested: a treatment against every other row, on one score.
+
+    Attributes:
+        primary: the score ("group/name") that decides.
+        treatment: name of the model whose effect is tested.
+        negative_control: score on which the treatment should change nothing; None for none.
+        alpha: significance level of the corrected tests.
+    """
+
+    primary: str
+    treatment: str
+    negative_control: str | None = None
+    alpha: float = 0.05
+
+    @property
+    def scores(self) -> tuple[str, ...]:
+        """The scores that are tested."""
+        return (self.primary,) if self.negative_control is None else (self.primary, self.negative_control)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A declaration as the comparison's folder records it.
+
+    Attributes:
+        declaration: what is tested.
+        seeds: that were declared; the comparison may have fewer so far.
+        time: when it was written, ISO 8601.
+        begun: number of runs that existed in the folder at that time.
+    """
+
+    declaration: Declaration
+    seeds: tuple[int, ...]
+    time: str
+    begun: int
+
+    def sentence(self) -> str:
+        """Return what was declared, and when."""
+        what = f"primary measure {self.declaration.primary}"
+        if self.declaration.negative_control is not None:
+            what += f", negative control {self.declaration.negative_control}"
+        when = "before any run" if self.begun == 0 else f"when {self.begun} runs had begun already"
+        return (
+            f"Declared {when} ({self.time}): {what}, treatment {self.declaration.treatment}, "
+            f"level {self.declaration.alpha:g}, {len(self.seeds)} seeds."
+        )
+
+
+def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
+    """Raise UserError for a score that is not measured, or a treatment that is no row beside the control."""
+    control, *others = configs
+    if declaration.treatment not in others:
+        names = ", ".join(others) or "none"
+        raise UserError(
+            f"--treatment {declaration.treatment} is compared with the other configurations, the first of which "
+            f"({control}) is the control: choose one of the others ({names})"
+        )
+    for name, config in configs.items():
+        known = config.task.score_names(config.data, config.evaluation)
+        for score in declaration.scores:
+            if score not in known:
+                listed = ", ".join(sorted(score for score in known if "@" not in score))
+                raise UserError(f"{name} is not measured by {score}, only by {listed}")
+    if declaration.primary == declaration.negative_control:
+        raise UserError(f"{declaration.primary} cannot be primary measure and negative control")
+    if not 0.0 < declaration.alpha < 1.0:
+        raise UserError(f"--alpha {declaration.alpha:g} is no significance level between 0 and 1")
+
+
+def declare(declaration: Declaration, plan: Mapping[str, Sequence[Job]], seeds: Sequence[int], out: Path) -> Declared:
+    """Write the declaration into the comparison's folder, unless it is there already, and return it.
+
+    Raises:
+        UserError: the folder holds another declaration, or one of other models or without some of the seeds.
+    """
+    path, wanted = out / FILE, asdict(declaration) | {"models": list(plan)}
+    found: dict[str, Any] = {}
+    with contextlib.suppress(FileNotFoundError):
+        found = json.loads(path.read_text(encoding="utf-8"))
+    if not found:
+        source = provenance()
+        begun = sum(job.start() == "resume" for planned in plan.values() for job in planned)
+        found = wanted | {"seeds": list(seeds), "begun": begun} | {name: source[name] for name in ("time", "git")}
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(path, found)
+    declared = Declared(declaration, tuple(found["seeds"]), found["time"], found["begun"])
+    difference = first_difference({name: found[name] for name in wanted}, wanted)
+    if not difference and (more := sorted(set(seeds) - set(declared.seeds))):
+        difference = f"seed {more[0]} was not declared"
+    if difference:
+        raise UserError(f"{path} holds another declaration ({difference}): choose another folder with --out")
+    return declared

@@ -1,0 +1,240 @@
+"""The table of a declared comparison: the treatment against every other row, on the declared measures alone.
+
+Rows are the other models and the interventions on the treatment itself. Every difference has two uncertainties: between
+seeds (paired t-test, corrected by Holm for the rows of one measure and checkpoint) and between test scenes (bootstrap
+interval over scenes, the seeds averaged). An effect is *shown* if the corrected p is below the declared level and the
+interval excludes 0, *contradicted* if the same holds in the wrong direction, else *not shown*.
+
+The interval is exact for ratios of counts, such as recall. Scores that rank detections over all scenes (DET_l, AP_l,
+TOP_ll) have none.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.ablations.declaration import Declaration, Declared
+from tflane_jax.ablations.report import listed
+from tflane_jax.ablations.results import Results
+from tflane_jax.ablations.scores import CHECKPOINTS, Which
+from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio, scene_weights
+from tflane_jax.plots.tables import format_table, save_table
+
+SAMPLES = 10_000
+Finding = Literal["shown", "not shown", "contradicted"]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A declared score, or the difference of two of them.
+
+    Attributes:
+        name: in the table.
+        scores: weight of each score.
+    """
+
+    name: str
+    scores: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """The treatment minus another row, in one measure at one checkpoint.
+
+    Attributes:
+        measure, checkpoint, row: name of the measure, checkpoint of both rows, and the other row.
+        mean, std: of the other row, over seeds; the standard deviation with n - 1, NaN for one seed.
+        difference: treatment minus the other row, mean over seeds.
+        low, high: 95 % interval of the difference over scenes; NaN where there is none.
+        p, p_holm: of the two-sided paired t-test over seeds, and corrected for the rows of this measure and checkpoint.
+        better: number of seeds in which the treatment is better.
+        seeds: that both rows have.
+        finding: about the claim that the treatment is better.
+    """
+
+    measure: str
+    checkpoint: Which
+    row: str
+    mean: float
+    std: float
+    difference: float
+    low: float
+    high: float
+    p: float
+    p_holm: float
+    better: int
+    seeds: tuple[int, ...]
+    finding: Finding
+
+
+def measures(declaration: Declaration) -> tuple[Measure, ...]:
+    """Return the primary measure, the negative control, and their difference, which tests that the effect differs."""
+    primary, control = declaration.primary, declaration.negative_control
+    alone = Measure(primary, {primary: 1.0})
+    if control is None:
+        return (alone,)
+    difference = Measure("difference of the two", {primary: 1.0, control: -1.0})
+    return alone, Measure(f"negative control {control}", {control: 1.0}), difference
+
+
+def effects(
+    results: Results, declaration: Declaration, test: str, which: Which, errors: Collection[str] = ()
+) -> list[Effect]:
+    """Return the effects in every measure at one checkpoint, over the seeds that all compared rows have.
+
+    Empty without a seed that all have.
+
+    Args:
+        results: of the comparison.
+        declaration: what is tested.
+        test: test set.
+        which: checkpoint.
+        errors: scores where lower is better.
+    """
+    table, treatment = results.rows(test, which), declaration.treatment
+    others = [row for row in table if row != treatment and (row in results.models or results.owners[row] == treatment)]
+    shared = tuple(
+        seed for seed in results.seeds if all(seed in table.get(row, {}) for row in (treatment, *others)) and others
+    )
+    if not shared:
+        return []
+    sign, found = -1.0 if declaration.primary in errors else 1.0, []
+    for measure in measures(declaration):
+        values = {row: _values(table[row], measure, shared) for row in (treatment, *others)}
+        samples = _samples(results, test, which, measure, (treatment, *others), shared)
+        of_measure = []
+        for row in others:
+            paired = paired_difference(sign * values[treatment], sign * values[row])
+            low, high = interval(samples[treatment] - samples[row]) if samples else (math.nan, math.nan)
+            of_measure.append(
+                Effect(
+                    measure=measure.name,
+                    checkpoint=which,
+                    row=row,
+                    mean=float(values[row].mean()),
+                    std=_std(values[row]),
+                    difference=sign * paired.mean,
+                    low=low,
+                    high=high,
+                    p=paired.p_value,
+                    p_holm=math.nan,
+                    better=paired.better,
+                    seeds=shared,
+                    finding="not shown",
+                )
+            )
+        for effect, corrected in zip(of_measure, holm([effect.p for effect in of_measure]), strict=True):
+            judged = _finding(effect, corrected, declaration.alpha, sign)
+            found.append(replace(effect, p_holm=corrected, finding=judged))
+    return found
+
+
+def _values(by_seed: Mapping[int, Mapping[str, float]], measure: Measure, seeds: Sequence[int]) -> np.ndarray:
+    return np.array([sum(weight * by_seed[seed][score] for score, weight in measure.scores.items()) for seed in seeds])
+
+
+def _samples(
+    results: Results, test: str, which: Which, measure: Measure, rows: Sequence[str], seeds: Sequence[int]
+) -> dict[str, Float[np.ndarray, " b"]]:
+    """Return bootstrap samples of the measure for each row, all of the same draws; empty if it is no ratio of counts.
+
+    Raises ValueError if rows count different lanes, so that they were not measured on the same scenes.
+    """
+    ratios = {row: [results.ratios[test, which][row][seed] for seed in seeds] for row in rows}
+    if not all(score in of_seed for each in ratios.values() for of_seed in each for score in measure.scores):
+        return {}
+    samples = dict.fromkeys(rows, np.zeros(SAMPLES))
+    for score, weight in measure.scores.items():
+        denominator = ratios[rows[0]][0][score].denominator
+        weights = scene_weights(len(denominator), SAMPLES)
+        for row, each in ratios.items():
+            if any(of_seed[score].denominator != denominator for of_seed in each):
+                raise ValueError(f"{row} and {rows[0]} were not measured on the same lanes ({score})")
+            numerators = np.array([of_seed[score].numerator for of_seed in each])
+            samples[row] = samples[row] + weight * resampled_ratio(numerators, np.array(denominator), weights)
+    return samples
+
+
+def _finding(effect: Effect, p: float, alpha: float, sign: float) -> Finding:
+    if not p < alpha:  # NaN too
+        return "not shown"
+    low, high = sorted((sign * effect.low, sign * effect.high))
+    if sign * effect.difference > 0:
+        return "not shown" if low <= 0 else "shown"
+    return "not shown" if high >= 0 else "contradicted"
+
+
+def save_effects(results: Results, declared: Declared, test: str, errors: Collection[str], stem: Path) -> list[Path]:
+    """Print the findings and their table and save them, `<stem>.md` and `<stem>.json`; nothing without shared seeds."""
+    declaration = declared.declaration
+    every = [effect for which in CHECKPOINTS for effect in effects(results, declaration, test, which, errors)]
+    if not every:
+        print(f"\nno effects ({results.title(test)}): no seed that {declaration.treatment} and all other rows have")
+        return []
+    lines = [f"{results.protocol}, {results.title(test)}", "", declared.sentence()]
+    seeds = every[0].seeds
+    if set(seeds) != set(declared.seeds):
+        lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
+    last = [effect for effect in every if effect.checkpoint == "last"]
+    by_row = [[effect for effect in last if effect.row == row] for row in dict.fromkeys(effect.row for effect in last)]
+    lines += ["", *(f"- {sentence(of_row, declaration)}." for of_row in by_row), ""]
+    lines += [
+        f"Difference: {declaration.treatment} minus the row. From, to: 95 % interval over scenes (seeds averaged,",
+        f"{SAMPLES:,} bootstrap samples; only for ratios of counts). p: two-sided paired t-test over seeds; Holm:",
+        "corrected for the rows of one measure and checkpoint.",
+    ]
+    rows, title = _rows(results, declaration, test, every), "\n".join(lines)
+    print("\n" + format_table(rows, title=title, digits=4))
+    meta = {"declaration": asdict(declared), "protocol": results.protocol, "seeds": list(seeds)}
+    return [save_table(stem, rows, meta, title=title, digits=4)[0]]
+
+
+def sentence(of_row: Sequence[Effect], declaration: Declaration) -> str:
+    """Return the effects against one row as a sentence: primary measure, then negative control and their difference."""
+    primary, *others = of_row
+    text = (
+        f"**{primary.finding}**: {declaration.treatment} is better than *{primary.row}* in {primary.measure}, "
+        f"{_numbers(primary)}"
+    )
+    return "; ".join([text, *(f"{effect.finding} in the {effect.measure}, {_numbers(effect)}" for effect in others)])
+
+
+def _numbers(effect: Effect) -> str:
+    """Return a difference in points of percent, with its uncertainties."""
+    parts = [] if math.isnan(effect.low) else [f"95 % {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    parts += [] if math.isnan(effect.p) else [f"p {effect.p_holm:.4f}"]
+    parts.append(f"better in {effect.better} of {len(effect.seeds)} seeds")
+    return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
+
+
+def _rows(results: Results, declaration: Declaration, test: str, every: Sequence[Effect]) -> list[dict[str, Any]]:
+    """Return the table: for each measure and checkpoint the treatment, then what it is compared with."""
+    rows: list[dict[str, Any]] = []
+    by_name = {measure.name: measure for measure in measures(declaration)}
+    for _, group in itertools.groupby(every, lambda effect: (effect.checkpoint, effect.measure)):
+        found = list(group)
+        which, name, seeds = found[0].checkpoint, found[0].measure, found[0].seeds
+        values = _values(results.rows(test, which)[declaration.treatment], by_name[name], seeds)
+        place = {"measure": name, "checkpoint": which}
+        rows.append(place | {"model": declaration.treatment, "mean": float(values.mean()), "std": _std(values)})
+        rows += [
+            place
+            | {"model": effect.row, "mean": effect.mean, "std": effect.std}
+            | {"difference": effect.difference, "from": effect.low, "to": effect.high}
+            | {"p": effect.p, "p (Holm)": effect.p_holm}
+            | {"seeds better": f"{effect.better} of {len(effect.seeds)}", "finding": effect.finding}
+            for effect in found
+        ]
+    return rows
+
+
+def _std(values: np.ndarray) -> float:
+    return float(values.std(ddof=1)) if len(values) > 1 else math.nan

@@ -1,0 +1,67 @@
+"""What a comparison measured: scores of every row by test set, checkpoint and seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from tflane_jax.ablations.comparison import Scores
+from tflane_jax.ablations.jobs import Tests
+from tflane_jax.ablations.scores import Measured, Which
+from tflane_jax.evaluation.results import SceneRatio
+
+Ratios = Mapping[str, SceneRatio]
+
+
+@dataclass
+class Results:
+    """Scores of a comparison.
+
+    Attributes:
+        models: names, the control first.
+        seeds: that were asked for.
+        tests: further test sets, see `compare`.
+        protocol: of the metrics, with its version.
+        scores: by (test set, checkpoint), by row of the table, by seed. Rows are models, or "model, intervention".
+        ratios: parts of the scores that are ratios of counts over scenes, in the same order.
+        owners: model of each row.
+    """
+
+    models: tuple[str, ...]
+    seeds: tuple[int, ...]
+    tests: Tests
+    protocol: str = ""
+    scores: dict[tuple[str, Which], dict[str, dict[int, Scores]]] = field(default_factory=dict)
+    ratios: dict[tuple[str, Which], dict[str, dict[int, Ratios]]] = field(default_factory=dict)
+    owners: dict[str, str] = field(default_factory=dict)
+
+    def add(self, test: str, which: Which, model: str, seed: int, measured: Measured) -> None:
+        """Add what was measured of a run."""
+        self.protocol = measured.protocol
+        for way, scores in measured.ways.items():
+            row = f"{model}, {way}" if way else model
+            self.owners[row] = model
+            self.scores.setdefault((test, which), {}).setdefault(row, {})[seed] = scores
+            self.ratios.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.ratios[way]
+
+    def has(self, model: str) -> bool:
+        """Return whether any run of a model was measured."""
+        return model in self.owners.values()
+
+    def rows(self, test: str, which: Which) -> dict[str, dict[int, Scores]]:
+        """Return the rows of a table and their scores by seed, in the order of models and seeds."""
+        rows = self.scores.get((test, which), {})
+        ordered = sorted(rows, key=lambda row: self.models.index(self.owners[row]))
+        return {row: {seed: rows[row][seed] for seed in self.seeds if seed in rows[row]} for row in ordered}
+
+    def by_seed(self) -> dict[str, Any]:
+        """Return everything as JSON: by test set, checkpoint, row and seed."""
+        content: dict[str, Any] = {}
+        for (test, which), rows in self.scores.items():
+            content.setdefault(test or "test", {})[which] = rows
+        return content
+
+    def title(self, test: str) -> str:
+        """Return the name of a test set, with its settings."""
+        return f"test set {test} ({' '.join(self.tests[test])})" if test else "test split"

@@ -1,0 +1,116 @@
+"""Interventions on the examples that a trained model sees: what does it predict with other traffic flow, or none?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from tflane_jax.datasets.base import FrameInfo, IndexedExamples
+from tflane_jax.datasets.streaming import Streamed
+from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig, Traffic
+from tflane_jax.scene import Example, TrafficFlow
+
+_SEED = 0
+
+
+def with_traffic(arrays: Example | Streamed, traffic: Traffic) -> Example | Streamed:
+    """Return the examples with other traffic flow, and everything else unchanged.
+
+    Scenes exchange their traffic by one fixed permutation, drawn at random, in which no scene gets its own. The frames
+    of a scene get those of the other scene in order, from the beginning again if it has fewer.
+
+    Args:
+        arrays: examples, stacked or streamed, the frames of a scene in succession.
+        traffic: which traffic flow; "own" returns `arrays` itself.
+
+    Raises:
+        UserError: the examples have no traffic flow; or "other-scene" with fewer than two scenes.
+    """
+    if traffic == "own":
+        return arrays
+    rows = other_scene_rows(scene_numbers(arrays)) if traffic == "other-scene" else None
+    if isinstance(arrays, Streamed):
+        return replace(arrays, dataset=_Changed(arrays.dataset, rows))
+    flow = _flow(arrays)
+    return replace(arrays, traffic_flow=_none(flow) if rows is None else jax.tree.map(lambda leaf: leaf[rows], flow))
+
+
+def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) -> dict[str, EvaluationConfig]:
+    """Return by name the evaluations without traffic flow, and with that of another scene if there are several scenes.
+
+    Empty for an evaluation that is an intervention itself.
+    """
+    if config.traffic != "own":
+        return {}
+    found = {"no traffic flow at inference": replace(config, traffic="none")}
+    if len(np.unique(scene_numbers(arrays))) > 1:
+        found["traffic of another scene"] = replace(config, traffic="other-scene")
+    return found
+
+
+def scene_numbers(arrays: Example | Streamed) -> Int[np.ndarray, " n"]:
+    """Return the number of each example's scene, 0 for the first."""
+    if isinstance(arrays, Streamed):
+        names = [arrays.dataset.info(index).scene for index in range(len(arrays))]
+        starts = np.array([index > 0 and name != names[index - 1] for index, name in enumerate(names)], int)
+    else:
+        starts = ~np.asarray(arrays.has_previous)
+        starts[:1] = False
+    return np.cumsum(starts)
+
+
+def other_scene_rows(scene: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return for each example the index of the example whose traffic it gets; see `with_traffic`.
+
+    Args:
+        scene: number of each example's scene, ascending from 0 without gaps.
+    """
+    first, size = np.unique(scene, return_index=True, return_counts=True)[1:]
+    if len(first) < 2:
+        raise UserError("traffic of another scene needs test data with at least two scenes")
+    # One cycle through all scenes: no scene gets its own.
+    order = np.random.default_rng(_SEED).permutation(len(first))
+    giver = np.empty_like(order)
+    giver[order] = np.roll(order, 1)
+    giver = giver[scene]
+    return first[giver] + (np.arange(len(scene)) - first[scene]) % size[giver]
+
+
+@dataclass(frozen=True, eq=False)
+class _Changed:
+    """A dataset whose examples get the traffic of others, `rows` by index, or none."""
+
+    dataset: IndexedExamples
+    rows: Int[np.ndarray, " n"] | None
+
+    @property
+    def name(self) -> str:
+        return self.dataset.name
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def example(self, index: int) -> Example:
+        example: Any = self.dataset.example(index)
+        if self.rows is None:
+            return replace(example, traffic_flow=_none(_flow(example)))
+        other: Any = self.dataset.example(int(self.rows[index]))
+        return replace(example, traffic_flow=_flow(other))
+
+    def info(self, index: int) -> FrameInfo:
+        return self.dataset.info(index)
+
+
+def _flow(example: Example) -> TrafficFlow:
+    if example.traffic_flow is None:
+        raise UserError("these examples have no traffic flow, so none can be taken away or exchanged")
+    return example.traffic_flow
+
+
+def _none(flow: TrafficFlow) -> TrafficFlow:
+    return replace(flow, valid=np.zeros_like(flow.valid))

@@ -1,0 +1,23 @@
+"""Variants of a trained lane-graph task that use less of the traffic flow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tflane_jax.errors import UserError
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+
+def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
+    """Return the task with at most `count` instances of traffic flow, those with the largest weights; 0 is without.
+
+    Parameters stay the same. Raises UserError if the model takes no traffic flow or has fewer slots.
+    """
+    traffic = task.model.priors.traffic_flow
+    if traffic is None:
+        raise UserError("this run is a baseline without traffic flow: --max-instances has nothing to limit")
+    if not 0 <= count <= traffic.prior.max_instances:
+        raise UserError(f"--max-instances {count} is outside 0 to {traffic.prior.max_instances}, the model's slots")
+    limited = replace(traffic, prior=replace(traffic.prior, top_instances=count))
+    priors = replace(task.model.priors, traffic_flow=limited)
+    return replace(task, model=replace(task.model, priors=priors))

@@ -1,0 +1,59 @@
+"""Fixed worlds on which models are compared: `CITY` and `STREET`.
+
+Both hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and traffic as dense and
+as mixed as in real logs (docs/world.md compares them). They differ in their roads. `WorldData.city` and
+`WorldData.street` add the ranges and capacities of the examples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.simulate import WorldConfig
+from tflane_jax.world.traffic.simulation import TrafficConfig
+from tflane_jax.world.traffic.tracker import TrackerConfig
+
+CITY = WorldConfig(
+    # The ego vehicle drives up to 160 m before its first key frame.
+    roads=RoadConfig(reach=190.0, ego_reach=178.0, parking=0.85, bike=0.35),
+    traffic=TrafficConfig(
+        vehicles_per_metre=0.055,
+        bicycles_per_metre=0.016,
+        parked_share=0.9,
+        pedestrians_per_metre=0.08,
+        crossers_per_minute=8.0,
+        variety=0.6,
+        ego_top_speed=12.0,
+        ego_passes_s=13.0,
+        range=80.0,
+        warm_up_s=12.0,
+        early_s=70.0,
+        step_s=0.4,
+    ),
+    # Like labelled tracks: they bridge an occlusion of 2 s, and a glimpse of a road user is enough.
+    tracker=TrackerConfig(
+        range=60.0, falloff=15.0, view_needed=0.1, drop=0.01, coast=20, switch_rate=0.01, look_every_s=0.5
+    ),
+    # 10 s of history, then key frames 2 s apart.
+    duration_s=16.1,
+    keyframes=4,
+)
+"""The kinds of roads and junctions of the default world."""
+
+STREET = replace(
+    CITY,
+    roads=replace(
+        CITY.roads,
+        kinds=(
+            (SceneKind.ROAD, 0.15),
+            (SceneKind.LANE_DROP, 0.17),
+            (SceneKind.LANE_GAIN, 0.18),
+            (SceneKind.ON_RAMP, 0.15),
+            (SceneKind.EXIT_RAMP, 0.13),
+            (SceneKind.T_JUNCTION, 0.22),
+        ),
+        junction_lanes=1,
+    ),
+)
+"""Roads that bend, split and merge, and T junctions of streets with one lane in each direction."""

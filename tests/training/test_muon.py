@@ -40,11 +40,24 @@ def test_updates_are_optaxs(shapes):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, -b, atol=2e-5), found.tree(), expected)
 
 
+@pytest.mark.parametrize("shape", [(6, 40), (40, 6), (3, 3, 8, 8)])
+def test_long_kernels_are_optaxs_also_with_tiny_singular_values(shape):
+    rows, columns = int(np.prod(shape[:-1])), shape[-1]
+    left, _, right = np.linalg.svd(np.random.default_rng(0).normal(size=(rows, columns)), full_matrices=False)
+    kernel = left @ (np.logspace(0, -6, min(rows, columns))[:, None] * right)
+    grads = {"kernel": jnp.asarray(kernel.reshape(shape), jnp.float32)}
+    found = orthogonal(as_vectors(grads)).tree()["kernel"].reshape(rows, columns)
+    steps = muon(1.0, consistent_rms=0.2, nesterov=False, beta=0.0)
+    matrix = grads["kernel"].reshape(rows, columns)
+    expected, _ = steps.update(matrix, steps.init(matrix), matrix)
+    assert np.linalg.norm(found + expected) < 2e-3 * np.linalg.norm(expected)
+
+
 def test_one_iteration_for_all_kernels_of_a_shape():
     def products(shapes):
         return str(jax.make_jaxpr(orthogonal)(as_vectors(gradients(shapes, 0)))).count("dot_general")
 
-    assert products(SHAPES) == 3 * products({"wide": (3, 7)})  # 3 x 7, 4 x 4, 1 x 5
+    assert products(SHAPES) == products({name: SHAPES[name] for name in ("wide", "square", "row")})
 
 
 def test_a_kernel_without_gradient_is_not_updated():

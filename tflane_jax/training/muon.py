@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.training.vectors import ROW, Stack, Vectors
 
 _COEFFICIENTS = (3.4445, -4.7750, 2.0315)  # of X, (X X^T) X and (X X^T)^2 X
 _ITERATIONS = 5
+_LONG = 2.5  # columns to rows from which the iteration on X X^T is faster
 _MOMENTUM = 0.95
 _EPS = 1e-8
 _RMS = 0.2  # root mean square of an update, about that of Adam's, so that one learning rate fits both
@@ -89,12 +91,25 @@ def _matrices(vector: Float[Array, " n"], stack: Stack) -> Float[Array, "matrice
 
 
 def _newton_schulz(x: Float[Array, "matrices rows columns"]) -> Float[Array, "matrices rows columns"]:
-    """Return matrices with the same singular vectors and values near 1; rows <= columns."""
-    a, b, c = _COEFFICIENTS
+    """Return matrices with the same singular vectors and values near 1; rows <= columns.
+
+    An iteration multiplies X by a polynomial P of X X^T. Long matrices (those of convolutions) are multiplied once by
+    the product of all P, which needs X X^T alone: P X X^T P is that of the next iteration. It takes half the time, and
+    differs by up to 1e-3 of the result for directions whose singular values are below 1e-4 of the largest.
+    """
     x = x / (jnp.linalg.norm(x, axis=(1, 2), keepdims=True) + _EPS)
+    if x.shape[2] < _LONG * x.shape[1]:
+        return lax.fori_loop(0, _ITERATIONS, lambda _, x: _polynomial(x @ x.mT) @ x, x)
+    one = jnp.broadcast_to(jnp.eye(x.shape[1]), (len(x), x.shape[1], x.shape[1]))
 
-    def iteration(_: Any, x: jax.Array) -> jax.Array:
-        gram = x @ x.mT
-        return a * x + (b * gram + c * gram @ gram) @ x
+    def iteration(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        gram, product = carry
+        p = _polynomial(gram)
+        return p @ gram @ p, p @ product
 
-    return jax.lax.fori_loop(0, _ITERATIONS, iteration, x)
+    return lax.fori_loop(0, _ITERATIONS, iteration, (x @ x.mT, one))[1] @ x
+
+
+def _polynomial(gram: Float[Array, "matrices rows rows"]) -> Float[Array, "matrices rows rows"]:
+    a, b, c = _COEFFICIENTS
+    return a * jnp.eye(gram.shape[1])[None] + b * gram + c * gram @ gram

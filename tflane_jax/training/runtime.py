@@ -29,7 +29,7 @@ def configure_jax(*, keep_programs: bool = True) -> None:
     _keep_freed_memory()
     # Tracing makes millions of objects and little garbage: collecting at the default rate takes a tenth of its time.
     gc.set_threshold(100_000, 50, 100)
-    if keep_programs and jax.config.values["jax_compilation_cache_dir"] is None:
+    if keep_programs and jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         _keep_programs(cache_root() / "programs")
 
 

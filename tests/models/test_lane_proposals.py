@@ -113,13 +113,13 @@ def test_hosts_train_with_proposals_and_all_their_parameters_learn(host):
         fixed = replace(decoder, refine="fixed")
         model = BevFormerDetrConfig(encoder=model.encoder, decoder=fixed, elements=None, control_points=None)
     task = LaneGraphTask(model)
-    params = task.init(jax.random.key(0), example)
+    params = jax.jit(task.init)(jax.random.key(0), example)
     batch = stack_examples([example, example])
 
     def loss(params):
         return task.loss(params, batch, jax.random.key(1))
 
-    (_, report), grads = jax.value_and_grad(loss, has_aux=True)(params)
+    (_, report), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
     assert {"proposal_heat", "proposal_points"} <= set(report)
     silent = [name for name, leaf in grads["proposals"].items() for x in jax.tree.leaves(leaf) if not np.any(x)]
     assert not silent

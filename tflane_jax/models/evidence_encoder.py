@@ -24,20 +24,21 @@ class EvidenceEncoderConfig:
     Attributes:
         dim: channels of the BEV features.
         cell: a block of `cell` x `cell` raster cells becomes one feature cell.
-        levels: channels of a U-Net's coarser levels, each half as fine as the one before: context from the whole box.
-        dilations: of the convolutions after it, one residual block each.
-        coordinates: whether x, y, abs x and abs y of the cells are input channels.
+        dilations: of the convolutions, one residual block each.
         cells: see `CameraEncoderConfig.cells`.
         range: the box that the raster covers, metres; equal to that of `BevSensorConfig.grid`, which training checks.
+        levels: channels of the coarser levels of a U-Net before these blocks, each half as fine as the one before:
+            context from the whole box.
+        coordinates: whether x, y, abs x and abs y of the cells are input channels.
     """
 
     dim: int = 32
     cell: int = 4
-    levels: tuple[int, ...] = ()
     dilations: tuple[int, ...] = (1, 2, 4, 1)
-    coordinates: bool = False
     cells: bool = False
     range: PerceptionRange = BevGrid().range
+    levels: tuple[int, ...] = ()
+    coordinates: bool = False
 
     @property
     def bev_range(self) -> PerceptionRange:

@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom and draws; the example of the README runs."""
+"""Every notebook runs from top to bottom and draws, and its outputs are stored; the example of the README runs."""
 
 import re
 
@@ -6,20 +6,65 @@ import pytest
 
 from tests.shared import ROOT
 
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+MOST_BYTES = 600_000
 
-@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
-@pytest.mark.filterwarnings("default")
-def test_notebook_runs(path, tmp_path, monkeypatch):
+# Follows the cell of parameters: models that are too small to be any good and have random weights.
+SMALL = """
+from tests.parameters import random_params
+from tflane_jax.runs import save_weights
+
+folder, scenes = Path({folder!r}), 2
+settings = "--task.model.decoder.layers 1 --task.model.encoder.levels 32"
+
+
+def train_run(config, folder):
+    save_weights(config, random_params(config.task.init, config.task.shapes(config.data)), folder)
+"""
+
+
+@pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
+def notebook(request):
     nbformat = pytest.importorskip("nbformat")
-    client = pytest.importorskip("nbclient")
-    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
-    notebook = nbformat.read(path, as_version=4)
-    assert all(not cell.get("outputs") for cell in notebook.cells), "clear the outputs before committing"
+    return nbformat.read(request.param, as_version=4)
+
+
+@pytest.mark.filterwarnings("default")
+def test_notebook_runs(notebook, tmp_path, monkeypatch):
+    nbformat, client = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    (place,) = [i for i, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", [])]
+    small = SMALL.format(folder=str(tmp_path / "runs"))
+    notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(small))
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = []
     client.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 3
-    printed = "".join(output.get("text", "") for output in outputs)
-    assert "step 12: loss" in printed
+    assert pictures(notebook) >= 6
+    assert "8 validation frames of 2 scenes" in printed(notebook)
+
+
+def test_outputs_are_stored(notebook):
+    """They are of the whole notebook, run once from top to bottom."""
+    codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in codes] == list(range(1, len(codes) + 1))
+    assert pictures(notebook) >= 6
+    assert "validation frames" in printed(notebook)
+    kinds = {output.get("name", output.output_type) for cell in codes for output in cell.outputs}
+    assert kinds <= {"stdout", "execute_result"}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_small(path):
+    assert path.stat().st_size < MOST_BYTES
+
+
+def pictures(notebook):
+    return sum("image/png" in output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", []))
+
+
+def printed(notebook):
+    return "".join(output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", []))
 
 
 def test_the_example_of_the_readme_runs(tmp_path, monkeypatch):

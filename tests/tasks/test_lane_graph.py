@@ -19,9 +19,10 @@ from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import Prediction, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.tasks.traffic import limit_instances
+from tflane_jax.tasks.traffic import limit_instances, queries_only
 from tflane_jax.world.bev.sensor import BevSensorConfig
 
 WIDE = PerceptionRange((-60.0, 60.0), (-30.0, 30.0))
@@ -75,6 +76,25 @@ def test_the_matched_control_differs_from_the_treatment_by_the_traffic_alone():
     }
     assert learning.pop("temporal") == learning.pop("L_to_T") == 0.0
     assert all(learning.values())
+
+
+def test_queries_only_is_the_model_without_the_raster():
+    traffic = WITH_TRAFFIC.priors.traffic_flow
+    both = replace(
+        WITH_TRAFFIC, priors=replace(WITH_TRAFFIC.priors, traffic_flow=replace(traffic, bev=TrafficRasterConfig()))
+    )
+    task, example = LaneGraphTask(both), make_example()
+    assert queries_only(task) == LaneGraphTask(WITH_TRAFFIC)
+    # The parameters of both fit: those of the raster are not used.
+    params = random_params(task.init, example)
+    points = [jax.jit(each.predict)(params, example).centerlines.points for each in (task, queries_only(task))]
+    assert np.abs(points[0] - points[1]).max() > 0.01
+    raster = replace(
+        both, priors=replace(both.priors, traffic_flow=replace(both.priors.traffic_flow, insert="nowhere"))
+    )
+    for model in (BASELINE, raster):
+        with pytest.raises(UserError, match="no traffic flow into its queries"):
+            queries_only(LaneGraphTask(model))
 
 
 def test_interventions_are_those_that_change_something():

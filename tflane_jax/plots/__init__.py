@@ -6,7 +6,8 @@ from tflane_jax.plots.attention import (
     draw_spatial_mask,
     draw_temporal_mask,
 )
-from tflane_jax.plots.bev import draw_prediction, draw_scene
+from tflane_jax.plots.attribution import draw_bars, draw_lane_bands, draw_removal, draw_road_users
+from tflane_jax.plots.bev import draw_lanes, draw_prediction, draw_scene
 from tflane_jax.plots.cameras import save_camera_views
 from tflane_jax.plots.curves import save_curves
 from tflane_jax.plots.differences import Findings, save_differences
@@ -20,8 +21,13 @@ __all__ = [
     "add_legend",
     "dataset_summary",
     "draw_attention_matrix",
+    "draw_bars",
     "draw_lane_attention",
+    "draw_lane_bands",
+    "draw_lanes",
     "draw_prediction",
+    "draw_removal",
+    "draw_road_users",
     "draw_scene",
     "draw_spatial_mask",
     "draw_temporal_mask",

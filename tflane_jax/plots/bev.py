@@ -43,6 +43,7 @@ def draw_scene(
     layers: Collection[Layer] = ALL_LAYERS,
     ground: PerceptionRange = GROUND,
     view: PerceptionRange = VIEW,
+    strength: float = 1.0,
     title: str = "",
 ) -> None:
     """Draw one example (no batch axis): the given layers, the ego vehicle, and axes in metres.
@@ -53,11 +54,12 @@ def draw_scene(
         layers: to draw, in a fixed order.
         ground: range of `example.bev` and `example.hidden`.
         view: range to show.
+        strength: of the evidence, 0 to 1.
         title: above the picture.
     """
     prepare(ax, view, title)
     if "evidence" in layers and example.bev is not None:
-        draw_evidence(ax, example.bev, ground)
+        draw_evidence(ax, example.bev, ground, strength=strength)
     if "hidden" in layers and example.hidden is not None:
         draw_hidden(ax, example.hidden, ground)
     if "areas" in layers:

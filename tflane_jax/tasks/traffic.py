@@ -21,3 +21,16 @@ def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
     limited = replace(traffic, prior=replace(traffic.prior, top_instances=count))
     priors = replace(task.model.priors, traffic_flow=limited)
     return replace(task, model=replace(task.model, priors=priors))
+
+
+def queries_only(task: LaneGraphTask) -> LaneGraphTask:
+    """Return the task with traffic flow in the lane queries alone: BEV features get none.
+
+    Parameters stay the same; those of the fusion into BEV features are not used. Raises UserError if the model takes
+    no traffic flow, or takes it in BEV features only.
+    """
+    traffic = task.model.priors.traffic_flow
+    if traffic is None or traffic.insert == "nowhere":
+        raise UserError("this model takes no traffic flow into its queries (task.model.priors.traffic_flow.insert)")
+    priors = replace(task.model.priors, traffic_flow=replace(traffic, bev=None))
+    return replace(task, model=replace(task.model, priors=priors))

@@ -77,13 +77,11 @@ def summary(results: Results) -> str:
         number = sum(ratios[_BASELINE][seed][score].denominator) // len(LANE_THRESHOLDS)
         found = {name: 100.0 * table[row][seed][score] for row, name in _COLUMNS.items()}
         rows.append({"true lanes": lanes, "number": number} | found)
-    scenes, within = (
-        len(ratios[_BASELINE][seed]["all/recall"].denominator),
-        ", ".join(f"{t:g}" for t in LANE_THRESHOLDS),
-    )
+    scenes = len(ratios[_BASELINE][seed]["all/recall"].denominator)
+    within = ", ".join(f"{threshold:g}" for threshold in LANE_THRESHOLDS)
     title = (
         f"Percent of the true lanes that each model finds on {scenes} unseen scenes (recall, mean over {within} m).\n"
-        "Hidden: the sensor shows less than half of the lane's borders."
+        "Hidden: along more than half of the lane, the sensor shows neither of its borders."
     )
     gain, use = (_effect(results, row) for row in (_BASELINE, _BLIND))
     return (

@@ -12,7 +12,7 @@ from tflane_jax.cli import main
 from tflane_jax.config import load_ablations, load_config
 from tflane_jax.evaluation.results import SceneRatio
 
-LANES = {"all/recall": (30, 20, 10), "hidden+traffic/recall": (6, 6, 6), "hidden-traffic/recall": (3, 0, 3)}
+LANES = {"all/recall": (30, 20, 10), "hidden+traffic/recall": (6, 6, 6), "hidden-traffic/recall": (3, 3, 3)}
 
 
 def measured(**hits):
@@ -33,29 +33,31 @@ def results(baseline, own, none):
     return found
 
 
-def hits(everywhere, hidden):
-    """Return hits that are the same in every scene, of all lanes and of hidden ones with traffic."""
-    return [[everywhere] * 3, [hidden] * 3, [0, 0, 0]]
+def hits(everywhere, hidden, control=0):
+    """Return hits that are the same in every scene: of all lanes, of hidden ones with traffic, and without."""
+    return [[everywhere] * 3, [hidden] * 3, [control] * 3]
 
 
 def test_the_summary_gives_percent_by_group_and_the_difference():
-    text = demo.summary(results(hits(6, 6), hits(12, 9), hits(3, 3)))
+    text = demo.summary(results(hits(6, 6), hits(12, 9, 1), hits(3, 3)))
     rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in text.splitlines() if "|" in line]
     assert rows[0] == ["true lanes", "number", "baseline", "+traffic", "+traffic, none at inference"]
     assert [row[1:] for row in rows[2:]] == [
         ["60", "10.0", "20.0", "5.0"],
         ["18", "33.3", "50.0", "16.7"],
-        ["6", "0.0", "0.0", "0.0"],
+        ["9", "0.0", "11.1", "0.0"],
     ]
     assert "on 3 unseen scenes" in text
     assert "finds 16.7 points more than the baseline\n(95 % interval over scenes: +16.7 to +16.7)" in text
     assert "33.3 points more than itself" in text
+    assert "(the control), 11.1 points more than the baseline (+11.1 to +11.1)" in text
 
 
 def test_the_summary_hides_no_loss():
     text = demo.summary(results(hits(6, 9), hits(6, 6), hits(6, 9)))
     assert "finds 16.7 points less than the baseline\n(95 % interval over scenes: -16.7 to -16.7)" in text
     assert "16.7 points less than itself" in text
+    assert "(the control), 0.0 points more than the baseline (+0.0 to +0.0)" in text
 
 
 def test_both_models_have_the_same_data_and_training():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from tflane_jax.ablations.compare import compare
 from tflane_jax.ablations.declaration import Declaration
@@ -83,20 +84,26 @@ def summary(results: Results) -> str:
         f"Percent of the true lanes that each model finds on {scenes} unseen scenes (recall, mean over {within} m).\n"
         "Hidden: along more than half of the lane, the sensor shows neither of its borders."
     )
-    gain, use = (_effect(results, row) for row in (_BASELINE, _BLIND))
-    return (
-        f"\n{format_table(rows, title=title, digits=1)}\n\n"
-        f"Of the hidden lanes that vehicles drove along, {_TREATMENT} finds {_points(gain)} than the baseline\n"
-        f"(95 % interval over scenes: {100 * gain.low:+.1f} to {100 * gain.high:+.1f}), and {_points(use)} than itself "
-        "without traffic at inference.\n"
-        "This is one training of each, an example and no evidence: another seed changes these numbers by some points."
-    )
+    gain, control = (_effect(results, _BASELINE, measure) for measure in ("primary", "control"))
+    use = _effect(results, _BLIND, "primary")
+    lines = [
+        f"Of the hidden lanes that vehicles drove along, {_TREATMENT} finds {_points(gain)} than the baseline",
+        f"(95 % interval over scenes: {_interval(gain)}), and {_points(use)} than itself without traffic at inference.",
+        f"Where no vehicle came near (the control), {_points(control)} than the baseline ({_interval(control)}).",
+        "This is one training of each, an example and no evidence: another seed changes these numbers by some points.",
+    ]
+    return "\n".join(["", format_table(rows, title=title, digits=1), "", *lines])
 
 
-def _effect(results: Results, row: str) -> Effect:
-    """Return what the treatment gains over another row in the primary measure."""
-    return next(effect for effect in effects(results, _DECLARED, OWN_TEST, "last") if effect.row == row)
+def _effect(results: Results, row: str, measure: Literal["primary", "control"]) -> Effect:
+    """Return what the treatment gains over another row, in the primary measure or in the negative control."""
+    primary, control, _ = (effect for effect in effects(results, _DECLARED, OWN_TEST, "last") if effect.row == row)
+    return primary if measure == "primary" else control
 
 
 def _points(effect: Effect) -> str:
     return f"{abs(100 * effect.difference):.1f} points {'more' if effect.difference >= 0 else 'less'}"
+
+
+def _interval(effect: Effect) -> str:
+    return f"{100 * effect.low:+.1f} to {100 * effect.high:+.1f}"

@@ -118,12 +118,12 @@ class WorldData:
         return ProceduralConfig(split, scenes=getattr(self, split), world=self.world, example=self.example)
 
     @classmethod
-    def city(cls, train: int = 1000, val: int = 25, test: int = 150) -> WorldData:
+    def city(cls, train: int = 3000, val: int = 25, test: int = 300) -> WorldData:
         """Return the preset `city`: every kind of junction, perceived within +-50 m x +-25 m."""
         return cls(train, val, test, CITY, CITY_EXAMPLE)
 
     @classmethod
-    def street(cls, train: int = 1000, val: int = 25, test: int = 150) -> WorldData:
+    def street(cls, train: int = 3000, val: int = 25, test: int = 300) -> WorldData:
         """Return the preset `street`: simple roads, perceived within +-30 m x +-15 m.
 
         The host must perceive the same box: `task.model.range` equal to `STREET_EXAMPLE.range`, and

@@ -64,7 +64,7 @@ class LaneProposals(nn.Module):
         shape = Mlp((proposals.hidden, proposals.hidden, config.points * 3), name="shape")
 
         def propose(cell: Int[Array, " k"], heading: Int[Array, " k"]):
-            feature = table[cell] + embedding[heading]
+            feature = table[cell] + jnp.take(embedding, heading, axis=0)
             points = _in_bin(shape(feature).reshape(-1, config.points, 3), config)
             return feature, _placed(points, centers[cell], heading, proposals.headings)
 

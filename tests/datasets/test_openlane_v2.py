@@ -131,6 +131,18 @@ def test_flavours_fill_their_own_part(whole, flavour, lanes, segments):
     np.testing.assert_allclose(example.traffic_elements.box[0], [[10, 4], [14, 12.5]])
 
 
+def test_crossings_may_be_two_sides(folder):
+    outline = [[5.0, -3.0, 0.1], [5.0, 3.0, 0.1], [8.0, 3.0, 0.1], [8.0, -3.0, 0.1], [5.0, -3.0, 0.1]]
+    crossing = {"id": 1, "category": 1, "points": outline}
+    change(info(folder, 0, "-ls"), lambda record: record["annotation"]["area"].append(crossing))
+    for form, corners in (("ring", [0, 0]), ("sides", [0, 1, 2, 3])):
+        example = opened(folder, None, flavour="lane_segment", example=replace(SIZES, crossings=form)).example(0)
+        assert example.areas.category.tolist() == [2, 1]
+        ends = [0, -1] if form == "ring" else [0, 9, 10, 19]
+        np.testing.assert_allclose(example.areas.points[1, ends], [outline[i] for i in corners], atol=1e-6)
+        np.testing.assert_allclose(example.areas.points[0, [0, -1]], [[5, -3, 0], [5, 3, 0]], atol=1e-6)
+
+
 def test_items_beyond_capacity_are_left_out_with_their_edges(whole):
     dataset = opened(whole, None, example=ExampleConfig(lanes=2, elements=1))
     with pytest.warns(TruncationWarning, match="more (lanes|elements)"):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -18,6 +18,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.datasets.data_source import LaneGraphSource, SplitData
+from tflane_jax.datasets.empty_frames import without_empty
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
@@ -56,11 +57,14 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         losses: weights of the host's matching costs and losses.
         clip: number of successive frames that training processes with memory. A training example is then a clip, with a
             leading axis on every leaf, and evaluation streams through the scenes. 1: single frames.
+        empty_frames: "skip" trains without frames that have none of the lanes or crossings of the host's ground truth,
+            as LaneSegNet does.
     """
 
     model: HostConfig = TopoNetConfig()
     losses: HostLossConfig = TopoNetLossConfig()
     clip: int = 1
+    empty_frames: Literal["keep", "skip"] = "keep"
 
     columns: ClassVar[tuple[str, ...]] = (
         "lanes of",
@@ -196,7 +200,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def examples(self, data: Example | Streamed) -> Example | Streamed:
         """Return the examples themselves, or the clips that they form."""
-        return data if self.clip == 1 else as_clips(data, self.clip)
+        data = data if self.clip == 1 else as_clips(data, self.clip)
+        return data if self.empty_frames == "keep" else without_empty(data, self.model.truth)
 
     def shapes(self, data: SplitData) -> Example:
         """Return shapes of the training parts of an example."""

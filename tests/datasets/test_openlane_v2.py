@@ -25,6 +25,7 @@ from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import (
     BASELINE_LARGE,
+    LANESEGNET_BUCKET,
     TOPONET_SUBSET_A,
     TOPONET_SUBSET_B,
     ImageConfig,
@@ -68,6 +69,7 @@ def change(path, function):
     ("config", "front", "others", "canvas"),
     [
         (TOPONET_SUBSET_A, (775, 775), (1024, 775), (1024, 800)),
+        (LANESEGNET_BUCKET, (511, 511), (675, 511), (704, 512)),
         (BASELINE_LARGE, (2048, 1550), (2048, 1550), (2048, 1568)),
         (TOPONET_SUBSET_B, (800, 450), (800, 450), (800, 480)),
     ],

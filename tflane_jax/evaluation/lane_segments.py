@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.openlane_export import segments_on_lanes
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
-from tflane_jax.metrics.lane_segment import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
+from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
 from tflane_jax.scene import Areas, LaneGraph, TrafficElements
 
 SEGMENT_CLASSES = ("lane_segment", "ped_crossing")

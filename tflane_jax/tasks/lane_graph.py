@@ -74,6 +74,15 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         "DET_t",
         "TOP_ll",
         "TOP_lt",
+        "mAP",
+        "AP_ls",
+        "AP_ped",
+        "TOP_lsls",
+        "AE_type",
+        "AE_dist",
+        "OLUS",
+        "DET_a",
+        "TOP_lste",
         "recall",
         "AP_l",
         "DET_l@1.0",
@@ -86,13 +95,18 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         "all/OLS",
         "all/DET_t",
         "all/TOP_lt",
+        "all/mAP",
+        "all/AP_ped",
+        "all/AE_type",
+        "all/AE_dist",
         *(
             f"{group}/{name}"
-            for name in ("DET_l", "TOP_ll", "recall")
+            for name in ("DET_l", "TOP_ll", "AP_ls", "TOP_lsls", "recall")
             for group in ("all", "occluded", "clear", *Sightings.groups)
         ),
         *(f"{group}/{name}" for name in ("recall", "AP_l") for group in LANE_GROUPS[:2]),
     )
+    errors: ClassVar[tuple[str, ...]] = ("all/AE_type", "all/AE_dist")
 
     # -----------------------------------------------------------------------------------------------------------------
     # Learning
@@ -256,10 +270,16 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         of_lanes = () if self._ground is None else LANE_GROUPS
         metrics = LaneGraphMetrics(config.versions, groups, self.model.predicts, of_lanes)
         names = set(Evaluation("", metrics.compute()).scores())
+        if "segments" in self.model.predicts:  # without matched pairs, there are no errors
+            names |= {f"{group}/{name}" for group in metrics.compute() for name in ("AE_type", "AE_dist")}
         if self.model.elements is not None:
-            of_elements = ["OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
-            of_elements += [f"{name}_{version}" for version in config.versions[1:] for name in ("OLS", "TOP_lt")]
-            names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}
+            attributes = ["DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
+            if "centerlines" in self.model.predicts:
+                scores = ["OLS", "TOP_lt", *attributes]
+                scores += [f"{name}_{version}" for version in config.versions[1:] for name in ("OLS", "TOP_lt")]
+                names |= {f"{group}/{name}" for group in ("all", *groups) for name in scores}
+            else:
+                names |= {f"all/{name}" for name in ("OLUS", "TOP_lste", *attributes)}
         return names
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:

@@ -12,6 +12,7 @@ from tflane_jax.scene import (
     ElementPrediction,
     Example,
     LaneGraph,
+    SegmentPrediction,
     TrafficElements,
     TrafficFlow,
 )
@@ -106,6 +107,20 @@ def fake_prediction(seed: int = 0, *, queries: int = 6) -> CenterlinePrediction:
     links = np.full((queries, queries), -3.0, np.float32)
     links[:1, 1:2] = 3.0
     return CenterlinePrediction(rng.uniform(-20, 20, (queries, POINTS, 3)).astype(np.float32), logits, links)
+
+
+def fake_segments(seed: int = 0, *, queries: int = 6) -> SegmentPrediction:
+    """Return two confident, connected segments with types, one confident crossing, and queries of low scores."""
+    rng = np.random.default_rng([seed, 4])
+    logits = np.full((queries, 2), -4.0, np.float32)
+    logits[:2, 0] = logits[2:3, 1] = 2.0
+    links = np.full((queries, queries), -3.0, np.float32)
+    links[:1, 1:2] = 3.0
+    points = rng.uniform(-20, 20, (queries, POINTS, 3)).astype(np.float32)
+    across = np.array([0.0, 1.8, 0.0], np.float32)
+    types = np.full((2, queries, 3), -2.0, np.float32)
+    types[0, [0, 1], [1, 2]] = types[1, [0, 1], [0, 1]] = 2.0
+    return SegmentPrediction(points, points + across, points - across, logits, *types, successor_logits=links)
 
 
 def fake_elements(seed: int = 0, *, elements: int = 3, queries: int = 6) -> ElementPrediction:

@@ -3,11 +3,21 @@
 import numpy as np
 import pytest
 
-from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, frames_of_difference, lane_confidences
+from tests.fakes import fake_example
+from tflane_jax.evaluation.found_lanes import (
+    WITHIN,
+    best_threshold,
+    confidences_of,
+    frames_of_difference,
+    lane_confidences,
+    lane_scores,
+)
+from tflane_jax.evaluation.lane_graph import LaneGraphMetrics
 from tflane_jax.geometry.distances import discrete_frechet
 from tflane_jax.metrics.centerline_matching import relaxation
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
+from tflane_jax.scene import LaneGraph, Prediction, SegmentPrediction
 
 
 def frame(seed, lanes=6, queries=30, points=5):
@@ -50,6 +60,26 @@ def test_few_lanes_and_detections(lanes, queries):
     truth = np.arange(lanes * 6.0).reshape(lanes, 2, 3)
     found = lane_confidences(truth, np.arange(queries * 6.0).reshape(queries, 2, 3), np.full(queries, 0.5))
     assert found.tolist() == ([0.5] if queries == 1 else [-np.inf] * lanes)
+
+
+def test_without_threshold_the_found_segments_are_the_recall_of_the_metric():
+    metrics, found = LaneGraphMetrics(), []
+    for seed in range(8):
+        truth, detected, scores = frame(seed, queries=8)
+        across = np.array([0.0, 1.8, 0.0])
+        segments = LaneGraph.empty(9, 5)
+        segments.points[:], segments.left[:], segments.right[:] = np.nan, np.nan, np.nan
+        segments.points[:6], segments.left[:6], segments.right[:6] = truth, truth + across, truth - across
+        segments.valid[:6], segments.visibility[:] = True, 1.0
+        logits = np.stack([scores, np.where(np.arange(8) == 0, 5.0, -9.0)], -1)  # the first is a crossing
+        prediction = SegmentPrediction(detected, detected + across, detected - across, logits)
+        metrics.update(Prediction(segments=prediction), fake_example().replace(segments=segments))
+        confidence = confidences_of(segments, prediction)
+        assert not np.isfinite(confidence[6:]).any()
+        found.append(np.isfinite(confidence[:6]))
+        assert lane_scores(prediction)[0] == 0.0
+    assert 0.1 < np.mean(found) < 1.0
+    assert metrics.compute()["all"][f"recall@{WITHIN:.1f}"] == pytest.approx(np.mean(found))
 
 
 @pytest.mark.parametrize("seed", range(5))

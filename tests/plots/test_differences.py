@@ -64,7 +64,7 @@ def test_one_row_for_each_example_and_one_column_for_each_model(tmp_path, count)
 def test_outlines_tell_found_lanes_from_missed_ones(tmp_path, monkeypatch):
     drawn, shown = [], []
     monkeypatch.setattr(differences, "draw_outlines", lambda ax, lanes, kind="edge": drawn.append((kind, len(lanes))))
-    monkeypatch.setattr(differences, "draw_prediction", lambda ax, lanes, threshold: shown.append(threshold))
+    monkeypatch.setattr(differences, "draw_found", lambda *_, threshold, **__: shown.append(threshold))
     models = {"one": findings(FIRST, 0.2), "none": findings(NONE, 0.4)}
     save_differences(tmp_path / "a.png", EXAMPLES, models, BOTH, title="t", titles=["a", "b"])
     first_row, second_row = drawn[:6], drawn[6:]

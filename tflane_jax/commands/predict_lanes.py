@@ -5,7 +5,9 @@ predictions.npz, arrays over F frames and Q queries:
     that lane j continues lane i; scene (F,) and timestamp_ns (F,) identify the frame. A model with traffic elements
     adds arrays over E element queries: box (F, E, 2, 2), corners in pixels of the front image; attribute_score
     (F, E, 13); element_lane (F, Q, E), 0 to 1: [f, i, e] is the score that element e governs lane i.
-truth.npz, the ground-truth lanes of the same frames over G slots:
+    A model of lane segments has their centerlines in `points` and adds left, right (F, Q, P, 3) and category (F, Q),
+    0 lane segment, 1 crossing; one with line types adds left_type, right_type (F, Q), 0 none, 1 solid, 2 dashed.
+truth.npz, the ground-truth lanes, or segments, of the same frames over G slots:
     points (F, G, P, 3), successor (F, G, G), valid (F, G), visibility (F, G), scene and timestamp_ns. `tflane score`
     reads both files.
 
@@ -15,6 +17,7 @@ predictions.json, lanes with a score of at least `threshold`, best first:
      "successors": [{"from": position in lanes, "to": position in lanes, "score"}, ...],
      "elements": [{"query", "score", "attribute", "box": [[left, top], [right, bottom]]}, ...],
      "governs": [{"element": position in elements, "lane": position in lanes, "score"}, ...]}, ...]}
+    Lane segments add "left", "right", "category" and, with line types, "left_type" and "right_type".
     Relations have a score of at least 0.5. "elements" and "governs" exist if the model predicts traffic elements.
 """
 
@@ -35,11 +38,14 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
+from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
+from tflane_jax.scene import SegmentPrediction
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_pictures import centerlines_of, titles
+from tflane_jax.tasks.lane_pictures import lanes_of, titles
 
 _RELATION_THRESHOLD = 0.5
+_OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
 
 
 def predict(trained: Run, options: argparse.Namespace) -> int:
@@ -51,14 +57,19 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
-    lanes, elements = centerlines_of(answer), answer.elements
-    assert lanes is not None, "a lane-graph task predicts centerlines"
+    lanes, elements = lanes_of(answer), answer.elements
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
-    successor = expit(np.asarray(lanes.successor_logits))
+    edges = lanes.successor_logits
+    successor = np.zeros((*scores.shape, scores.shape[-1])) if edges is None else expit(np.asarray(edges))
 
     make_folder(options.out)
     arrays = {"points": points, "scores": scores, "successor": successor}
+    if isinstance(lanes, SegmentPrediction):
+        arrays |= {"left": np.asarray(lanes.left), "right": np.asarray(lanes.right)}
+        arrays["category"] = np.asarray(lanes.logits).argmax(-1)
+        types = {"left_type": lanes.left_type_logits, "right_type": lanes.right_type_logits}
+        arrays |= {name: np.asarray(logits).argmax(-1) for name, logits in types.items() if logits is not None}
     if elements is not None:
         arrays["box"] = np.asarray(elements.box)
         arrays["attribute_score"] = expit(elements.logits)
@@ -66,7 +77,9 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
     _save_arrays(options.out / "predictions.npz", arrays)
-    truth = {name: np.asarray(getattr(examples.lanes, name)) for name in ("points", "successor", "valid", "visibility")}
+    true, kept = true_lanes(examples, lanes), ["points", "successor", "valid", "visibility"]
+    kept += [name for name in ("left", "right", "left_type", "right_type") if name in arrays]
+    truth = {name: np.asarray(getattr(true, name)) for name in kept}
     _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     frames = [
         _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
@@ -109,7 +122,11 @@ def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> 
         "source": info.source,
         "scene": info.scene,
         "timestamp_ns": int(info.timestamp_ns),
-        "lanes": [{"query": int(q), "score": float(scores[q]), "points": points[q].tolist()} for q in kept],
+        "lanes": [
+            {"query": int(q), "score": float(scores[q]), "points": points[q].tolist()}
+            | {name: arrays[name][q].tolist() for name in _OF_SEGMENTS if name in arrays}
+            for q in kept
+        ],
         "successors": _relations(arrays["successor"][np.ix_(kept, kept)], "from", "to"),
     }
     if "box" in arrays:

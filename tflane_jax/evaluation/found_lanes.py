@@ -1,9 +1,9 @@
 """Which true lanes a model finds, lane by lane, and the frames in which two models differ most.
 
 A lane counts as found if a detection whose nearest lane it is lies within `WITHIN` of it, with a confidence of at least
-the model's threshold. Distances are those of the metric (`metrics.centerline_matching.nearest_lanes`), so without a
-threshold the fraction of found lanes is `recall@2.0`. Confidences of two models have different scales: the threshold of
-each is the one with its best F-score.
+the model's threshold. Distances are those of the metric (`metrics.centerline_matching.nearest_lanes`, or
+`metrics.segment_matching.nearest_segments`), so without a threshold the fraction of found lanes is `recall@2.0`.
+Confidences of two models have different scales: the threshold of each is the one with its best F-score.
 """
 
 from __future__ import annotations
@@ -14,8 +14,36 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.metrics.centerline_matching import nearest_lanes
+from tflane_jax.metrics.segment_matching import nearest_segments
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, SegmentPrediction
 
 WITHIN = 2.0  # metres
+
+
+def confidences_of(truth: LaneGraph, found: CenterlinePrediction | SegmentPrediction) -> Float[np.ndarray, " n"]:
+    """Return for each row of the padded truth the highest confidence of the detections that find it; else -inf.
+
+    Args:
+        truth: merged centerlines, or segments where the detections are segments.
+        found: all detections of the frame; crossings find no lane.
+    """
+    valid, names = np.asarray(truth.valid), ("points", "left", "right")
+    true = [np.asarray(getattr(truth, name))[valid] for name in names]
+    confidences, scores = np.full(len(valid), -np.inf), lane_scores(found)
+    if isinstance(found, SegmentPrediction):
+        lines = [np.asarray(getattr(found, name))[scores > 0.0] for name in names]
+        confidences[valid] = segment_confidences(true, lines, scores[scores > 0.0])
+    else:
+        confidences[valid] = lane_confidences(true[0], np.asarray(found.points), scores)
+    return confidences
+
+
+def lane_scores(found: CenterlinePrediction | SegmentPrediction) -> Float[np.ndarray, "*b p"]:
+    """Return the confidences of detected lanes; 0 for crossings."""
+    scores = np.asarray(found.scores)
+    if isinstance(found, SegmentPrediction):
+        return np.where(np.asarray(found.logits).argmax(-1) == 0, scores, 0.0)
+    return scores
 
 
 def lane_confidences(
@@ -27,8 +55,22 @@ def lane_confidences(
         truth: valid lanes of one frame, metres.
         points, scores: all detections of the frame.
     """
-    distance, nearest = nearest_lanes(np.asarray(truth), np.asarray(points))
-    found, near = np.full(len(truth), -np.inf), distance < WITHIN
+    return _highest(*nearest_lanes(np.asarray(truth), np.asarray(points)), scores, len(truth))
+
+
+def segment_confidences(
+    truth: Sequence[Float[np.ndarray, "g n 3"]],
+    detected: Sequence[Float[np.ndarray, "p m 3"]],
+    scores: Float[np.ndarray, " p"],
+) -> Float[np.ndarray, " g"]:
+    """Return the same for segments: centerlines, left and right lines of both sides."""
+    return _highest(*nearest_segments(list(truth), list(detected)), scores, len(truth[0]))
+
+
+def _highest(
+    distance: Float[np.ndarray, " p"], nearest: Int[np.ndarray, " p"], scores: Float[np.ndarray, " p"], lanes: int
+) -> Float[np.ndarray, " g"]:
+    found, near = np.full(lanes, -np.inf), distance < WITHIN
     np.maximum.at(found, nearest[near], np.asarray(scores)[near])
     return found
 

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
-from numpy.typing import ArrayLike
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.plots import style
+from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_links, faded, turned, valid_rows
+from tflane_jax.plots.segments import draw_segment_prediction, draw_segments, true_lanes, visibility_colours
 from tflane_jax.scene import (
     Areas,
     AreaType,
@@ -21,6 +22,7 @@ from tflane_jax.scene import (
     Example,
     LaneGraph,
     RoadUser,
+    SegmentPrediction,
     TrafficElements,
     TrafficFlow,
 )
@@ -28,7 +30,7 @@ from tflane_jax.scene import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Layer = Literal["evidence", "hidden", "areas", "lanes", "traffic", "elements"]
+Layer = Literal["evidence", "hidden", "areas", "lanes", "segments", "traffic", "elements"]
 # The ground that rasters cover, and the part of it that is shown by default.
 GROUND = BevGrid().range
 VIEW = PerceptionRange()
@@ -51,7 +53,7 @@ def draw_scene(
     Args:
         ax: where to draw.
         example: layers that it does not have are skipped.
-        layers: to draw, in a fixed order.
+        layers: to draw, in a fixed order; by default all but "segments", which cover the lanes.
         ground: range of `example.bev` and `example.hidden`.
         view: range to show.
         strength: of the evidence, 0 to 1.
@@ -66,6 +68,8 @@ def draw_scene(
         draw_areas(ax, example.areas)
     if "lanes" in layers:
         draw_lanes(ax, example.lanes)
+    if "segments" in layers:
+        draw_segments(ax, example.segments)
     if "traffic" in layers and example.traffic_flow is not None:
         draw_traffic(ax, example.traffic_flow)
     if "elements" in layers and example.traffic_elements is not None:
@@ -115,29 +119,19 @@ def draw_hidden(ax: Axes, hidden: Bool[Array, "h w"], ground: PerceptionRange = 
 
 def draw_areas(ax: Axes, areas: Areas) -> None:
     """Draw crossings (shaded) and road boundaries."""
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgba
-
-    points, category = _rows(areas.valid, areas.points, areas.category)
-    _lines(ax, points[category == AreaType.ROAD_BOUNDARY], style.ROAD_BOUNDARY, width=1.0, zorder=1.0)
-    crossings = points[category == AreaType.PEDESTRIAN_CROSSING][..., :2]
-    shade, outline = to_rgba(style.CROSSING, 0.22), to_rgba(style.CROSSING, 0.8)
-    ax.add_collection(
-        PolyCollection(list(crossings), facecolors=[shade], edgecolors=[outline], linewidths=0.7, zorder=1.1)
-    )
+    points, category = valid_rows(areas.valid, areas.points, areas.category)
+    add_lines(ax, points[category == AreaType.ROAD_BOUNDARY], style.ROAD_BOUNDARY, width=1.0, zorder=1.0)
+    add_crossings(ax, points[category == AreaType.PEDESTRIAN_CROSSING])
 
 
 def draw_lanes(
     ax: Axes, lanes: LaneGraph, *, colour: str | None = None, width: float = 1.5, alpha: float = 1.0
 ) -> None:
     """Draw true lanes with arrows in driving direction; without a `colour`, they are coloured by visibility."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    points, visibility = _rows(lanes.valid, lanes.points, lanes.visibility)
-    by_visibility = LinearSegmentedColormap.from_list("visibility", [style.LANE_HIDDEN, style.LANE_CLEAR])
-    colours = by_visibility(np.clip(visibility, 0.0, 1.0)) if colour is None else colour
-    _lines(ax, points, colours, width=width, alpha=alpha, zorder=3.0)
-    _arrows(ax, points, colours, alpha=alpha, zorder=3.1)
+    points, visibility = valid_rows(lanes.valid, lanes.points, lanes.visibility)
+    colours = visibility_colours(visibility) if colour is None else colour
+    add_lines(ax, points, colours, width=width, alpha=alpha, zorder=3.0)
+    add_arrows(ax, points, colours, alpha=alpha, zorder=3.1)
 
 
 def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
@@ -146,7 +140,7 @@ def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
     from matplotlib.colors import to_rgba_array
 
     known = np.asarray(flow.valid).any(-1)
-    position, yaw, size, category, occluded, valid = _rows(
+    position, yaw, size, category, occluded, valid = valid_rows(
         known, flow.position, flow.yaw, flow.size, flow.category, flow.occluded, flow.valid
     )
     if len(valid) == 0:
@@ -168,7 +162,7 @@ def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
 
 def draw_elements(ax: Axes, elements: TrafficElements) -> None:
     """Draw traffic lights (round, in the colour of their state) and signs (square)."""
-    position, category, attribute = _rows(elements.valid, elements.position, elements.category, elements.attribute)
+    position, category, attribute = valid_rows(elements.valid, elements.position, elements.category, elements.attribute)
     for kind, marker in ((1, "o"), (2, "s")):
         mine = category == kind
         colours = [
@@ -196,27 +190,47 @@ def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
     ax.add_collection(PolyCollection(list(nose), facecolors=style.ROAD, zorder=6.1))
 
 
-def draw_prediction(ax: Axes, prediction: CenterlinePrediction, *, threshold: float = 0.3) -> None:
+def draw_prediction(ax: Axes, prediction: CenterlinePrediction | SegmentPrediction, *, threshold: float = 0.3) -> None:
     """Draw lanes with a score of at least `threshold`, opacity by score, and their topology.
 
-    A link runs from the end of a lane to the start of its successor if the score of the edge is above 0.5.
+    A link runs from the end of a lane to the start of its successor if the score of the edge is above 0.5. Segments
+    have boundaries by type, see `draw_boundaries`; crossings are shaded.
     """
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import to_rgba
-
+    if isinstance(prediction, SegmentPrediction):
+        draw_segment_prediction(ax, prediction, threshold=threshold)
+        return
     scores = np.asarray(prediction.scores)
     chosen = scores >= threshold
     points = np.asarray(prediction.points)[chosen]
-    colours = np.tile(to_rgba(style.PREDICTION), (len(points), 1))
-    colours[:, 3] = 0.25 + 0.75 * scores[chosen]
-    _lines(ax, points, colours, width=1.7, zorder=3.5)
-    _arrows(ax, points, colours, zorder=3.6)
-    # A logit of 0 is a score of 0.5.
-    before, after = np.nonzero(np.asarray(prediction.successor_logits)[np.ix_(chosen, chosen)] > 0.0)
-    links = np.stack([points[before, -1, :2], points[after, 0, :2]], 1)
-    ax.add_collection(LineCollection(list(links), colors=style.LINK, linewidths=1.1, zorder=3.7))
-    joints = links.mean(1)
-    ax.scatter(joints[:, 0], joints[:, 1], s=7, c=style.LINK, linewidths=0, zorder=3.8)
+    colours = faded(style.PREDICTION, scores[chosen])
+    add_lines(ax, points, colours, width=1.7, zorder=3.5)
+    add_arrows(ax, points, colours, zorder=3.6)
+    if prediction.successor_logits is not None:
+        add_links(ax, points, np.asarray(prediction.successor_logits)[np.ix_(chosen, chosen)])
+
+
+def draw_found(
+    ax: Axes,
+    example: Example,
+    prediction: CenterlinePrediction | SegmentPrediction,
+    *,
+    ground: PerceptionRange = GROUND,
+    view: PerceptionRange = VIEW,
+    threshold: float = 0.3,
+    title: str = "",
+) -> None:
+    """Draw a prediction over its ground truth, thin and white, and dim evidence; arguments as of `draw_scene`."""
+    prepare(ax, view, title)
+    if example.bev is not None:
+        draw_evidence(ax, example.bev, ground, strength=0.3)
+    draw_lanes(ax, true_lanes(example, prediction), colour="white", width=0.8, alpha=0.45)
+    draw_prediction(ax, prediction, threshold=threshold)
+    draw_ego(ax)
+
+
+def truth_layer(prediction: CenterlinePrediction | SegmentPrediction | None) -> Layer:
+    """Return the layer that shows the ground truth of a prediction."""
+    return "segments" if isinstance(prediction, SegmentPrediction) else "lanes"
 
 
 def box_corners(
@@ -224,49 +238,8 @@ def box_corners(
 ) -> Float[np.ndarray, "k 4 2"]:
     """Return the corners of boxes of (length, width) turned by `yaw`, counter-clockwise from front left."""
     corners = np.asarray([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]) * size[:, None]
-    return _turned(corners, yaw) + centre[:, None]
-
-
-def _turned(shapes: Float[np.ndarray, "#k n 2"], angle: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k n 2"]:
-    """Return each shape turned about the origin by its angle, counter-clockwise."""
-    along = np.stack([np.cos(angle), np.sin(angle)], -1)[:, None]
-    across = np.stack([-np.sin(angle), np.cos(angle)], -1)[:, None]
-    return shapes[..., :1] * along + shapes[..., 1:] * across
+    return turned(corners, yaw) + centre[:, None]
 
 
 def _extent(ground: PerceptionRange) -> tuple[float, float, float, float]:
     return (*ground.x, *ground.y)
-
-
-def _rows(valid: ArrayLike, *arrays: ArrayLike) -> list[np.ndarray]:
-    """Return the valid rows of each array."""
-    chosen = np.asarray(valid, bool)
-    return [np.asarray(array)[chosen] for array in arrays]
-
-
-def _lines(ax: Axes, points: np.ndarray, colours, *, width: float, zorder: float, alpha: float = 1.0) -> None:
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import to_rgba_array
-
-    shown = to_rgba_array(colours)
-    shown[:, 3] *= alpha
-    ax.add_collection(
-        LineCollection(list(points[..., :2]), colors=shown, linewidths=width, capstyle="round", zorder=zorder)
-    )
-
-
-def _arrows(ax: Axes, points: np.ndarray, colours, *, zorder: float, alpha: float = 1.0) -> None:
-    """Draw an arrow head in the middle of each line of at least two points."""
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgba_array
-
-    if len(points) == 0 or points.shape[1] < 2:
-        return
-    middle = points.shape[1] // 2
-    tip, tail = points[:, middle, :2], points[:, middle - 1, :2]
-    heading = np.arctan2(tip[:, 1] - tail[:, 1], tip[:, 0] - tail[:, 0])
-    head = np.asarray([[[1.0, 0.0], [-0.9, 0.75], [-0.9, -0.75]]])
-    shown = to_rgba_array(colours)
-    shown[:, 3] *= alpha
-    triangles = _turned(head, heading) + tip[:, None]
-    ax.add_collection(PolyCollection(list(triangles), facecolors=shown, linewidths=0, zorder=zorder))

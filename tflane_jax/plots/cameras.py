@@ -15,10 +15,11 @@ from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.geometry.cameras import project
 from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, draw_ego, draw_evidence, draw_lanes, draw_prediction, draw_scene, prepare
+from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
-from tflane_jax.scene import CameraViews, CenterlinePrediction, ElementPrediction, Example, TrafficElements
+from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_segments, outline_of_sides
+from tflane_jax.scene import CameraViews, ElementPrediction, Example, LineType, SegmentPrediction, TrafficElements
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +44,8 @@ ATTRIBUTE_NAMES = (
 _PANEL = 3.4  # inches
 # Points on a lane in an image: less than half a metre apart on the longest lanes.
 _POINTS = 201
+# Length of a dash and of dash with gap, metres; None: no gaps.
+_DASHES = {LineType.NONE: (0.5, 2.0), LineType.SOLID: None, LineType.DASHED: (2.5, 5.0)}
 # Lanes are cut off at this depth, metres.
 _NEAR = 0.5
 # Images smaller than this are shown with sharp pixels.
@@ -54,7 +57,7 @@ Tree = TypeVar("Tree")
 def save_camera_views(
     path: Path,
     examples: Example,
-    lanes: CenterlinePrediction | None = None,
+    lanes: LanePrediction | None = None,
     elements: ElementPrediction | None = None,
     *,
     titles: Sequence[str] = (),
@@ -116,7 +119,7 @@ def draw_camera(
     ax: Axes,
     example: Example,
     number: int,
-    lanes: CenterlinePrediction | None = None,
+    lanes: LanePrediction | None = None,
     elements: ElementPrediction | None = None,
     *,
     threshold: float = 0.3,
@@ -138,7 +141,9 @@ def draw_camera(
     if max(width, height) < _PIXELATED:
         ax.images[-1].set_interpolation("nearest")
     predicted = lanes is not None or elements is not None
-    if lanes is not None:
+    if isinstance(lanes, SegmentPrediction):
+        _draw_segments(ax, views, number, lanes, threshold)
+    elif lanes is not None:
         draw_projected(ax, views, number, np.asarray(lanes.points)[np.asarray(lanes.scores) >= threshold])
     elif not predicted:
         draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
@@ -150,27 +155,69 @@ def draw_camera(
         draw_boxes(ax, np.asarray(truth.box), np.asarray(truth.attribute), np.asarray(truth.valid))
 
 
-def draw_projected(ax: Axes, views: CameraViews, number: int, lines: Float[np.ndarray, "n p 3"]) -> None:
-    """Draw lines of the ego frame into a camera's image; colour by direction: forward green, left blue, back red."""
+def draw_projected(
+    ax: Axes,
+    views: CameraViews,
+    number: int,
+    lines: Float[np.ndarray, "n p 3"],
+    *,
+    colour: str | None = None,
+    width: float = 1.3,
+    dash: tuple[float, float] | None = None,
+) -> None:
+    """Draw lines of the ego frame into a camera's image.
+
+    Args:
+        ax, views, number: where, and which camera.
+        lines: metres.
+        colour: of all lines; None: by direction, forward green, left blue, back red.
+        width: of the lines, points.
+        dash: length of a dash and of dash with gap on the ground, metres; None draws whole lines.
+    """
     from matplotlib.collections import LineCollection
 
     if not len(lines):
         return
     dense = resample_lines(list(np.asarray(lines, np.float64)), _POINTS)
-    width, height = np.asarray(views.size)[number]
+    columns, height = np.asarray(views.size)[number]
     pixels, depth, _ = project(
         dense.reshape(-1, 3),
         np.asarray(views.intrinsics, np.float64)[number],
         np.asarray(views.camera_from_ego, np.float64)[number],
     )
     pixels, depth = pixels.reshape(*dense.shape[:2], 2), depth.reshape(dense.shape[:2])
-    margin = 0.1 * max(width, height)
-    shown = (depth > _NEAR) & ((pixels > -margin) & (pixels < [width + margin, height + margin])).all(-1)
+    margin = 0.1 * max(columns, height)
+    shown = (depth > _NEAR) & ((pixels > -margin) & (pixels < [columns + margin, height + margin])).all(-1)
     step = np.diff(dense[..., :2], axis=1)
-    colours = _direction_colours(np.arctan2(step[..., 1], step[..., 0]))
     pieces = shown[:, 1:] & shown[:, :-1]
+    if dash is not None:
+        along = np.cumsum(np.linalg.norm(step, axis=-1), axis=1)
+        pieces &= along % dash[1] < dash[0]
+    colours = colour or _direction_colours(np.arctan2(step[..., 1], step[..., 0]))[pieces]
     parts = np.stack([pixels[:, :-1], pixels[:, 1:]], 2)[pieces]
-    ax.add_collection(LineCollection(list(parts), colors=colours[pieces], linewidths=1.3, alpha=0.85, zorder=2.0))
+    ax.add_collection(LineCollection(list(parts), colors=colours, linewidths=width, alpha=0.85, zorder=2.0))
+
+
+def draw_projected_boundaries(
+    ax: Axes, views: CameraViews, number: int, lines: Float[np.ndarray, "n p 3"], types: Int[np.ndarray, " n"]
+) -> None:
+    """Draw boundaries into a camera's image by `LineType`: solid, dashed, or dotted and thin for none."""
+    for kind, dash in _DASHES.items():
+        width = 0.6 if kind == LineType.NONE else 1.3
+        mine = lines[np.asarray(types) == kind]
+        draw_projected(ax, views, number, mine, colour=style.PREDICTION, width=width, dash=dash)
+
+
+def _draw_segments(ax: Axes, views: CameraViews, number: int, found: SegmentPrediction, threshold: float) -> None:
+    """Draw predicted segments: thin centerlines by direction, boundaries by type, outlines of crossings."""
+    lanes, crossings = chosen_segments(found, threshold)
+    left, right = np.asarray(found.left), np.asarray(found.right)
+    draw_projected(ax, views, number, np.asarray(found.points)[lanes], width=0.8)
+    for lines, types in zip((left, right), boundary_types(found, lanes), strict=True):
+        draw_projected_boundaries(ax, views, number, lines[lanes], types)
+    rings = outline_of_sides(left[crossings], right[crossings])
+    closed = np.concatenate([rings, rings[:, :1]], 1)
+    draw_projected(ax, views, number, closed, colour=style.CROSSING, width=1.5)
 
 
 def draw_boxes(
@@ -189,7 +236,7 @@ def draw_boxes(
 def _draw_above(
     ax: Axes,
     example: Example,
-    lanes: CenterlinePrediction | None,
+    lanes: LanePrediction | None,
     title: str,
     threshold: float,
     ground: PerceptionRange,
@@ -199,12 +246,7 @@ def _draw_above(
         layers = ("hidden", "areas", "lanes", "traffic", "elements")
         draw_scene(ax, example, layers=layers, ground=ground, view=view, title=title)
         return
-    prepare(ax, view, title)
-    if example.bev is not None:
-        draw_evidence(ax, example.bev, ground, strength=0.3)
-    draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
-    draw_prediction(ax, lanes, threshold=threshold)
-    draw_ego(ax)
+    draw_found(ax, example, lanes, ground=ground, view=view, threshold=threshold, title=title)
 
 
 def _azimuth(views: CameraViews) -> Float[np.ndarray, " v"]:

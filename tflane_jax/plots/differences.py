@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, draw_ego, draw_evidence, draw_lanes, draw_prediction, draw_scene, prepare
+from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layer
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import label_edges, panel_size, pick
-from tflane_jax.scene import BevChannel, CenterlinePrediction, Example, RoadUser
+from tflane_jax.plots.gallery import boundary_entries, label_edges, panel_size, pick
+from tflane_jax.plots.segments import LanePrediction, true_lanes
+from tflane_jax.scene import BevChannel, Example, RoadUser
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +37,7 @@ class Findings:
         found: (B, G) by row of the padded truth.
     """
 
-    lanes: CenterlinePrediction
+    lanes: LanePrediction
     threshold: float
     found: Bool[np.ndarray, "b g"]
 
@@ -74,12 +75,18 @@ def save_differences(
     """
     size = panel_size(view, _PANEL_WIDTH)
     figure, axes = new_figure(len(titles), 2 + len(models), panel=size, footer=1.5)
+    shown = next((findings.lanes for findings in models.values()), None)
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
     for row, (line, name) in enumerate(zip(axes, titles, strict=True)):
         example, (truth, seen, *places) = pick(examples, row), line
-        lanes = np.asarray(example.lanes.points)
+        lanes = np.asarray(true_lanes(example, shown).points)
         draw_scene(
-            truth, example, layers=("hidden", "areas", "lanes"), ground=ground, view=view, title=f"truth, {name}"
+            truth,
+            example,
+            layers=("hidden", "areas", truth_layer(shown)),
+            ground=ground,
+            view=view,
+            title=f"truth, {name}",
         )
         layers = ("evidence", "traffic")
         draw_scene(seen, example, layers=layers, ground=ground, view=view, title="evidence and traffic")
@@ -87,16 +94,13 @@ def save_differences(
             draw_outlines(ax, lanes[outlined[row]])
         for ax, (model, findings) in zip(places, models.items(), strict=True):
             found = findings.found[row] & outlined[row]
-            prepare(ax, view, f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined")
-            if example.bev is not None:
-                draw_evidence(ax, example.bev, ground, strength=0.3)
-            draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
+            name = f"{model}: finds {found.sum()} of {outlined[row].sum()} outlined"
+            prediction = pick(findings.lanes, row)
+            draw_found(ax, example, prediction, ground=ground, view=view, threshold=findings.threshold, title=name)
             draw_outlines(ax, lanes[found], "filled")
             draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")
-            draw_prediction(ax, pick(findings.lanes, row), threshold=findings.threshold)
-            draw_ego(ax)
     label_edges(axes)
-    _add_legend(figure, caption, meaning)
+    _add_legend(figure, caption, meaning, segments=truth_layer(shown) == "segments")
     return save_figure(figure, path)
 
 
@@ -129,7 +133,7 @@ def band(line: Float[np.ndarray, "n 2"], half_width: float) -> Float[np.ndarray,
     return np.concatenate([line - half_width * left, (line + half_width * left)[::-1]])
 
 
-def _add_legend(figure: Figure, caption: str, meaning: str) -> None:
+def _add_legend(figure: Figure, caption: str, meaning: str, *, segments: bool = False) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -151,6 +155,7 @@ def _add_legend(figure: Figure, caption: str, meaning: str) -> None:
             Patch(facecolor=style.EVIDENCE[channel], label=f"evidence: {channel.name.lower().replace('_', ' ')}")
             for channel in (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE, BevChannel.OBSTACLE)
         ),
+        *(boundary_entries() if segments else ()),
     ]
     legend = figure.legend(
         handles=entries,

@@ -12,18 +12,10 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import (
-    GROUND,
-    VIEW,
-    draw_ego,
-    draw_evidence,
-    draw_lanes,
-    draw_prediction,
-    draw_scene,
-    prepare,
-)
+from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layer
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
-from tflane_jax.scene import CenterlinePrediction, Example
+from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
+from tflane_jax.scene import Example, LineType
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +32,7 @@ Tree = TypeVar("Tree")
 def save_examples(
     path: Path,
     examples: Example,
-    predictions: Mapping[str, CenterlinePrediction] | None = None,
+    predictions: Mapping[str, LanePrediction] | None = None,
     *,
     titles: Sequence[str] = (),
     ground: PerceptionRange = GROUND,
@@ -52,7 +44,8 @@ def save_examples(
     Args:
         path: .png, .pdf or .svg.
         examples: B of them, stacked along a leading axis.
-        predictions: by the name of the model, stacked in the same way.
+        predictions: by the name of the model, stacked in the same way. The truth is that of the first: lane segments
+            with boundaries by type, or merged centerlines.
         titles: one per row; default their numbers.
         ground, view: see `draw_scene`.
         threshold: lowest score of a lane that is drawn.
@@ -69,6 +62,7 @@ def save_examples(
     sizes = {"titles": len(titles)} | {name: len(stacked.points) for name, stacked in predictions.items()}
     if any(size != count for size in sizes.values()):
         raise ValueError(f"{count} examples, but {sizes}")
+    layer = truth_layer(next(iter(predictions.values()), None))
     panels = 2 + len(predictions)
     lines = -(-panels // _MOST_COLUMNS)
     figure, axes = new_figure(count * lines, -(-panels // lines), panel=panel_size(view), footer=0.5)
@@ -80,7 +74,7 @@ def save_examples(
         draw_scene(
             truth,
             example,
-            layers=("hidden", "areas", "lanes", "elements"),
+            layers=("hidden", "areas", layer, "elements"),
             ground=ground,
             view=view,
             title=f"{title}: truth",
@@ -89,14 +83,9 @@ def save_examples(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
         )
         for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
-            prepare(ax, view, name)
-            if example.bev is not None:
-                draw_evidence(ax, example.bev, ground, strength=0.3)
-            draw_lanes(ax, example.lanes, colour="white", width=0.8, alpha=0.45)
-            draw_prediction(ax, pick(stacked, row), threshold=threshold)
-            draw_ego(ax)
+            draw_found(ax, example, pick(stacked, row), ground=ground, view=view, threshold=threshold, title=name)
     label_edges(axes)
-    add_legend(figure, "with predictions" if predictions else "scenes")
+    add_legend(figure, "with predictions" if predictions else "scenes", segments=layer == "segments")
     return save_figure(figure, path)
 
 
@@ -131,8 +120,10 @@ def show_dataset(
     return save_figure(figure, out)
 
 
-def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes") -> None:
-    """Add the legend of all colours below the panels, once for the figure."""
+def add_legend(
+    figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes", *, segments: bool = False
+) -> None:
+    """Add the legend of all colours below the panels, once for the figure; with `segments`, types of boundaries too."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -155,10 +146,24 @@ def add_legend(figure: Figure, kind: Literal["scenes", "with predictions"] = "sc
             Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
             Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
         ]
+    if segments:
+        entries += boundary_entries()
     fitting = max(4, int(figure.get_figwidth() // 1.6))
     rows = -(-len(entries) // fitting)
     columns = -(-len(entries) // rows)
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
+
+
+def boundary_entries() -> list:
+    """Return the entries of a legend for boundaries by type, and for crossings."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    names = {LineType.SOLID: "solid boundary", LineType.DASHED: "dashed boundary", LineType.NONE: "unmarked boundary"}
+    return [
+        *(Line2D([], [], color="#b0b3ba", lw=1.2, ls=LINE_STYLES[kind], label=name) for kind, name in names.items()),
+        Patch(facecolor=style.CROSSING + "38", edgecolor=style.CROSSING, label="crossing"),
+    ]
 
 
 def panel_size(view: PerceptionRange, inches: float = _PANEL_WIDTH) -> tuple[float, float]:

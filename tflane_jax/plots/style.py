@@ -17,6 +17,8 @@ OUTLINE = "#ffee58"
 LANE_CLEAR = "#8be28b"
 LANE_HIDDEN = "#ff9d3c"
 
+# Boundaries of true lane segments.
+BOUNDARY = "#e6e2d3"
 ROAD_BOUNDARY = "#7f8da3"
 CROSSING = "#b9a5e2"
 

@@ -26,7 +26,6 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import traffic_interventions
 from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, Sightings, evaluate_lanes
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
-from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.geometry import PerceptionRange
@@ -43,7 +42,7 @@ from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
-from tflane_jax.tasks.lane_pictures import draw_differences, draw_hidden_lanes, titles
+from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
 T = TypeVar("T")
 
@@ -284,25 +283,13 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws a few validation examples from above and in their camera images."""
-        from tflane_jax.plots import save_camera_views, save_examples
-
         source = data.source("val")
         dataset = sources.open_dataset(source)
         indices = spread(len(dataset), config.pictures)
 
         def draw(folder: Path, step: int, params: Params) -> None:
             if indices:
-                examples, answer = predict_examples(self, params, dataset, indices)
-                if answer.centerlines is None:
-                    return  # pictures of other lanes come with the hosts that predict them
-                path, names = folder / "pictures" / f"step_{step:08d}.png", titles(dataset, indices)
-                ground, view = source.example.ground, source.example.range
-                lanes = {f"step {step}": answer.centerlines}
-                save_examples(path, examples, lanes, titles=names, ground=ground, view=view)
-                if examples.cameras is not None:
-                    path = path.with_stem(f"{path.stem}_cameras")
-                    lanes, elements = answer.centerlines, answer.elements
-                    save_camera_views(path, examples, lanes, elements, titles=names, ground=ground, view=view)
+                draw_examples(Model(self, params), source, dataset, indices, folder / "pictures", step)
 
         return draw
 

@@ -17,14 +17,15 @@ from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, frames_of_difference, lane_confidences
+from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, confidences_of, frames_of_difference, lane_scores
 from tflane_jax.evaluation.interventions import scene_numbers
 from tflane_jax.evaluation.lane_groups import lane_groups
 from tflane_jax.evaluation.predict import predict_examples, predicted_batches
-from tflane_jax.scene import CenterlinePrediction, Example, Prediction, stack_examples
+from tflane_jax.scene import CenterlinePrediction, Example, Prediction, SegmentPrediction, stack_examples
 from tflane_jax.tasks.base import Model, spread
 
 Group = Literal["hidden+traffic", "occluded"]
+Field = Literal["lanes", "segments"]
 _MEANING: dict[Group, str] = {
     "hidden+traffic": "lanes that the sensor hardly shows and vehicles drove along",
     "occluded": "lanes of which less than half is in line of sight",
@@ -34,6 +35,27 @@ _FRAMES_OF_ONE_MODEL = 6
 _BATCH = 16
 
 
+def draw_examples(
+    model: Model, source: LaneGraphSource, dataset: Dataset, indices: list[int], folder: Path, step: int
+) -> None:
+    """Write pictures of some examples to a folder, from above and, where there are any, in their camera images.
+
+    Predictions without lanes of a kind that can be drawn leave no picture.
+    """
+    from tflane_jax.plots import save_camera_views, save_examples
+
+    examples, answer = predict_examples(model.task, model.params, dataset, indices)
+    found = answer.centerlines if answer.segments is None else answer.segments
+    if found is None:
+        return
+    path, names = folder / f"step_{step:08d}.png", titles(dataset, indices)
+    ground, view = source.example.ground, source.example.range
+    save_examples(path, examples, {f"step {step}": found}, titles=names, ground=ground, view=view)
+    if examples.cameras is not None:
+        path = path.with_stem(f"{path.stem}_cameras")
+        save_camera_views(path, examples, found, answer.elements, titles=names, ground=ground, view=view)
+
+
 def draw_hidden_lanes(
     models: Mapping[str, Model], source: LaneGraphSource, data: Example | Streamed, path: Path
 ) -> Path:
@@ -41,18 +63,20 @@ def draw_hidden_lanes(
     from tflane_jax.plots import save_examples
 
     dataset = sources.open_dataset(source)
+    field = truth_of(next(iter(models.values())))
     if isinstance(data, Streamed):
         indices = spread(len(data), _FRAMES_OF_ONE_MODEL)
     else:
-        hidden = (data.lanes.valid & (data.lanes.visibility < 0.5)).sum(-1)
+        lanes = getattr(data, field)
+        hidden = (lanes.valid & (lanes.visibility < 0.5)).sum(-1)
         indices = np.argsort(-hidden, kind="stable")[:_FRAMES_OF_ONE_MODEL].tolist()
     examples = stack_examples([dataset.example(index) for index in indices])
-    lanes = {
-        name: centerlines_of(predict_examples(model.task, model.params, dataset, indices)[1])
+    found = {
+        name: lanes_of(predict_examples(model.task, model.params, dataset, indices)[1])
         for name, model in models.items()
     }
     ground, view = source.example.ground, source.example.range
-    return save_examples(path, examples, lanes, titles=titles(dataset, indices), ground=ground, view=view)
+    return save_examples(path, examples, found, titles=titles(dataset, indices), ground=ground, view=view)
 
 
 @dataclass(frozen=True)
@@ -67,7 +91,7 @@ class _Answers:
 
     found: Bool[np.ndarray, "f g"]
     threshold: float
-    lanes: CenterlinePrediction
+    lanes: CenterlinePrediction | SegmentPrediction
 
 
 def draw_differences(
@@ -76,7 +100,7 @@ def draw_differences(
     """Draw the frames in which the first two models differ most, and outline the lanes that only one of them finds.
 
     All models predict the whole split once. `evaluation.found_lanes` says which lanes are found and which frames are
-    drawn.
+    drawn. Lanes are merged centerlines, or segments where the models predict these.
 
     Args:
         models: by name, at least two.
@@ -84,15 +108,22 @@ def draw_differences(
         path: of the picture.
         group: the lanes that are counted and outlined: `hidden+traffic` of `evaluation.lane_groups`, for examples with
             BEV evidence and traffic flow; or lanes of which less than half is in line of sight.
+
+    Raises:
+        UserError: some models predict centerlines, others segments.
     """
     from tflane_jax.plots import Findings, save_differences
 
     parts, answers = next(iter(models.values())).task.parts, {}
+    fields: list[Field] = sorted({truth_of(model) for model in models.values()})
+    if len(fields) > 1:
+        raise UserError("these models predict lanes of different kinds: compare hosts of centerlines or of segments")
+    field = fields[0]
     for name, model in models.items():
         mine = data if model.task.parts == parts else model.task.load(source, progress=False)
-        answers[name] = _answers(model, mine)
+        answers[name] = _answers(model, mine, field)
     first, second = list(answers)[:2]
-    members = _members(data, source, group)
+    members = _members(data, source, group, field)
     by_first, by_second = (members & answers[name].found for name in (first, second))
     alone = {first: by_first & ~by_second, second: by_second & ~by_first}
     frames = frames_of_difference(alone[first].sum(1), alone[second].sum(1), scene_numbers(data), _FRAMES)
@@ -130,31 +161,29 @@ def _caption(answers: Mapping[str, _Answers], ahead: Mapping[str, Sequence[int]]
     )
 
 
-def _answers(model: Model, data: Example | Streamed) -> _Answers:
+def _answers(model: Model, data: Example | Streamed, field: Field) -> _Answers:
     """Return what a model predicts for a whole split."""
-    confidences, valid, lanes = [], [], []
+    confidences, valid, lanes, scores = [], [], [], []
     for indices, batch, answer in predicted_batches(model.task, model.params, data, _BATCH):
-        lanes.append(centerlines_of(answer))
-        scores = np.asarray(lanes[-1].scores)
+        lanes.append(lanes_of(answer))
+        scores.append(lane_scores(lanes[-1]))
         for row in range(len(indices)):
-            true = np.asarray(batch.lanes.valid[row])
-            confidence = np.full(len(true), -np.inf)
-            confidence[true] = lane_confidences(batch.lanes.points[row][true], lanes[-1].points[row], scores[row])
-            confidences.append(confidence)
-            valid.append(true)
+            truth, found = jax.tree.map(lambda leaf, i=row: np.asarray(leaf[i]), (getattr(batch, field), lanes[-1]))
+            confidences.append(confidences_of(truth, found))
+            valid.append(truth.valid)
     stacked: Any = jax.tree.map(lambda *leaves: np.concatenate(leaves), *lanes)
     found = np.stack(confidences)
-    threshold = best_threshold([found[np.stack(valid)]], [np.asarray(stacked.scores).ravel()])
+    threshold = best_threshold([found[np.stack(valid)]], [np.concatenate(scores).ravel()])
     return _Answers(found >= threshold, threshold, stacked)
 
 
-def _members(data: Example | Streamed, source: LaneGraphSource, group: Group) -> Bool[np.ndarray, "f g"]:
+def _members(data: Example | Streamed, source: LaneGraphSource, group: Group, field: Field) -> Bool[np.ndarray, "f g"]:
     """Return which true lanes, by row of the padded truth, belong to the group."""
     every = []
     for indices, batch in ordered_batches(data, _BATCH):
         for row in range(len(indices)):
             lanes, bev, flow = jax.tree.map(
-                lambda leaf, i=row: np.asarray(leaf[i]), (batch.lanes, batch.bev, batch.traffic_flow)
+                lambda leaf, i=row: np.asarray(leaf[i]), (getattr(batch, field), batch.bev, batch.traffic_flow)
             )
             members = lanes.valid & (lanes.visibility < 0.5)
             if group != "occluded":
@@ -164,11 +193,20 @@ def _members(data: Example | Streamed, source: LaneGraphSource, group: Group) ->
     return np.stack(every)
 
 
-def centerlines_of(prediction: Prediction) -> CenterlinePrediction:
-    """Return the predicted centerlines; raise UserError for a host that predicts none."""
-    if prediction.centerlines is None:
-        raise UserError("this host predicts no centerlines: pictures of other lanes are not drawn yet")
-    return prediction.centerlines
+def lanes_of(prediction: Prediction) -> CenterlinePrediction | SegmentPrediction:
+    """Return the predicted segments or centerlines; raise UserError for a host that predicts neither."""
+    found = prediction.centerlines if prediction.segments is None else prediction.segments
+    if found is None:
+        raise UserError(
+            "this host predicts neither centerlines nor segments: pictures of other lanes are not drawn yet"
+        )
+    return found
+
+
+def truth_of(model: Model) -> Field:
+    """Return the field of `Example` that holds the truth of what `lanes_of` returns for this model."""
+    host: Any = getattr(model.task, "model", None)
+    return "segments" if host is not None and "segments" in host.predicts else "lanes"
 
 
 def titles(dataset: Dataset, indices: list[int]) -> list[str]:

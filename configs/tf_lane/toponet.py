@@ -26,7 +26,7 @@ def get_config() -> RunConfig:
 
 def ablations() -> dict[str, RunConfig]:
     """Return the baseline on the preset `street`, the same without one part each, and TopoNet's published forms."""
-    street = _small(WorldData.street(), steps=5000)
+    street = _small(WorldData.street(), steps=7000)
     model, losses, optim = _host(WorldData.street()), street.task.losses, street.optim
     decoder, encoder = model.decoder, model.encoder
 

@@ -21,7 +21,7 @@ from tflane_jax.training.schedule import OptimConfig
 
 def get_config() -> RunConfig:
     """Return the baseline on the preset `city`."""
-    return _small(WorldData.city(), steps=6000)
+    return _small(WorldData.city(), steps=9000)
 
 
 def ablations() -> dict[str, RunConfig]:

@@ -21,12 +21,12 @@ from tflane_jax.training.schedule import OptimConfig
 
 def get_config() -> RunConfig:
     """Return the baseline on the preset `city`."""
-    return _small(WorldData.city(), steps=6000)
+    return _small(WorldData.city(), steps=9000)
 
 
 def ablations() -> dict[str, RunConfig]:
     """Return the baseline on the preset `street`, the same without one part each, and TopoNet's published forms."""
-    street = _small(WorldData.street(), steps=5000)
+    street = _small(WorldData.street(), steps=7000)
     model, losses, optim = _host(WorldData.street()), street.task.losses, street.optim
     decoder, encoder = model.decoder, model.encoder
 
@@ -54,8 +54,8 @@ def ablations() -> dict[str, RunConfig]:
 
 def _host(data: WorldData) -> TopoNetConfig:
     """Return a host that learns within minutes; docs/small_models.md tells what is TopoNet's and what is not."""
-    encoder = EvidenceEncoderConfig(dim=48, levels=(64, 128), dilations=(), coordinates=True, range=data.example.ground)
-    decoder = LaneDecoderConfig(layers=2, queries=40, output="metric", proposals=LaneProposalConfig(count=28))
+    encoder = EvidenceEncoderConfig(dim=64, levels=(96, 128), dilations=(), coordinates=True, range=data.example.ground)
+    decoder = LaneDecoderConfig(layers=2, queries=48, output="metric", proposals=LaneProposalConfig(count=36))
     return TopoNetConfig(
         encoder=encoder, range=data.example.range, decoder=decoder, denoising=DenoisingConfig(copies=1)
     )

@@ -1,6 +1,7 @@
-"""Compiled programs are kept between processes, in the user's cache folder or where the environment says."""
+"""Freed memory is kept for the next step, and compiled programs for the next process."""
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -65,3 +66,34 @@ def test_the_oldest_programs_are_dropped(tmp_path, monkeypatch, limit, kept):
         os.utime(tmp_path / name, (1000 - age, 1000 - age))
     runtime._keep_programs(tmp_path)
     assert {file.name for file in tmp_path.iterdir()} == kept
+
+
+REUSE = """
+import resource
+import sys
+import threading
+import numpy as np
+from tflane_jax.training import runtime
+if sys.argv[1] == "configured":
+    runtime.configure_jax(keep_programs=False)
+faults = []
+def allocate():
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        np.ones(100 * 2**20, np.uint8)
+        faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+thread = threading.Thread(target=allocate)
+thread.start()
+thread.join()
+print(faults[-1])
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
+def test_memory_of_one_step_is_used_by_the_next_in_any_thread():
+    def faults(argument):
+        command = [sys.executable, "-c", REUSE, argument]
+        return int(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=100).stdout)
+
+    # Without the settings, 25,600 pages of 4 KiB or 50 of 2 MiB are mapped anew each time.
+    assert faults("configured") < faults("plain") / 4

@@ -38,7 +38,8 @@ class AuxiliaryOutputs:
     """Auxiliary outputs of a model; None where it has none. `HostConfig.auxiliary` lists those of a host.
 
     Attributes:
-        denoised: centerlines or segments of the denoising queries, leading axes (copy, layer); see `models.lane_denoising`.
+        denoised: centerlines or segments of the denoising queries, leading axes (copy, layer); see
+            `models.lane_denoising`.
         lane_cells: (h, w, `CELL_CHANNELS`) lanes per BEV cell.
         lane_proposals: of the heads that propose lanes, see `models.lane_proposals`.
         line_cells: (h, w) logit per cell of the image features: does a lane line pass through it?

@@ -52,7 +52,9 @@ class SegmentDecoderConfig(LaneDecoderConfig):
     def check(self) -> None:
         """Raise UserError where sizes do not fit together."""
         if self.heads % 2:
-            raise UserError(f"half of the attention heads look at each boundary: make decoder.heads even, not {self.heads}")
+            raise UserError(
+                f"half of the attention heads look at each boundary: make decoder.heads even, not {self.heads}"
+            )
         if self.sampling_points % min(self.sampling_points, 8):
             raise UserError(
                 "sampling points start as a star of eight directions: set decoder.sampling_points to a multiple of 8 "
@@ -111,7 +113,9 @@ class SegmentHeads(nn.Module):
         score = config.initial_score
         bias = None if score is None else math.log(score / (1.0 - score))
         logits = Branch((*hidden, CLASSES), norm=True, bias=bias, name="class")(queries)
-        types = [Branch((*hidden, LINE_TYPES), norm=True, name=f"{side}_type")(queries) for side in ("left", "right")]
+        left_type, right_type = (
+            Branch((*hidden, LINE_TYPES), norm=True, name=f"{side}_type")(queries) for side in ("left", "right")
+        )
         change, offset = (
             Branch((*hidden, lines), name=name)(queries).reshape(reference.shape) for name in ("points", "offset")
         )
@@ -122,7 +126,7 @@ class SegmentHeads(nn.Module):
         if masks:
             kernels = Branch((*hidden, bev.shape[-1]), name="mask")(queries)
             mask = jnp.einsum("qe,hwe->qhw", kernels, bev)
-        return SegmentOutput(points, left, right, unit, logits, *types, mask)
+        return SegmentOutput(points, left, right, unit, logits, left_type, right_type, mask)
 
     def _boundaries(
         self, points: Float[Array, "q p 3"], offset: Float[Array, "q p 3"]

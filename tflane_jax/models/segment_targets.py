@@ -1,4 +1,4 @@
-"""LaneSegNet's ground truth: lane segments and pedestrian crossings as rows of one graph (docs/reference/lanesegnet.md).
+"""LaneSegNet's ground truth: lane segments and pedestrian crossings as rows of one graph.
 
 A crossing is a pseudo segment: its two long sides are its left and right boundary.
 """
@@ -76,9 +76,7 @@ def segment_targets(segments: LaneGraph, areas: Areas) -> SegmentTargets:
     return SegmentTargets(lanes, jnp.where(order < count, LANE, CROSSING))
 
 
-def crossing_sides(
-    rings: Float[Array, "a k 3"], points: int
-) -> tuple[Float[Array, "a p 3"], Float[Array, "a p 3"]]:
+def crossing_sides(rings: Float[Array, "a k 3"], points: int) -> tuple[Float[Array, "a p 3"], Float[Array, "a p 3"]]:
     """Return the long sides of crossings, metres, each `points` points at equal distances.
 
     A crossing is the rectangle around its ring along the ring's prevailing edge direction. Both sides head between -45

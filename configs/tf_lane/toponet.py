@@ -54,8 +54,8 @@ def ablations() -> dict[str, RunConfig]:
 
 def _host(data: WorldData) -> TopoNetConfig:
     """Return a host that learns within minutes; docs/small_models.md tells what is TopoNet's and what is not."""
-    encoder = EvidenceEncoderConfig(dim=48, levels=(64, 128), dilations=(), coordinates=True, range=data.example.ground)
-    decoder = LaneDecoderConfig(layers=2, queries=40, output="metric", proposals=LaneProposalConfig(count=28))
+    encoder = EvidenceEncoderConfig(dim=64, levels=(96, 128), dilations=(), coordinates=True, range=data.example.ground)
+    decoder = LaneDecoderConfig(layers=2, queries=48, output="metric", proposals=LaneProposalConfig(count=36))
     return TopoNetConfig(
         encoder=encoder, range=data.example.range, decoder=decoder, denoising=DenoisingConfig(copies=1)
     )

@@ -123,8 +123,10 @@ def test_groups_by_hand():
     assert members(lanes, painted(-5.25), driving(10.0, 0.2)) == [
         ["visible-traffic"],
         ["hidden+traffic"],
-        ["hidden-traffic"],
+        ["hidden-traffic", "hidden-neighbours"],
     ]
+    # The lane beside the driven one has no traffic of its own, but a neighbour that has.
+    assert members(straight_lanes(3.5), raster(), driving(10.0, 0.0)) == [["hidden-traffic"]]
     # A lane of which less than half was driven, or with a vehicle at its side, is in no group.
     assert members(straight_lanes(0.0), raster(), driving(3.0, 0.2)) == [[]]
     assert members(straight_lanes(0.0), raster(), driving(10.0, 2.0)) == [[]]
@@ -138,9 +140,9 @@ def test_groups_by_hand():
         (driving(10.0, 0.0, yaw=np.radians(31.0)), []),
         (driving(10.0, 0.0, yaw=np.pi), []),
         (driving(10.0, 1.6), []),
-        (driving(10.0, 0.0, category=RoadUser.PEDESTRIAN), ["hidden-traffic"]),
-        (driving(10.0, 0.0, occluded=True), ["hidden-traffic"]),
-        (TrafficFlow.empty(0, 3), ["hidden-traffic"]),
+        (driving(10.0, 0.0, category=RoadUser.PEDESTRIAN), ["hidden-traffic", "hidden-neighbours"]),
+        (driving(10.0, 0.0, occluded=True), ["hidden-traffic", "hidden-neighbours"]),
+        (TrafficFlow.empty(0, 3), ["hidden-traffic", "hidden-neighbours"]),
     ],
 )
 def test_what_counts_as_traffic(flow, group):
@@ -160,7 +162,7 @@ def test_what_counts_as_traffic(flow, group):
 def test_what_counts_as_evidence(channel, value, group):
     bev = raster()
     bev[:, :, channel] = value
-    assert members(straight_lanes(0.0), bev, TrafficFlow.empty(1, 3)) == [[f"{group}-traffic"]]
+    assert members(straight_lanes(0.0), bev, TrafficFlow.empty(1, 3))[0][0] == f"{group}-traffic"
 
 
 def test_a_frame_without_lanes_has_empty_groups():

@@ -16,11 +16,12 @@ over `SAMPLES` points, equally spaced along the lane.
 | `hidden+traffic` | below `HALF` | driven fraction at least `HALF` |
 | `hidden-traffic` | below `HALF` | no vehicle came within `NEARBY` of the lane, in any direction |
 | `visible+traffic`, `visible-traffic` | at least `HALF` | the same |
+| `hidden-neighbours` | below `HALF` | no vehicle came within `BESIDE_IT` of the lane |
 
-Lanes with some traffic, but along less than half of their length, are in none of the groups. Lanes of the control may
-have traffic in the lane beside them, which tells of them too, but less. Traffic is the history of
-the example before any selection: its valid, not occluded frames, and straight lines between successive ones.
-Pedestrians do not count.
+Lanes with some traffic, but along less than half of their length, are in none of the first four groups. Lanes of the
+control may have traffic in the lane beside them, which tells of them too; `hidden-neighbours`, a part of it, has none
+there either, and few lanes. Traffic is the history of the example before any selection: its valid, not occluded frames,
+and straight lines between successive ones. Pedestrians do not count.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from scipy.ndimage import maximum_filter
 from tflane_jax.geometry import BevGrid, PerceptionRange, resample_lines
 from tflane_jax.scene import BevChannel, LaneGraph, RoadUser, TrafficFlow
 
-LANE_GROUPS = ("hidden+traffic", "hidden-traffic", "visible+traffic", "visible-traffic")
+LANE_GROUPS = ("hidden+traffic", "hidden-traffic", "visible+traffic", "visible-traffic", "hidden-neighbours")
 SAMPLES = 25
 EVIDENCE = 64  # of 255
 TOLERANCE = 1.0  # metres
 BESIDE = 1.5  # metres
 HEADING = np.radians(30.0)
-NEARBY = 2.5  # metres
+NEARBY, BESIDE_IT = 2.5, 5.0  # metres; lanes are 3 to 3.75 m wide
 HALF = 0.5
 
 
@@ -56,7 +57,9 @@ def lane_groups(
     hidden = shown_fraction(left, right, bev, ground) < HALF
     driven, distance = driven_fraction(center, flow)
     traffic, none = driven >= HALF, distance > NEARBY
-    return dict(zip(LANE_GROUPS, (hidden & traffic, hidden & none, ~hidden & traffic, ~hidden & none), strict=True))
+    remote = hidden & (distance > BESIDE_IT)
+    groups = hidden & traffic, hidden & none, ~hidden & traffic, ~hidden & none, remote
+    return dict(zip(LANE_GROUPS, groups, strict=True))
 
 
 def shown_fraction(

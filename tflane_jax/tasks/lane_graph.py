@@ -87,7 +87,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
             for name in ("DET_l", "TOP_ll", "recall")
             for group in ("all", "occluded", "clear", *Sightings.groups)
         ),
-        *(f"{group}/{name}" for name in ("recall", "AP_l") for group in LANE_GROUPS[:2]),
+        *(f"{group}/{name}" for name in ("recall", "AP_l") for group in (*LANE_GROUPS[:2], LANE_GROUPS[-1])),
     )
 
     # -----------------------------------------------------------------------------------------------------------------

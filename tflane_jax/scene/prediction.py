@@ -54,6 +54,11 @@ class SegmentPrediction:
     mask_logits: Float[Array, "*layers q h w"] | None = None
     successor_logits: Float[Array, "*layers q q"] | None = None
 
+    @property
+    def scores(self) -> Float[Array, "*layers q"]:
+        """Confidence of the best class, 0 to 1."""
+        return jax.nn.sigmoid(self.logits).max(-1)
+
 
 @struct.dataclass
 class LinePrediction:

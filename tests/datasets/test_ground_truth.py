@@ -8,9 +8,10 @@ import shapely
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.datasets import prepared_map
-from tflane_jax.datasets.areas import BOUNDARY_MARGIN, clip_ring, crop_areas
+from tflane_jax.datasets.areas import BOUNDARY_MARGIN, clip_ring, crop_areas, crossing_sides
 from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
 from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose
 from tflane_jax.scene import AreaType
 from tflane_jax.scene.logs import MapElement
@@ -124,10 +125,10 @@ def test_a_map_is_prepared_once_and_forgotten_with_it():
     assert key not in prepared_map._PREPARED
 
 
-def areas_of(*, crossings=(), boundaries=(), capacity=6):
+def areas_of(*, crossings=(), boundaries=(), capacity=6, form="ring"):
     vector_map = lane_map(crossings=crossings, road_boundaries=boundaries)
     prepared = prepare_map(vector_map, bike_lanes=True)
-    return crop_areas(prepared, np.eye(4), RANGE, capacity=capacity, points=20)
+    return crop_areas(prepared, np.eye(4), RANGE, capacity=capacity, points=20, crossings=form)
 
 
 def ring(*corners):
@@ -142,6 +143,36 @@ def test_crossings_stay_whole_if_they_touch_the_range():
     assert areas.points[0, :, 0].max() > 58.0
     np.testing.assert_array_equal(areas.points[0, 0], areas.points[0, -1])
     assert dropped == 0
+
+
+CORNERS = ((10.0, -6.0), (10.0, 6.0), (13.0, 6.0), (13.0, -6.0))
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_sides_of_a_crossing_are_its_first_and_third_edge(turn):
+    outline = ring(*CORNERS) @ np.diag([1.0, 1.0, 0.0])
+    c, s = np.round((np.cos(turn * np.pi / 2), np.sin(turn * np.pi / 2)))
+    outline[:, :2] = outline[:, :2] @ np.array([[c, s], [-s, c]])
+    boundary = ring((0.0, 1.0), (3.0, 1.0), (3.0, -1.0))
+    areas, _ = areas_of(crossings=(outline,), boundaries=(boundary,), form="sides")
+    row = np.flatnonzero(areas.category == AreaType.PEDESTRIAN_CROSSING)[0]
+    first, second = areas.points[row].reshape(2, 10, 3)
+    edges = [np.linspace(*outline[[0, 1]], 10), np.linspace(*outline[[2, 3]], 10)]
+    # Seen along +y and -x, the rule takes the first edge, else the third.
+    expected = edges if turn in (0, 3) else edges[::-1]
+    np.testing.assert_allclose([first, second], expected, atol=1e-5)
+    step = first[-1] - first[0]
+    assert -45.0 <= np.rad2deg(np.arctan2(step[1], step[0])) <= 135.0
+    # The boundary stays a ring.
+    np.testing.assert_array_equal(*areas.points[1 - row][[0, -1]])
+
+
+def test_an_outline_with_further_corners_is_cut_in_two_halves():
+    outline = ring((0.0, 0.0), (4.0, 0.0), (8.0, 0.0), (8.0, 3.0), (0.0, 3.0))
+    sides = crossing_sides(outline, 8)
+    np.testing.assert_allclose(sides[[0, 3, 4, 7], :2], [[0, 0], [8, 3], [8, 3], [0, 0]], atol=0.8)
+    with pytest.raises(UserError, match="even number"):
+        crossing_sides(outline, 7)
 
 
 def test_boundaries_are_cut_inside_the_range_and_islands_stay_closed():

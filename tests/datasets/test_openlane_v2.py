@@ -25,6 +25,7 @@ from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import (
     BASELINE_LARGE,
+    LANESEGNET_BUCKET,
     TOPONET_SUBSET_A,
     TOPONET_SUBSET_B,
     ImageConfig,
@@ -68,6 +69,7 @@ def change(path, function):
     ("config", "front", "others", "canvas"),
     [
         (TOPONET_SUBSET_A, (775, 775), (1024, 775), (1024, 800)),
+        (LANESEGNET_BUCKET, (511, 511), (675, 511), (704, 512)),
         (BASELINE_LARGE, (2048, 1550), (2048, 1550), (2048, 1568)),
         (TOPONET_SUBSET_B, (800, 450), (800, 450), (800, 480)),
     ],
@@ -129,6 +131,18 @@ def test_flavours_fill_their_own_part(whole, flavour, lanes, segments):
     assert len(example.traffic_elements.lane) == (5 if flavour == "centerline" else 4)
     assert example.traffic_elements.lane[:3, :2].tolist() == [[True, False], [False, False], [False, True]]
     np.testing.assert_allclose(example.traffic_elements.box[0], [[10, 4], [14, 12.5]])
+
+
+def test_crossings_may_be_two_sides(folder):
+    outline = [[5.0, -3.0, 0.1], [5.0, 3.0, 0.1], [8.0, 3.0, 0.1], [8.0, -3.0, 0.1], [5.0, -3.0, 0.1]]
+    crossing = {"id": 1, "category": 1, "points": outline}
+    change(info(folder, 0, "-ls"), lambda record: record["annotation"]["area"].append(crossing))
+    for form, corners in (("ring", [0, 0]), ("sides", [0, 1, 2, 3])):
+        example = opened(folder, None, flavour="lane_segment", example=replace(SIZES, crossings=form)).example(0)
+        assert example.areas.category.tolist() == [2, 1]
+        ends = [0, -1] if form == "ring" else [0, 9, 10, 19]
+        np.testing.assert_allclose(example.areas.points[1, ends], [outline[i] for i in corners], atol=1e-6)
+        np.testing.assert_allclose(example.areas.points[0, [0, -1]], [[5, -3, 0], [5, 3, 0]], atol=1e-6)
 
 
 def test_items_beyond_capacity_are_left_out_with_their_edges(whole):

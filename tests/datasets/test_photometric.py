@@ -97,6 +97,27 @@ def test_a_grid_hides_squares_of_the_mean_colour(seed):
     assert draw_grid(NOTHING, np.random.default_rng(seed), 60, 80) is None
 
 
+def test_all_views_have_the_same_grid():
+    views = fake_views().replace(image=np.full_like(fake_views().image, 200))
+    image = augment_views(views, replace(NOTHING, grid_mask=1.0), 0).image
+    hidden = (image == [124, 116, 104]).all(-1)
+    assert hidden[0].any()
+    for view, (width, height) in zip(hidden, views.size, strict=True):
+        np.testing.assert_array_equal(view[:height, :width], hidden[0, :height, :width])
+        assert not view[height:].any()  # padding keeps its content
+        assert not view[:, width:].any()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_grid_has_one_period_and_hides_half_of_it(seed):
+    grid = draw_grid(replace(NOTHING, grid_mask=1.0), np.random.default_rng(seed), 400, 400)
+    for axis in (0, 1):
+        edges = np.flatnonzero(np.diff(grid.any(axis).astype(int)))
+        widths = np.diff(edges)
+        assert (abs(widths[:-1:2] - widths[1::2]) <= 1).all()
+        assert len(set(widths[::2].tolist())) <= 1
+
+
 def test_a_grid_is_drawn_with_its_probability():
     config = PhotometricConfig(grid_mask=0.7)
     drawn = [draw_grid(config, np.random.default_rng(seed), 50, 50) for seed in range(300)]

@@ -42,7 +42,8 @@ def labelled(seed=0):
     lines.category[:5] = [0, 1, 2, LineClass.CENTERLINE, 2]
     lines.valid[:5] = True
     lanes, across = example.lanes, np.array([0.0, 1.5, 0.0], np.float32)
-    segments = lanes.replace(left=lanes.points + across, right=lanes.points - across)
+    types = {name: np.array([1, 2, 0, 0, 0], np.int32) for name in ("left_type", "right_type")}
+    segments = lanes.replace(left=lanes.points + across, right=lanes.points - across, **types)
     elements = example.traffic_elements
     attribute = np.full_like(elements.attribute, elements.attribute[0])
     box = np.broadcast_to(np.array([[10.0, 10.0], [30.0, 40.0]], np.float32), elements.box.shape)
@@ -72,7 +73,8 @@ class Oracle:
             edges = jnp.where(segments.successor, 9.0, -9.0)
             points, left, right = (x + self.shift for x in (segments.points, segments.left, segments.right))
             logits = jnp.where(kind, 9.0, -9.0)
-            found["segments"] = SegmentPrediction(points, left, right, logits, successor_logits=edges)
+            types = (jax.nn.one_hot(kind, 3) for kind in (segments.left_type, segments.right_type))
+            found["segments"] = SegmentPrediction(points, left, right, logits, *types, successor_logits=edges)
         if "lines" in self.parts:
             kind = jax.nn.one_hot(lines.category, 4) * lines.valid[:, None]
             points = jnp.nan_to_num(lines.points) + self.shift
@@ -92,26 +94,27 @@ def measured(parts, shift=0.0, config=BOTH):
 def test_an_oracle_gets_the_full_score_in_every_protocol():
     metrics = measured(("centerlines", "segments", "lines", "elements"))
     found = metrics.compute()
-    assert {"all", "occluded", "clear", "segments", "lanesegnet", "lines"} <= set(found)
+    assert {"all", "occluded", "clear", "segments all", "segments occluded", "lines"} <= set(found)
     assert found["all"]["DET_l"] == found["all"]["TOP_ll"] == found["all"]["DET_t"] == found["all"]["OLS"] == 1.0
     assert found["all"]["OLS_v1.0"] > 0
-    assert found["segments"]["DET_l"] == found["segments"]["TOP_ll"] == found["segments"]["DET_t"] == 1.0
-    assert found["lanesegnet"]["AP_ls"] == 1.0
+    segments = found["segments all"]
+    assert segments["AP_ls"] == segments["TOP_lsls"] == segments["DET_t"] == segments["TOP_lste"] == 1.0
+    assert (segments["AE_dist"], segments["AE_type"]) == (0.0, 0.0)
     assert found["lines"]["mAP"] == 1.0
-    for name in ("OpenLane-V2 centerline", "lane segments", "MapTR"):
+    for name in ("OpenLane-V2 centerline", "LaneSegNet lane segments", "OpenLane-V2 lane segments", "MapTR"):
         assert name in metrics.protocol
 
 
 @pytest.mark.parametrize("part", ["centerlines", "segments", "lines"])
 def test_only_predicted_parts_are_measured_and_errors_lower_the_score(part):
     near, far = measured((part,)).compute(), measured((part,), shift=30.0).compute()
-    names = {"centerlines": ("all", "DET_l"), "segments": ("lanesegnet", "AP_ls"), "lines": ("lines", "mAP")}
+    names = {"centerlines": ("all", "DET_l"), "segments": ("all", "AP_ls"), "lines": ("lines", "mAP")}
     group, name = names[part]
     assert near[group][name] == 1.0
     assert far[group][name] < 0.2
     assert ("lines" in near) == (part == "lines")
-    assert ("segments" in near) == (part == "segments")
-    assert ("all" in near) == (part == "centerlines")
+    assert ("all" in near) == (part != "lines")
+    assert ("AP_ped" in near.get("all", {})) == ("DET_a" in near.get("all", {})) == (part == "segments")
 
 
 def test_a_second_version_adds_columns_and_changes_none():
@@ -189,6 +192,47 @@ def test_lanes_are_grouped_by_evidence_and_traffic():
     for lacking in ("bev", "traffic_flow"):
         without = evaluate_lanes(Oracle(("centerlines",)), {}, arrays.replace(**{lacking: None}), BOTH, ground=ground)
         assert list(without.compute()) == ["all", "occluded", "clear"]
+
+
+def test_segments_have_the_groups_of_centerlines():
+    arrays, ground = with_groups(), BevGrid().range
+    lanes, segments = (
+        evaluate_lanes(Oracle((part,)), {}, arrays, BOTH, ground=ground) for part in ("centerlines", "segments")
+    )
+    expected, found = lanes.compute(), segments.compute()
+    assert list(found) == list(expected) == ["all", "occluded", "clear", *LANE_GROUPS]
+    for group in found:  # the segments of these examples are the centerlines
+        assert found[group]["lanes"] == expected[group]["lanes"]
+        assert found[group]["recall"] == expected[group]["recall"]
+        assert ("mAP" in found[group]) == (group == "all")
+    assert segments.ratios() == lanes.ratios()
+
+
+def test_types_count_only_where_they_are_predicted():
+    example = labelled()
+    segments = example.segments
+    logits = np.stack([np.where(segments.valid, 9.0, -9.0), np.full(5, -9.0)], -1)
+    wrong = np.eye(3)[(segments.left_type + 1) % 3]
+    for types, expected in ((None, None), (wrong, 1.0)):
+        metrics = LaneGraphMetrics()
+        lines = segments.points, segments.left, segments.right
+        metrics.update(Prediction(segments=SegmentPrediction(*lines, logits, types, types)), example)
+        assert metrics.compute()["all"].get("AE_type") == expected
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_segments_and_one_and_padding_of_nan(count):
+    example = labelled()
+    segments = example.segments.replace(valid=np.arange(5) < count)
+    for line in (segments.points, segments.left, segments.right, segments.visibility):
+        line[count:] = np.nan
+    queries = segments.points[:count], segments.left[:count], segments.right[:count], np.tile([[9.0, -9.0]], (count, 1))
+    metrics = LaneGraphMetrics()
+    metrics.update(Prediction(segments=SegmentPrediction(*queries)), example.replace(segments=segments))
+    found = metrics.compute()["all"]
+    assert (found["AP_ls"], found["lanes"]) == (1.0, count)
+    assert np.isfinite(list(found.values())).all()
+    assert ("AE_dist" in found) == bool(count)
 
 
 def test_an_intervention_changes_what_the_model_sees_and_neither_truth_nor_groups():

@@ -11,7 +11,7 @@ import numpy as np
 
 from tests.shared import shared_root
 from tflane_jax.metrics import ElementDetections, ElementTruth, LaneDetections, LaneTruth
-from tflane_jax.metrics.lane_segment import AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
+from tflane_jax.metrics.segment_matching import AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
 from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
 
 Task = Literal["centerline", "lanesegment", "maptr"]

@@ -9,29 +9,19 @@ from hypothesis import strategies as st
 
 from tests.metrics.cases import straight
 from tests.metrics.fixtures import expected_cases, load_segments
+from tests.metrics.segments import evaluate, frame, moved, random_segments, with_types
 from tflane_jax.errors import UserError
-from tflane_jax.metrics import LaneDetections, LaneTruth
-from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, match_lanes
-from tflane_jax.metrics.chamfer import PaddedLines, pair_chamfer
-from tflane_jax.metrics.lane_segment import (
+from tflane_jax.metrics import LaneDetections
+from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
+from tflane_jax.metrics.groups import ByDistance, ByOcclusion
+from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
-    AreaDetections,
     AreaTruth,
-    Flavour,
-    LaneSegmentMetrics,
     SegmentDetections,
-    SegmentTruth,
-    nearest_segments,
 )
 
 CASES = list(expected_cases("lanesegment"))
-
-
-def evaluate(frames, flavour: Flavour = "OpenLane-V2"):
-    metrics = LaneSegmentMetrics(flavour)
-    for detections, truth in frames:
-        metrics.update(detections, truth)
-    return metrics.compute()
 
 
 @pytest.mark.golden
@@ -57,97 +47,6 @@ def test_golden_totals(case):
             key = f"{official}_per_{'attribute' if ours == 'DET_t' else 'threshold'}"
             got = [result[f"{ours}@{t}"] for t in thresholds]
             np.testing.assert_allclose(got, expected["olus"][key], atol=1e-6, err_msg=key)
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("case", CASES)
-def test_golden_distances_and_matches(case):
-    expected = expected_cases("lanesegment")[case]
-    topology = {key: np.array(expected["olus"][f"{key}_per_threshold_frame"], float) for key in ("TOP_ll", "TOP_lt")}
-    tied = bool(expected["tie_sensitive"])
-    for f, (detections, truth, official) in enumerate(load_segments(case)):
-        distance, nearest = nearest_segments(
-            [truth.lanes.points, truth.left, truth.right],
-            [detections.lanes.points, detections.left, detections.right],
-        )
-        matrix = official["out_lane_dist"]
-        if len(matrix):
-            # Pairs beyond the largest threshold are not all measured; they must only stay beyond it.
-            near = matrix.min(0) < LANE_THRESHOLDS[-1]
-            np.testing.assert_array_equal(distance < LANE_THRESHOLDS[-1], near)
-            np.testing.assert_allclose(distance[near], matrix.min(0)[near], atol=1e-6)
-            np.testing.assert_array_equal(nearest[near], matrix.argmin(0)[near])
-        scores = detections.lanes.scores
-        if len(set(scores.tolist())) == len(scores):  # the official order of ties is not defined
-            frame = match_lanes(detections.lanes, truth.lanes, distance, nearest)
-            matches = np.where(frame.hits, frame.nearest, -1)
-            np.testing.assert_array_equal(matches, [official[f"out_lane_match_{t}"] for t in LANE_THRESHOLDS])
-            assert np.isnan(topology["TOP_ll"][:, f]).all() == (frame.lanes == 0)
-            if frame.lanes and not tied:
-                mean = frame.topology["v2.1"].sum(-1) / (2 * frame.lanes)
-                np.testing.assert_allclose(mean, topology["TOP_ll"][:, f], atol=1e-6)
-            elements = frame.elements
-            if elements is not None and elements.vertices and not tied:
-                np.testing.assert_allclose(
-                    elements.topology["v2.1"] / elements.vertices, topology["TOP_lt"][:, f], atol=1e-6
-                )
-
-
-@pytest.mark.golden
-@pytest.mark.parametrize("case", CASES)
-def test_golden_area_distances(case):
-    for detections, truth, official in load_segments(case):
-        true = PaddedLines.of(truth.areas.points, "truth").open_ends()
-        found = PaddedLines.of(detections.areas.points, "detections")
-        i, j = np.nonzero(np.ones((len(true), len(found))))
-        expected = official["out_area_dist"][i, j]
-        np.testing.assert_allclose(pair_chamfer(true, found, i, j), expected, atol=1e-6)
-
-
-def segment(y, points=5):
-    """Return a 10 m segment along x, 4 m wide, its centerline at `y`."""
-    return [straight((0, y + side, 0), (10, y + side, 0), points) for side in (0.0, 2.0, -2.0)]
-
-
-def frame(true, found, scores, areas=((), ()), found_areas=((), (), ())):
-    """Return a frame of segments at the given y."""
-    (tc, tl, tr), (fc, fl, fr) = (
-        zip(*map(segment, ys), strict=True) if len(ys) else ((), (), ()) for ys in (true, found)
-    )
-    g, p = len(true), len(found)
-    return (
-        SegmentDetections(
-            LaneDetections(fc, np.array(scores, float), np.zeros((p, p))),
-            fl,
-            fr,
-            AreaDetections(found_areas[0], np.array(found_areas[1], int), np.array(found_areas[2])),
-        ),
-        SegmentTruth(LaneTruth(tc, np.zeros((g, g), bool)), tl, tr, AreaTruth(areas[0], np.array(areas[1], int))),
-    )
-
-
-def test_a_shift_counts_one_and_a_half_times():
-    detections, truth = frame([0.0], [0.6, 0.8], [0.9, 0.8])
-    distance, nearest = nearest_segments(
-        [truth.lanes.points, truth.left, truth.right], [detections.lanes.points, detections.left, detections.right]
-    )
-    np.testing.assert_allclose(distance, [0.9, 1.2])
-    np.testing.assert_array_equal(nearest, [0, 0])
-    # Within 1 m only the first; the second never gets a lane, which is taken.
-    result = evaluate([(detections, truth)])
-    assert [result[f"DET_l@{t}"] for t in LANE_THRESHOLDS] == [1.0, 1.0, 1.0]
-    second = evaluate([frame([0.0], [0.6, 0.8], [0.8, 0.9])])
-    # The first in rank misses at 1 m (precision 1/2 at every recall) and takes the lane at 2 and 3 m.
-    assert [second[f"DET_l@{t}"] for t in LANE_THRESHOLDS] == pytest.approx([0.5, 1.0, 1.0])
-
-
-def test_side_lines_cannot_bring_back_a_far_centerline():
-    detections, truth = frame([0.0], [0.0], [0.9])
-    moved = dataclasses.replace(detections, lanes=dataclasses.replace(detections.lanes, points=[segment(3.0)[0]]))
-    distance, _ = nearest_segments(
-        [truth.lanes.points, truth.left, truth.right], [moved.lanes.points, moved.left, moved.right]
-    )
-    assert distance.tolist() == [np.inf]
 
 
 def test_areas_by_hand():
@@ -206,6 +105,65 @@ def test_arrays_may_be_reused_after_an_update():
         detections.areas.scores[:] = 0.0
         detections.areas.categories[:] = 1
     assert metrics.compute() == expected
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(st.integers(0, 10**6), st.floats(-3.2, 3.2))
+def test_a_turn_about_the_vehicle_and_a_mirror_change_nothing(seed, angle):
+    rng = np.random.default_rng(seed)
+    frames = [random_segments(rng) for _ in range(3)]
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    for flavour in ("OpenLane-V2", "LaneSegNet"):
+        expected = evaluate(frames, flavour)
+        turned = [tuple(moved(part, turn) for part in frame) for frame in frames]
+        assert evaluate(turned, flavour) == pytest.approx(expected, abs=1e-9)
+        mirrored = [tuple(moved(part, np.diag([1.0, -1.0, 1.0]), swap=True) for part in frame) for frame in frames]
+        assert evaluate(mirrored, flavour) == pytest.approx(expected, abs=1e-9)
+
+
+PARTITIONS = {"occlusion": ByOcclusion(), "distance": ByDistance((5.0, 15.0))}
+
+
+@pytest.mark.parametrize("partition", PARTITIONS.values(), ids=PARTITIONS)
+def test_groups_share_the_segments_of_all(partition):
+    rng = np.random.default_rng(5)
+    frames = [random_segments(rng) for _ in range(6)]
+    grouped, parts = (GroupedSegmentMetrics(partition=partition) for _ in range(2)), []
+    grouped, other = grouped
+    for detections, truth in frames:
+        grouped.update(detections, truth)
+    result = grouped.compute()
+    assert result["all"] == evaluate(frames, "LaneSegNet")
+    parts = [result[name] for name in partition.names]
+    assert [name for name in result if name != "all"] == list(partition.names)
+    assert sum(part["lanes"] for part in parts) == result["all"]["lanes"]
+    for name in ("TOP_lsls", "recall"):  # means over the lanes
+        weighted = sum(part["lanes"] * part[name] for part in parts) / result["all"]["lanes"]
+        assert weighted == pytest.approx(result["all"][name])
+    assert not {"AP_ped", "mAP", "crossing@0.5"} & parts[0].keys()
+    hits = {group: counts.sum(0) for group, counts in grouped.recalled().items()}
+    assert (hits["all"] == sum(hits[name] for name in partition.names)).all()
+    for detections, truth in frames[:2]:
+        other.update(detections, truth)
+    rest = GroupedSegmentMetrics(partition=partition)
+    for detections, truth in frames[2:]:
+        rest.update(detections, truth)
+    merged = other.merge(rest).compute()
+    assert all(merged[group] == pytest.approx(result[group]) for group in result)
+
+
+def test_errors_of_a_group_are_those_of_its_segments():
+    near, far = [(0.0, 0.6), (9.0, 10.0)]
+    detections, truth = with_types(
+        frame([near[0], far[0]], [near[1], far[1]], [0.9, 0.8]), [(1, 1), (1, 1)], [(1, 1), (2, 1)]
+    )
+    metrics = GroupedSegmentMetrics(partition=ByDistance((5.0,)), lane_groups=("second",))
+    metrics.update(detections, truth, members={"second": np.array([False, True])})
+    result = metrics.compute()
+    assert (result["0 to 5 m"]["AE_dist"], result["0 to 5 m"]["AE_type"]) == (pytest.approx(0.6), 0.0)
+    assert (result["from 5 m"]["AE_dist"], result["from 5 m"]["AE_type"]) == (pytest.approx(1.0), 0.5)
+    assert result["second"] == result["from 5 m"]
 
 
 def test_empty_input():

@@ -13,6 +13,7 @@ from tests.metrics.fixtures import expected_cases, load_frames
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics, GroupedCenterlineMetrics, LaneDetections, LaneTruth
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, iou_distance, match_frame, nearest_lanes
+from tflane_jax.metrics.groups import ByOcclusion
 
 VERSIONS = {"v2.1": "", "v1.0": "v1_0_"}
 CASES = list(expected_cases())
@@ -205,7 +206,7 @@ def test_frames_outside_a_group_of_frames_count_nothing_in_it():
 
 def test_threshold_of_occlusion_is_strict_and_configurable():
     lanes = {
-        limit: evaluate([hand_frame()], GroupedCenterlineMetrics(occluded_below=limit))["occluded"]["lanes"]
+        limit: evaluate([hand_frame()], GroupedCenterlineMetrics(partition=ByOcclusion(limit)))["occluded"]["lanes"]
         for limit in (0.2, 0.3, 0.4, 0.41)
     }
     assert lanes == {0.2: 0, 0.3: 1, 0.4: 1, 0.41: 2}

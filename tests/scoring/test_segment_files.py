@@ -98,3 +98,37 @@ def test_laneseg_net_measures_the_long_sides_of_a_crossing(tmp_path):
     assert own["crossing@0.5"] == 1.0
     # The devkit spreads 20 points around the whole outline instead, also along its short sides.
     assert devkit["crossing@0.5"] == 0.0
+
+
+def typed(record, types, visibility=None):
+    (lane,) = record["lane_segment"]
+    lane |= dict(zip(("left_laneline_type", "right_laneline_type"), types, strict=True))
+    return record if visibility is None else record | {"lane_segment": [lane | {"visibility": visibility}]}
+
+
+@pytest.mark.parametrize("by", ["distance", "occlusion"])
+def test_types_and_groups_are_read_from_the_files(tmp_path, by):
+    corners = np.array([[0, 0, 0], [0, 9, 0], [8, 9, 0], [8, 0, 0], [0, 0, 0]], float)
+    keys = [("val", "1", str(i)) for i in range(2)]
+    truth = {key: {"annotation": typed(segment_record(corners), (1, 2), 0.2)} for key in keys}
+    found = {key: {"predictions": typed(segment_record(corners, 0.9), (1, i))} for i, key in enumerate(keys)}
+    (tmp_path / "annotations.pkl").write_bytes(pickle.dumps(truth))
+    (tmp_path / "submission.pkl").write_bytes(pickle.dumps({"results": found}))
+    files = [str(tmp_path / name) for name in ("submission.pkl", "annotations.pkl")]
+    for protocol in ("lanesegnet", "openlane-v2.1-lane-segment"):
+        assert main(["score", protocol, *files, "--by", by, "--out", str(tmp_path / "out")]) == 0
+        rows = {row["part"]: row for row in json.loads((tmp_path / "out.json").read_text())["rows"]}
+        assert rows["all"]["AE_type"] == 0.5
+        assert rows["all"]["AE_dist"] == 0.0
+        near, far = ("0 to 10 m", "from 30 m") if by == "distance" else ("occluded", "clear")
+        assert (rows[near]["lanes"], rows[far]["lanes"]) == (2, 0)
+        assert rows[near]["AE_type"] == 0.5
+
+
+def test_occlusion_needs_visibility(tmp_path, capsys):
+    corners = np.array([[0, 0, 0], [0, 9, 0], [8, 9, 0], [8, 0, 0], [0, 0, 0]], float)
+    key = ("val", "1", "1")
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({key: {"annotation": segment_record(corners)}}))
+    (tmp_path / "s.pkl").write_bytes(pickle.dumps({"results": {key: {"predictions": segment_record(corners, 0.9)}}}))
+    assert main(["score", "lanesegnet", str(tmp_path / "s.pkl"), str(tmp_path / "a.pkl"), "--by", "occlusion"]) == 2
+    assert "no visibility of its lanes" in capsys.readouterr().err

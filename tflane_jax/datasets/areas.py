@@ -6,12 +6,16 @@ and their sources.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.prepared_map import PreparedMap
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.geometry.polylines import clip_to_range, resample_lines
+from tflane_jax.geometry.polylines import clip_to_range, resample, resample_lines
 from tflane_jax.scene import Areas, AreaType
 
 # Metres. MapTR cuts road boundaries this far inside the range; figures of OpenLane-V2 agree with it.
@@ -25,14 +29,20 @@ def crop_areas(
     *,
     capacity: int,
     points: int,
+    crossings: Literal["ring", "sides"] = "ring",
 ) -> tuple[Areas, int]:
     """Return the areas near the vehicle, ego frame, and how many of them (the farthest) exceeded the capacity.
 
     Crossings that meet the range stay whole; road boundaries are cut `BOUNDARY_MARGIN` inside the range.
+
+    Args:
+        prepared, ego_from_global, range_: map, pose, and perception range in the ego frame.
+        capacity, points: areas in the result, and points on each.
+        crossings: form of crossings, see `ExampleConfig`.
     """
-    crossings = prepared.crossings.moved(ego_from_global)
+    outlines = prepared.crossings.moved(ego_from_global)
     # A ring that meets the range crosses its border or lies inside it; no crossing is large enough to surround it.
-    rings = [crossings.line(i) for i in crossings.near(range_)]
+    rings = [outlines.line(i) for i in outlines.near(range_)]
     rings = [ring for ring in rings if clip_to_range(ring, range_)]
     low, high = BOUNDARY_MARGIN, -BOUNDARY_MARGIN
     inner = PerceptionRange((range_.x[0] + low, range_.x[1] + high), (range_.y[0] + low, range_.y[1] + high), range_.z)
@@ -47,7 +57,43 @@ def crop_areas(
         areas.points[:n] = resample_lines([found[i] for i in kept], points)
         areas.category[:n] = [category[i] for i in kept]
         areas.valid[:n] = True
+        if crossings == "sides":
+            with_sides(areas, [found[i] for i in kept])
     return areas, len(found) - n
+
+
+def with_sides(areas: Areas, outlines: Sequence[np.ndarray]) -> None:
+    """Replace the crossings among the first rows of `areas` (numpy, in place) by the long sides of their outlines."""
+    for row, outline in enumerate(outlines):
+        if areas.category[row] == AreaType.PEDESTRIAN_CROSSING:
+            areas.points[row] = crossing_sides(outline, areas.points.shape[1])
+
+
+def crossing_sides(outline: Float[np.ndarray, "n 3"], points: int) -> Float[np.ndarray, "points 3"]:
+    """Return the left side of a crossing followed by its reversed right side, half of the points on each.
+
+    The long sides of an outline of four corners are its first and its third edge, as in Argoverse 2 and OpenLane-V2;
+    other outlines are cut in two halves of equal length. As in LaneSegNet's loader, the left side is the edge that runs
+    in a direction between -45 and 135 degrees, in the order of the outline.
+
+    Args:
+        outline: closed ring, metres, ego frame.
+        points: an even number.
+
+    Raises:
+        UserError: the number of points is odd.
+    """
+    if points % 2:
+        raise UserError(f"ExampleConfig.area_points = {points} cannot be shared by two sides: give an even number")
+    if len(outline) == 5:
+        first, second = outline[:2], outline[2:4]
+    else:
+        dense = resample(outline, 2 * points)
+        first, second = dense[:points], dense[points:]
+    step = first[-1, :2] - first[0, :2]
+    if not -45.0 <= np.rad2deg(np.arctan2(step[1], step[0])) <= 135.0:
+        first, second = second, first
+    return np.concatenate([resample(first, points // 2), resample(second, points // 2)])
 
 
 def clip_ring(line: np.ndarray, range_: PerceptionRange) -> list[np.ndarray]:

@@ -37,6 +37,8 @@ class ExampleConfig:
         lanes, lane_points: merged centerlines and points on each.
         segments, segment_points: lane segments and points on each.
         areas, area_points: crossings with road boundaries and points on each.
+        crossings: points of a pedestrian crossing: "ring" takes them along its closed outline, "sides" half of them
+            along each of its two long sides, see `areas.crossing_sides`. LaneSegNet learns and measures "sides".
         history: frames N of traffic flow before the key frame.
         history_hz: rate of these frames: at 2 Hz, 20 frames look back 10 s, and the latest is 0.5 s before the key
             frame, as in nuScenes and OpenLane-V2. It must divide the rate of the log's tracks. None takes every track
@@ -57,6 +59,7 @@ class ExampleConfig:
     segment_points: int = 10
     areas: int = 32
     area_points: int = 20
+    crossings: Literal["ring", "sides"] = "ring"
     history: int = 20
     history_hz: float | None = None
     tracks: int = 96

@@ -105,7 +105,12 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         buildings=buildings,
     )
     areas, areas_dropped = crop_areas(
-        prepared, ego_from_global, config.range, capacity=config.areas, points=config.area_points
+        prepared,
+        ego_from_global,
+        config.range,
+        capacity=config.areas,
+        points=config.area_points,
+        crossings=config.crossings,
     )
     elements, elements_dropped = traffic_elements(
         log.map.elements,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int
 
+from tflane_jax.datasets.areas import with_sides
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.openlane_annotation import Annotation
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, canvas_size
@@ -48,14 +49,16 @@ def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph
     return graph, kept
 
 
-def area_set(found: Annotation, capacity: int, points: int) -> Areas:
-    """Return the areas of an annotation."""
+def area_set(found: Annotation, capacity: int, points: int, crossings: Literal["ring", "sides"] = "ring") -> Areas:
+    """Return the areas of an annotation; see `ExampleConfig` for the form of crossings."""
     kept = _nearest(found.areas, capacity, "areas")
     areas, n = Areas.empty(capacity, points), len(kept)
     if n:
         areas.points[:n] = _with_points([found.areas[i] for i in kept], points)
         areas.category[:n] = found.area_category[kept]
         areas.valid[:n] = True
+        if crossings == "sides":
+            with_sides(areas, [found.areas[i] for i in kept])
     return areas
 
 

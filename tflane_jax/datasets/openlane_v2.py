@@ -113,7 +113,7 @@ class OpenLaneV2Dataset:
         segments = LaneGraph.empty(config.segments, config.segment_points)
         if (found := by_flavour.get(SEGMENT)) is not None:
             segments, kept_segments = lane_graph(found, config.segments, config.segment_points)
-            areas = area_set(found, config.areas, config.area_points)
+            areas = area_set(found, config.areas, config.area_points, config.crossings)
         governed = (segments, kept_segments) if self._names[0] is SEGMENT else (lanes, kept_lanes)
         elements = TrafficElements.empty(config.elements, len(governed[0].valid))
         if annotations[0] is not None:

@@ -47,6 +47,10 @@ class PhotometricConfig:
     grid_ratio: float = 0.5
 
 
+LANESEGNET_PHOTOMETRIC = PhotometricConfig(grid_mask=0.7)
+"""LaneSegNet at the paper's size: photometric distortion, and one GridMask for all views."""
+
+
 def augment_example(example: Example, config: PhotometricConfig, seed: int | Sequence[int]) -> Example:
     """Return an example with its images changed at random; without cameras it is unchanged."""
     if example.cameras is None:

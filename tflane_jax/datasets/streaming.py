@@ -11,8 +11,13 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
+
+# Draws in place of an example that is not wanted.
+_MOST_DRAWS = 1000
 
 
 @dataclass(frozen=True)
@@ -50,11 +55,14 @@ class Streamed:
         dataset: its examples all have the same shapes; several threads call it, or it is pickled for processes.
         config: workers.
         select: example -> the part of it to keep; None keeps all.
+        wanted: example -> whether to use it. In place of one that is not wanted, `stream` yields another, drawn with
+            the request's key. None uses all.
     """
 
     dataset: IndexedExamples
     config: StreamingConfig = StreamingConfig()
     select: Callable[[Any], Any] | None = None
+    wanted: Callable[[Any], bool] | None = None
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -63,6 +71,22 @@ class Streamed:
         """Return the selected part of one example."""
         example = self.dataset.example(index)
         return example if self.select is None else self.select(example)
+
+    def requested(self, request: Request) -> Any:
+        """Return the requested example, or the one drawn in its place; see `wanted`.
+
+        Raises UserError if the first `_MOST_DRAWS` are not wanted.
+        """
+        draws = np.random.default_rng(request.key)
+        index = request.index
+        for _ in range(_MOST_DRAWS):
+            example = self.example(index)
+            if self.wanted is None or self.wanted(example):
+                return example
+            index = int(draws.integers(len(self)))
+        raise UserError(
+            f"{self.dataset.name}: of {_MOST_DRAWS} examples none has any lanes: set task.empty_frames=keep"
+        )
 
     def stream(self, requests: Callable[[int], Request], count: int, prepare: Prepare | None = None) -> Generator[Any]:
         """Yield the examples of requests 0 to count - 1, in this order.
@@ -101,9 +125,9 @@ class _Load:
     prepare: Prepare | None
 
     def __call__(self, number: int) -> Any:
-        index, key = self.requests(int(number))
-        example = self.source.example(index)
-        return example if self.prepare is None else self.prepare(example, key)
+        request = self.requests(int(number))
+        example = self.source.requested(request)
+        return example if self.prepare is None else self.prepare(example, request.key)
 
 
 def _mark_flags_as_parsed() -> None:

@@ -35,6 +35,8 @@ class ImageConfig:
 
 TOPONET_SUBSET_A = ImageConfig(front_rows=(356, 1906), scale=0.5)
 """TopoNet, LaneSegNet and TF-Lane on Argoverse 2: 7 images of 1024 x 775 (the front one 775 x 775) in 1024 x 800."""
+LANESEGNET_BUCKET = ImageConfig(front_rows=(356, 1906), scale=0.33)
+"""LaneSegNet's map-element-bucket variant on Argoverse 2: 7 images of 675 x 511 (the front one 511 x 511)."""
 TOPONET_SUBSET_B = ImageConfig(scale=0.5)
 """TopoNet on nuScenes: 6 images of 800 x 450 in 800 x 480."""
 BASELINE_LARGE = ImageConfig(front_size=(2048, 1550))

@@ -4,7 +4,8 @@
 |---|---|---|
 | `centerlines` (with `elements`) | OpenLane-V2 centerline | all, occluded, clear; those of `lane_groups`; seen, gap, |
 | | | before for markers |
-| `segments` | OpenLane-V2 lane segment; LaneSegNet | segments; lanesegnet |
+| `segments` (with `elements`) | LaneSegNet; in `all` also the devkit's | the same (`segments all` and so on beside |
+| | | centerlines) |
 | `lines` | MapTR | lines |
 """
 
@@ -20,21 +21,25 @@ from scipy.special import expit
 
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
-from tflane_jax.evaluation.centerlines import detections_from_prediction, element_detections, truth_from_example
+from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups
-from tflane_jax.evaluation.lane_segments import segment_detections, segment_truth
+from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_truth
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
 from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
 from tflane_jax.evaluation.vector_maps import map_detections, map_lines, map_truth
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
-from tflane_jax.metrics.lane_segment import LaneSegmentMetrics
+from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
+from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth, VectorMapMetrics
 from tflane_jax.models.parameters import Params
-from tflane_jax.scene import ElementPrediction, Example, LinePrediction, Prediction, SegmentPrediction, TrafficElements
+from tflane_jax.scene import Example, LinePrediction, Prediction
+
+Members = Mapping[str, Bool[np.ndarray, " g"]]
+"""For each group of lanes, which of the valid true lanes belong to it."""
 
 
 class LaneGraphMetrics:
@@ -58,21 +63,22 @@ class LaneGraphMetrics:
             versions=versions, frame_groups=frame_groups, lane_groups=lane_groups
         )
         self._continues: list[bool] = []  # whether a frame belongs to the scene of the frame before
-        self._segments = {"segments": LaneSegmentMetrics("OpenLane-V2"), "lanesegnet": LaneSegmentMetrics("LaneSegNet")}
+        self._segments = GroupedSegmentMetrics(frame_groups=frame_groups, lane_groups=lane_groups)
+        self._devkit = LaneSegmentMetrics("OpenLane-V2")
         self._lines = VectorMapMetrics()
         self._measured = tuple(parts)
 
     @property
     def protocol(self) -> str:
         """Names and versions of the protocols that apply."""
-        return "; ".join(metrics.protocol for metrics in self._applied().values())
+        return "; ".join(metrics.protocol for metrics in self._applied())
 
     def update(
         self,
         prediction: Prediction,
         example: Example,
         frame_group: str | None = None,
-        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
+        members: Mapping[str, Members] | None = None,
     ) -> None:
         """Add one frame; the frames of a scene come in succession.
 
@@ -80,7 +86,8 @@ class LaneGraphMetrics:
             prediction: the last decoder layer's prediction for this example.
             example: ground truth of all predicted parts. Traffic elements are measured if both have them.
             frame_group: the group that this frame belongs to.
-            members: for each of `lane_groups`, which of the valid true lanes belong to it.
+            members: by "centerlines" and "segments": for each of `lane_groups`, which of the valid true lanes belong to
+                it.
 
         Raises:
             ValueError: no protocol measures any predicted part.
@@ -92,60 +99,63 @@ class LaneGraphMetrics:
         self._continues.append(bool(example.has_previous))
         both = prediction.elements is not None and example.traffic_elements is not None
         found, true = (prediction.elements, example.traffic_elements) if both else (None, None)
+        members = members or {}
         if prediction.centerlines is not None:
             detections = detections_from_prediction(prediction.centerlines, found)
-            self._centerlines.update(detections, truth_from_example(example.lanes, true), frame_group, members)
+            lanes = truth_from_example(example.lanes, true)
+            self._centerlines.update(detections, lanes, frame_group, members.get("centerlines"))
         if prediction.segments is not None:
-            self._update_segments(prediction.segments, found, true, example)
+            segments = segment_truth(example.segments, example.areas, true, None if true is None else example.lanes)
+            frame = match_segments(detections_of_segments(prediction.segments, found), segments)
+            self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
+            self._devkit.add(frame)
         if prediction.lines is not None:
             self._lines.update(_lines(prediction.lines), _true_lines(example))
-
-    def _update_segments(
-        self,
-        segments: SegmentPrediction,
-        found: ElementPrediction | None,
-        true: TrafficElements | None,
-        example: Example,
-    ) -> None:
-        confidence = expit(np.asarray(segments.logits))
-        edges = segments.successor_logits
-        successor = np.zeros((len(confidence),) * 2) if edges is None else expit(np.asarray(edges))
-        detections = segment_detections(
-            np.asarray(segments.points),
-            np.asarray(segments.left),
-            np.asarray(segments.right),
-            confidence.argmax(-1),
-            confidence.max(-1),
-            successor,
-            elements=None if found is None else element_detections(found),
-        )
-        truth = segment_truth(example.segments, example.areas, true, None if true is None else example.lanes)
-        for metrics in self._segments.values():
-            metrics.update(detections, truth)
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return metrics by name, for every group of every protocol that applies."""
         groups: dict[str, dict[str, float]] = {}
-        for name, metrics in self._applied().items():
-            groups |= metrics.compute() if name == "centerlines" else {name: metrics.compute()}
+        if "centerlines" in self._measured:
+            groups |= self._centerlines.compute()
+        if "segments" in self._measured:
+            segments = self._segments.compute()
+            segments["all"] |= _of_devkit(self._devkit.compute())
+            groups |= {self._prefix + group: values for group, values in segments.items()}
+        if "lines" in self._measured:
+            groups["lines"] = self._lines.compute()
         return groups
 
     def ratios(self) -> dict[str, SceneRatio]:
-        """Return the recall of every group of centerlines as hits and lanes of each scene."""
-        if "centerlines" not in self._measured or not self._continues:
+        """Return the recall of every group of lanes as hits and lanes of each scene."""
+        if not self._continues:
             return {}
+        recalled = self._centerlines.recalled() if "centerlines" in self._measured else {}
+        if "segments" in self._measured:
+            recalled |= {self._prefix + group: counts for group, counts in self._segments.recalled().items()}
         scene = np.cumsum(~np.array([True, *self._continues[1:]]))
         ratios = {}
-        for group, counts in self._centerlines.recalled().items():
+        for group, counts in recalled.items():
             lanes, hits = (np.bincount(scene, column).astype(int).tolist() for column in counts.T)
             ratios[f"{group}/recall"] = SceneRatio(tuple(hits), tuple(len(LANE_THRESHOLDS) * n for n in lanes))
         return ratios
 
-    def _applied(self) -> dict[str, Any]:
-        """Return the accumulators that apply, by the part that they measure."""
-        applied: dict[str, Any] = {"centerlines": self._centerlines} if "centerlines" in self._measured else {}
-        applied |= self._segments if "segments" in self._measured else {}
-        return applied | ({"lines": self._lines} if "lines" in self._measured else {})
+    @property
+    def _prefix(self) -> str:
+        """What tells the groups of segments from those of centerlines."""
+        return "segments " if "centerlines" in self._measured else ""
+
+    def _applied(self) -> list[Any]:
+        """Return the accumulators that apply."""
+        applied: list[Any] = [self._centerlines] if "centerlines" in self._measured else []
+        applied += [self._segments, self._devkit] if "segments" in self._measured else []
+        return applied + ([self._lines] if "lines" in self._measured else [])
+
+
+def _of_devkit(values: Mapping[str, float]) -> dict[str, float]:
+    """Return the devkit's numbers that LaneSegNet's do not contain; TOP_lt is TOP_lste of its papers."""
+    names = {"DET_a": "DET_a", "DET_t": "DET_t", "TOP_lt": "TOP_lste", "OLUS": "OLUS"}
+    names |= {name: name for name in values if name.startswith("DET_t@")}
+    return {theirs: values[name] for name, theirs in names.items() if name in values}
 
 
 def _lines(lines: LinePrediction) -> MapDetections:
@@ -201,23 +211,28 @@ def evaluate_lanes(
             metrics = LaneGraphMetrics(
                 config.versions,
                 () if batch.markers is None else sightings.groups,
-                lane_groups=() if _members(batch, 0, ground) is None else LANE_GROUPS,
+                lane_groups=LANE_GROUPS if _members(batch, answer, 0, ground) else (),
             )
         for row in range(len(indices)):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
             group = None
             if batch.markers is not None:
                 group = sightings.next(batch.markers.valid[row].any(), batch.has_previous[row])
-            metrics.update(prediction, example, group, _members(batch, row, ground))
+            metrics.update(prediction, example, group, _members(batch, answer, row, ground))
     return metrics
 
 
-def _members(batch: Example, row: int, ground: PerceptionRange | None) -> dict[str, Bool[np.ndarray, " g"]] | None:
-    """Return the lane groups of one example; None without a raster, its range, or traffic flow."""
+def _members(batch: Example, answer: Prediction, row: int, ground: PerceptionRange | None) -> dict[str, Members]:
+    """Return the lane groups of one example by predicted part; none without a raster, its range, or traffic flow."""
     if ground is None or batch.bev is None or batch.traffic_flow is None:
-        return None
-    lanes, flow = jax.tree.map(lambda leaf: leaf[row], (batch.lanes, batch.traffic_flow))
-    return lane_groups(lanes, np.asarray(batch.bev[row]), flow, ground)
+        return {}
+    bev, flow = jax.tree.map(lambda leaf: np.asarray(leaf[row]), (batch.bev, batch.traffic_flow))
+    true = {"centerlines": batch.lanes, "segments": batch.segments}
+    return {
+        part: lane_groups(jax.tree.map(lambda leaf: leaf[row], lanes), bev, flow, ground)
+        for part, lanes in true.items()
+        if getattr(answer, part) is not None
+    }
 
 
 def _labels(batch: Example) -> Example:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
 from tflane_jax.datasets.openlane_export import segments_on_lanes
+from tflane_jax.evaluation.centerlines import element_detections
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
-from tflane_jax.metrics.lane_segment import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
-from tflane_jax.scene import Areas, LaneGraph, TrafficElements
+from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
+from tflane_jax.scene import Areas, ElementPrediction, LaneGraph, SegmentPrediction, TrafficElements
 
 SEGMENT_CLASSES = ("lane_segment", "ped_crossing")
 """Classes of LaneSegNet's queries."""
@@ -19,8 +21,8 @@ def segment_truth(
 ) -> SegmentTruth:
     """Return the valid lane segments, areas and traffic elements of one example.
 
-    Crossings stay closed rings. In contrast, `tflane score` in the flavour "LaneSegNet" measures only the two long
-    sides of a crossing, which it takes from the corners of the annotation.
+    Crossings are as in the example: closed rings, or with `ExampleConfig.crossings = "sides"` the two long sides, which
+    LaneSegNet measures.
 
     Args:
         segments: lane segments.
@@ -47,6 +49,8 @@ def segment_truth(
         left=np.asarray(segments.left)[keep],
         right=np.asarray(segments.right)[keep],
         areas=AreaTruth(np.asarray(areas.points)[kept_areas], np.asarray(areas.category)[kept_areas]),
+        left_type=np.asarray(segments.left_type)[keep],
+        right_type=np.asarray(segments.right_type)[keep],
     )
 
 
@@ -59,6 +63,8 @@ def segment_detections(
     successor: Float[np.ndarray, "q q"],
     valid: Bool[np.ndarray, " q"] | None = None,
     elements: ElementDetections | None = None,
+    left_type: Int[np.ndarray, " q"] | None = None,
+    right_type: Int[np.ndarray, " q"] | None = None,
 ) -> SegmentDetections:
     """Return the detections of Q queries, best score first, as lane segments and crossings.
 
@@ -72,6 +78,7 @@ def segment_detections(
         successor: [i, j] confidence that segment j continues segment i, 0 to 1.
         valid: queries to keep; None keeps all.
         elements: traffic elements, `lane` (Q, U) with a row for each query; None where the model predicts none.
+        left_type, right_type: `LineType` of the boundaries; None where the model predicts none.
     """
     order = np.argsort(-np.asarray(scores), kind="stable")
     if valid is not None:
@@ -92,6 +99,26 @@ def segment_detections(
             np.full(len(crossings), CROSSING),
             scores[crossings],
         ),
+        left_type=None if left_type is None else np.asarray(left_type)[rows],
+        right_type=None if right_type is None else np.asarray(right_type)[rows],
+    )
+
+
+def detections_of_segments(segments: SegmentPrediction, elements: ElementPrediction | None = None) -> SegmentDetections:
+    """Return the last decoder layer's segments of one example, see `segment_detections`."""
+    confidence = expit(np.asarray(segments.logits))
+    edges, types = segments.successor_logits, (segments.left_type_logits, segments.right_type_logits)
+    left_type, right_type = (None if logits is None else np.asarray(logits).argmax(-1) for logits in types)
+    return segment_detections(
+        np.asarray(segments.points),
+        np.asarray(segments.left),
+        np.asarray(segments.right),
+        confidence.argmax(-1),
+        confidence.max(-1),
+        np.zeros((len(confidence),) * 2) if edges is None else expit(np.asarray(edges)),
+        elements=None if elements is None else element_detections(elements),
+        left_type=left_type,
+        right_type=right_type,
     )
 
 

@@ -8,14 +8,14 @@ from tflane_jax.metrics.frames import (
     LaneDetections,
     LaneTruth,
 )
-from tflane_jax.metrics.lane_segment import (
+from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
+from tflane_jax.metrics.segment_matching import (
     AreaDetections,
     AreaTruth,
-    LaneSegmentMetrics,
     SegmentDetections,
     SegmentTruth,
 )
-from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.metrics.vector_map import MapDetections, MapTruth, VectorMapMetrics
 
@@ -27,6 +27,7 @@ __all__ = [
     "ElementDetections",
     "ElementTruth",
     "GroupedCenterlineMetrics",
+    "GroupedSegmentMetrics",
     "LaneDetections",
     "LaneSegmentMetrics",
     "LaneTruth",

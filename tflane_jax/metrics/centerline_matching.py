@@ -87,13 +87,16 @@ class MatchedFrame:
     topology: dict[Version, Float[np.ndarray, "k g"]]
     elements: MatchedElements | None
 
+    def owned(self, lanes: Bool[np.ndarray, " g"]) -> Bool[np.ndarray, " p"]:
+        """Return which detections belong to some of the lanes: to the nearest one; without lanes, to none."""
+        return lanes[self.nearest] if self.lanes else np.zeros(len(self.nearest), bool)
+
     def select(self, lanes: Bool[np.ndarray, " g"]) -> MatchedFrame:
         """Return the part of the frame that belongs to some of its lanes, from this same matching.
 
-        A detection belongs to its nearest lane; in a frame without lanes it belongs to none. Traffic elements are
-        left out.
+        Traffic elements are left out.
         """
-        owned = lanes[self.nearest] if self.lanes else np.zeros(len(self.nearest), bool)
+        owned = self.owned(lanes)
         return MatchedFrame(
             scores=self.scores[owned],
             nearest=(np.cumsum(lanes) - 1)[self.nearest[owned]],

@@ -8,18 +8,18 @@ and the groups of lanes are this project's own (docs/metrics.md).
 
 from __future__ import annotations
 
-import copy
-import itertools
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
+from tflane_jax.metrics.groups import BY_OCCLUSION, GroupedMetrics, Partition
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled
 from tflane_jax.metrics.topology import Version, check_versions
 
@@ -143,52 +143,27 @@ def _protocol(versions: Sequence[Version]) -> str:
     return f"OpenLane-V2 centerline {versions[0]}{further}"
 
 
-class GroupedCenterlineMetrics:
-    """The centerline metrics of all lanes, of the occluded ones and of those in clear view.
-
-    A true lane is `occluded` if its visibility is below `occluded_below`, else `clear`. Every frame is matched once,
-    with all lanes and all detections, by the official rules. Then, for the group S of lanes:
-
-    - DET_l counts the true lanes in S and the detections whose nearest true lane lies in S, false positives included.
-      Nearest is the least relaxed Frechet distance, however large. Below 3 m it is the official candidate. Detections
-      in frames without true lanes count only in `all`;
-    - TOP_ll pools the vertex precisions of the lanes in S; their neighbours may lie outside S.
-
-    `all` is the official number. `occluded` and `clear` partition its lanes and its vertices, and its detections in
-    frames with lanes. Traffic elements count only in `all`.
-
-    The caller may name further groups of lanes, which may overlap, and tell their members with every frame. A frame may
-    also belong to a group of frames, which is measured like `all` on these frames alone.
+class GroupedCenterlineMetrics(GroupedMetrics[MatchedFrame]):
+    """The centerline metrics of all lanes and of the groups of a partition, see `metrics.groups`.
 
     Args:
-        groups: the groups to report.
-        frame_groups: names of groups of frames.
-        lane_groups: names of further groups of lanes.
-        occluded_below: visibility (fraction of the lane in direct line of sight) below which a lane is occluded.
+        groups, frame_groups, lane_groups: see `GroupedMetrics`.
+        partition: of the lanes; default by occlusion.
         versions: of the topology score, see `CenterlineMetrics`.
     """
 
     def __init__(
         self,
-        groups: Sequence[str] = ("all", "occluded", "clear"),
+        groups: Sequence[str] | None = None,
         *,
         frame_groups: Sequence[str] = (),
         lane_groups: Sequence[str] = (),
-        occluded_below: float = 0.5,
+        partition: Partition = BY_OCCLUSION,
         versions: Sequence[Version] = ("v2.1",),
     ) -> None:
         self.versions = check_versions(versions)
-        self.occluded_below = occluded_below
-        self._frame_groups = frozenset(frame_groups)
-        self._lane_groups = frozenset(lane_groups)
-        self._metrics = {group: CenterlineMetrics(versions) for group in (*groups, *lane_groups, *frame_groups)}
-        # Of every frame: true lanes and hits, summed over the thresholds.
-        self._recalled: dict[str, list[tuple[int, int]]] = {group: [] for group in self._metrics}
-
-    @property
-    def protocol(self) -> str:
-        """Name and version, the title of every table of these numbers."""
-        return f"{_protocol(self.versions)}, occluded: visibility < {self.occluded_below:g}"
+        make = partial(CenterlineMetrics, self.versions)
+        super().__init__(make, partition, groups, frame_groups=frame_groups, lane_groups=lane_groups)
 
     def update(
         self,
@@ -197,84 +172,8 @@ class GroupedCenterlineMetrics:
         frame_group: str | None = None,
         members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:
-        """Add one frame, which may belong to a group of frames.
+        """Add one frame; arguments as of `GroupedMetrics.add`.
 
-        Args:
-            detections, truth: of the frame.
-            frame_group: the group of frames.
-            members: for each of `lane_groups`, which of the true lanes belong to it.
-
-        Raises:
-            UserError: arrays that do not fit together, or a visibility that is not known.
+        Raises UserError for arrays that do not fit together, or a visibility that is not known.
         """
-        frame = match_frame(detections, truth, self.versions)
-        for group, metrics in self._metrics.items():
-            lanes = hits = 0
-            if group not in self._frame_groups or group == frame_group:
-                part = frame
-                if group in self._lane_groups:
-                    part = frame.select((members or {})[group])
-                elif group not in ("all", frame_group):
-                    part = frame.select(self._members(group, truth, frame.lanes))
-                metrics.add(part)
-                lanes, hits = part.lanes, int(part.hits.sum())
-            self._recalled[group].append((lanes, hits))
-
-    def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:
-        """Return by group, for every frame: true lanes, and hits summed over the three thresholds.
-
-        Recall is the sum of the hits over frames, divided by three times the sum of the lanes.
-        """
-        return {group: np.array(counts, int).reshape(-1, 2) for group, counts in self._recalled.items()}
-
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both, in this order (neither changes)."""
-        if self.protocol != other.protocol or self._metrics.keys() != other._metrics.keys():
-            raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
-        merged = copy.copy(self)
-        merged._metrics = {group: metrics.merge(other._metrics[group]) for group, metrics in self._metrics.items()}
-        merged._recalled = {group: counts + other._recalled[group] for group, counts in self._recalled.items()}
-        return merged
-
-    def compute(self) -> dict[str, dict[str, float]]:
-        """Return `CenterlineMetrics.compute` of each group."""
-        return {group: metrics.compute() for group, metrics in self._metrics.items()}
-
-    def _members(self, group: str, truth: LaneTruth, lanes: int) -> Bool[np.ndarray, " g"]:
-        """Return which of the true lanes belong to a group other than `all`."""
-        if truth.visibility is None:
-            raise UserError("the truth has no visibility of its lanes: report the group 'all' only")
-        visibility = np.asarray(truth.visibility)
-        if visibility.shape != (lanes,):
-            raise UserError(f"truth: visibility has shape {visibility.shape}, expected {(lanes,)}")
-        occluded = visibility < self.occluded_below
-        return occluded if group == "occluded" else ~occluded
-
-
-class DistanceCenterlineMetrics(GroupedCenterlineMetrics):
-    """The centerline metrics of all lanes and of those whose nearest vertex lies within a range of distances.
-
-    Lanes and detections are assigned to groups by the rules of `GroupedCenterlineMetrics`.
-
-    Args:
-        edges: distances in the ground plane at which one group ends and the next begins, metres, ascending.
-        versions: of the topology score, see `CenterlineMetrics`.
-    """
-
-    def __init__(self, edges: Sequence[float] = (10.0, 20.0, 30.0), *, versions: Sequence[Version] = ("v2.1",)) -> None:
-        limits = [0.0, *edges, np.inf]
-        self._ranges = {
-            f"from {low:g} m" if high == np.inf else f"{low:g} to {high:g} m": (low, high)
-            for low, high in itertools.pairwise(limits)
-        }
-        super().__init__(("all", *self._ranges), versions=versions)
-
-    @property
-    def protocol(self) -> str:
-        """Name and version, the title of every table of these numbers."""
-        return f"{_protocol(self.versions)}, by distance of a lane's nearest vertex"
-
-    def _members(self, group: str, truth: LaneTruth, lanes: int) -> Bool[np.ndarray, " g"]:
-        low, high = self._ranges[group]
-        distance = np.array([np.linalg.norm(np.asarray(line)[:, :2], axis=-1).min() for line in truth.points])
-        return (low <= distance) & (distance < high)
+        self.add(match_frame(detections, truth, self.versions), truth, frame_group, members)

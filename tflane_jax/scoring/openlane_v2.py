@@ -17,7 +17,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, load_file, load_json, member, scores
+from tflane_jax.files.fields import items, load_file, load_json, member, numbers, scores
 from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
@@ -27,16 +27,17 @@ from tflane_jax.files.openlane import (
     as_identifier,
     read_areas,
     read_elements,
+    read_labels,
     read_lines,
     read_matrix,
 )
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
-from tflane_jax.metrics.lane_segment import (
+from tflane_jax.metrics.lane_segment import Flavour
+from tflane_jax.metrics.segment_matching import (
     CROSSING,
     AreaDetections,
     AreaTruth,
-    Flavour,
     SegmentDetections,
     SegmentTruth,
 )
@@ -120,6 +121,7 @@ def _truth(record: Any, where: str, names: FieldNames) -> LaneTruth:
     return LaneTruth(
         points=[line[::_STRIDE] if len(line) == DENSE_POINTS else line for line in points],
         successor=read_matrix(record, names.lane_lane, (lanes, lanes), where) > 0.5,
+        visibility=_visibility(record, names.lanes, where),
         elements=ElementTruth(
             boxes, attributes, read_matrix(record, names.lane_element, (lanes, len(elements)), where) > 0.5
         ),
@@ -156,13 +158,30 @@ def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
         for lines in (lanes.points, *(read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))
     )
     areas = AreaTruth([_with_points(line, _AREA_POINTS) for line in points], categories)
-    return SegmentTruth(replace(lanes, points=center), left, right, areas)
+    return SegmentTruth(replace(lanes, points=center), left, right, areas, *_types(record, where))
 
 
 def _segment_detections(record: Any, where: str) -> SegmentDetections:
     left, right = (read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES)
     areas = AreaDetections(*read_areas(record, where), _confidences(record, "area", where))
-    return SegmentDetections(_detections(record, where, SEGMENT), left, right, areas)
+    return SegmentDetections(_detections(record, where, SEGMENT), left, right, areas, *_types(record, where))
+
+
+def _types(record: Any, where: str) -> list[np.ndarray | None]:
+    """Return the types of the left and of the right lines; None where some segment has none."""
+    lanes = items(record, SEGMENT.lanes, where)
+    return [
+        read_labels(record, SEGMENT.lanes, field, 0, 2, where) if all(field in lane for lane in lanes) else None
+        for field in (f"{side}_laneline_type" for side in _SIDES)
+    ]
+
+
+def _visibility(record: Any, things: str, where: str) -> np.ndarray | None:
+    """Return the fraction of each lane in line of sight; None for official files, which do not tell."""
+    lanes = items(record, things, where)
+    if not all("visibility" in lane for lane in lanes):
+        return None
+    return numbers([lane["visibility"] for lane in lanes], (len(lanes),), f"{where}: {things}: visibility")
 
 
 _SIDES = ("left", "right")

@@ -12,8 +12,9 @@ from typing import Any
 from tflane_jax.errors import UserError
 from tflane_jax.files import tusimple
 from tflane_jax.metrics.f_score import CenterlineFScore
-from tflane_jax.metrics.lane_segment import Flavour, LaneSegmentMetrics
-from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, DistanceCenterlineMetrics, GroupedCenterlineMetrics
+from tflane_jax.metrics.groups import ByDistance
+from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
 from tflane_jax.metrics.vector_map import CLASSES, Sampling, VectorMapMetrics
@@ -55,7 +56,7 @@ def _centerline(version: Version) -> ScoringProtocol:
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
         groups={
             "occlusion": partial(GroupedCenterlineMetrics, versions=(version,)),
-            "distance": partial(DistanceCenterlineMetrics, versions=(version,)),
+            "distance": partial(GroupedCenterlineMetrics, partition=ByDistance(), versions=(version,)),
         },
     )
 
@@ -66,7 +67,11 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
         read_truth=partial(openlane_v2.read_segment_truth, flavour=flavour),
         scene_of=lambda key: key.scene,
         metrics=partial(LaneSegmentMetrics, flavour),
-        columns=columns,
+        columns=(*columns, "AE_type", "AE_dist"),
+        groups={
+            "occlusion": partial(GroupedSegmentMetrics, flavour=flavour),
+            "distance": partial(GroupedSegmentMetrics, partition=ByDistance(), flavour=flavour),
+        },
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import jax
 import numpy as np
@@ -18,6 +18,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.datasets.data_source import LaneGraphSource, SplitData
+from tflane_jax.datasets.empty_frames import without_empty
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
@@ -56,11 +57,14 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         losses: weights of the host's matching costs and losses.
         clip: number of successive frames that training processes with memory. A training example is then a clip, with a
             leading axis on every leaf, and evaluation streams through the scenes. 1: single frames.
+        empty_frames: "skip" trains without frames that have none of the lanes or crossings of the host's ground truth,
+            as LaneSegNet does.
     """
 
     model: HostConfig = TopoNetConfig()
     losses: HostLossConfig = TopoNetLossConfig()
     clip: int = 1
+    empty_frames: Literal["keep", "skip"] = "keep"
 
     columns: ClassVar[tuple[str, ...]] = (
         "lanes of",
@@ -70,6 +74,15 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         "DET_t",
         "TOP_ll",
         "TOP_lt",
+        "mAP",
+        "AP_ls",
+        "AP_ped",
+        "TOP_lsls",
+        "AE_type",
+        "AE_dist",
+        "OLUS",
+        "DET_a",
+        "TOP_lste",
         "recall",
         "AP_l",
         "DET_l@1.0",
@@ -82,13 +95,18 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         "all/OLS",
         "all/DET_t",
         "all/TOP_lt",
+        "all/mAP",
+        "all/AP_ped",
+        "all/AE_type",
+        "all/AE_dist",
         *(
             f"{group}/{name}"
-            for name in ("DET_l", "TOP_ll", "recall")
+            for name in ("DET_l", "TOP_ll", "AP_ls", "TOP_lsls", "recall")
             for group in ("all", "occluded", "clear", *Sightings.groups)
         ),
         *(f"{group}/{name}" for name in ("recall", "AP_l") for group in (*LANE_GROUPS[:2], LANE_GROUPS[-1])),
     )
+    errors: ClassVar[tuple[str, ...]] = ("all/AE_type", "all/AE_dist")
 
     # -----------------------------------------------------------------------------------------------------------------
     # Learning
@@ -196,7 +214,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def examples(self, data: Example | Streamed) -> Example | Streamed:
         """Return the examples themselves, or the clips that they form."""
-        return data if self.clip == 1 else as_clips(data, self.clip)
+        data = data if self.clip == 1 else as_clips(data, self.clip)
+        return data if self.empty_frames == "keep" else without_empty(data, self.model.truth)
 
     def shapes(self, data: SplitData) -> Example:
         """Return shapes of the training parts of an example."""
@@ -251,10 +270,16 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         of_lanes = () if self._ground is None else LANE_GROUPS
         metrics = LaneGraphMetrics(config.versions, groups, self.model.predicts, of_lanes)
         names = set(Evaluation("", metrics.compute()).scores())
+        if "segments" in self.model.predicts:  # without matched pairs, there are no errors
+            names |= {f"{group}/{name}" for group in metrics.compute() for name in ("AE_type", "AE_dist")}
         if self.model.elements is not None:
-            of_elements = ["OLS", "TOP_lt", "DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
-            of_elements += [f"{name}_{version}" for version in config.versions[1:] for name in ("OLS", "TOP_lt")]
-            names |= {f"{group}/{name}" for group in ("all", *groups) for name in of_elements}
+            attributes = ["DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
+            if "centerlines" in self.model.predicts:
+                scores = ["OLS", "TOP_lt", *attributes]
+                scores += [f"{name}_{version}" for version in config.versions[1:] for name in ("OLS", "TOP_lt")]
+                names |= {f"{group}/{name}" for group in ("all", *groups) for name in scores}
+            else:
+                names |= {f"all/{name}" for name in ("OLUS", "TOP_lste", *attributes)}
         return names
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:

@@ -114,7 +114,7 @@ def score(commands) -> None:
     parser.add_argument(
         "--by",
         choices=("scene", "distance", "occlusion"),
-        help="also report parts; distance and occlusion are for centerlines only",
+        help="also report parts; distance and occlusion are for centerlines and lane segments",
     )
     parser.add_argument(
         "--bootstrap",

@@ -1,0 +1,223 @@
+"""Metrics of groups of true lanes, and of groups of frames.
+
+Every frame is matched once, with all lanes and all detections, by the official rules. Then, for the group S of lanes:
+
+- average precisions count the true lanes in S and the detections whose nearest true lane lies in S, false positives
+  included. Nearest is by the metric's distance, however large; below the largest threshold it is the official
+  candidate. Detections in frames without true lanes count only in `all`;
+- topology scores pool the vertex precisions of the lanes in S; their neighbours may lie outside S.
+
+`all` is the official number. The groups of a partition share its lanes and its vertices, and its detections in frames
+with lanes. Traffic elements and areas count only in `all` and in groups of frames.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.metrics.frames import LaneTruth
+
+
+class Matched(Protocol):
+    """A frame that has been matched."""
+
+    @property
+    def lanes(self) -> int:
+        """Number of true lanes."""
+        ...
+
+    @property
+    def hits(self) -> Bool[np.ndarray, "k p"]:
+        """True positives at each of the K thresholds."""
+        ...
+
+    def select(self, lanes: Bool[np.ndarray, " g"]) -> Self:
+        """Return the part of the frame that belongs to some of its lanes."""
+        ...
+
+
+class LaneMetrics(Protocol):
+    """An accumulator of matched frames."""
+
+    @property
+    def protocol(self) -> str:
+        """Name and version."""
+        ...
+
+    def add(self, frame: Any) -> None:
+        """Add a matched frame."""
+        ...
+
+    def merge(self, other: Any) -> Any:
+        """Return an accumulator of the frames of both."""
+        ...
+
+    def compute(self) -> dict[str, float]:
+        """Return the numbers."""
+        ...
+
+
+class Partition(Protocol):
+    """A division of true lanes into groups, each lane in one."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the groups."""
+        ...
+
+    @property
+    def suffix(self) -> str:
+        """What it adds to the name of the protocol."""
+        ...
+
+    def members(self, group: str, truth: LaneTruth) -> Bool[np.ndarray, " g"]:
+        """Return which of the true lanes belong to a group; raise UserError if the truth does not tell."""
+        ...
+
+
+@dataclass(frozen=True)
+class ByOcclusion:
+    """A lane is `occluded` if its visibility (fraction in direct line of sight) is below `below`, else `clear`."""
+
+    below: float = 0.5
+    names = ("occluded", "clear")
+
+    @property
+    def suffix(self) -> str:
+        """What it adds to the name of the protocol."""
+        return f", occluded: visibility < {self.below:g}"
+
+    def members(self, group: str, truth: LaneTruth) -> Bool[np.ndarray, " g"]:
+        """Return which of the true lanes belong to a group; raise UserError if their visibility is not known."""
+        if truth.visibility is None:
+            raise UserError("the truth has no visibility of its lanes: report the group 'all' only")
+        visibility = np.asarray(truth.visibility)
+        if visibility.shape != (len(truth.points),):
+            raise UserError(f"truth: visibility has shape {visibility.shape}, expected {(len(truth.points),)}")
+        return (visibility < self.below) == (group == "occluded")
+
+
+BY_OCCLUSION = ByOcclusion()
+
+
+@dataclass(frozen=True)
+class ByDistance:
+    """Lanes by the distance of their nearest vertex in the ground plane.
+
+    Attributes:
+        edges: distances at which one group ends and the next begins, metres, ascending.
+    """
+
+    edges: tuple[float, ...] = (10.0, 20.0, 30.0)
+    suffix = ", by distance of a lane's nearest vertex"
+
+    @property
+    def _ranges(self) -> dict[str, tuple[float, float]]:
+        return {
+            f"from {low:g} m" if high == np.inf else f"{low:g} to {high:g} m": (low, high)
+            for low, high in itertools.pairwise([0.0, *self.edges, np.inf])
+        }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the groups, nearest first."""
+        return tuple(self._ranges)
+
+    def members(self, group: str, truth: LaneTruth) -> Bool[np.ndarray, " g"]:
+        """Return which of the true lanes belong to a group."""
+        low, high = self._ranges[group]
+        distance = np.array([np.linalg.norm(np.asarray(line)[:, :2], axis=-1).min() for line in truth.points])
+        return (low <= distance) & (distance < high)
+
+
+FrameT = TypeVar("FrameT", bound=Matched)
+
+
+class GroupedMetrics(Generic[FrameT]):
+    """Accumulators of all lanes and of groups of them, see the module's docstring.
+
+    Args:
+        make: returns an accumulator.
+        partition: of the lanes; its groups are reported.
+        groups: which of "all" and the groups of the partition to report; default all of them.
+        frame_groups: names of groups of frames, which are measured like `all` on these frames alone.
+        lane_groups: names of further groups of lanes, which may overlap; the caller tells their members.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], LaneMetrics],
+        partition: Partition,
+        groups: Sequence[str] | None = None,
+        *,
+        frame_groups: Sequence[str] = (),
+        lane_groups: Sequence[str] = (),
+    ) -> None:
+        self.partition = partition
+        self._frame_groups = frozenset(frame_groups)
+        self._lane_groups = frozenset(lane_groups)
+        groups = ("all", *partition.names) if groups is None else groups
+        self._metrics = {group: make() for group in (*groups, *lane_groups, *frame_groups)}
+        self._protocol = make().protocol
+        # Of every frame: true lanes and hits, summed over the thresholds.
+        self._recalled: dict[str, list[tuple[int, int]]] = {group: [] for group in self._metrics}
+
+    @property
+    def protocol(self) -> str:
+        """Name and version, the title of every table of these numbers."""
+        return self._protocol + self.partition.suffix
+
+    def add(
+        self,
+        frame: FrameT,
+        truth: LaneTruth,
+        frame_group: str | None = None,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
+    ) -> None:
+        """Add one matched frame.
+
+        Args:
+            frame: matching results.
+            truth: the lanes that it was matched with.
+            frame_group: the group of frames that it belongs to.
+            members: for each of `lane_groups`, which of the true lanes belong to it.
+        """
+        for group, metrics in self._metrics.items():
+            lanes = hits = 0
+            if group not in self._frame_groups or group == frame_group:
+                part = frame
+                if group in self._lane_groups:
+                    part = frame.select((members or {})[group])
+                elif group not in ("all", frame_group):
+                    part = frame.select(self.partition.members(group, truth))
+                metrics.add(part)
+                lanes, hits = part.lanes, int(part.hits.sum())
+            self._recalled[group].append((lanes, hits))
+
+    def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:
+        """Return by group, for every frame: true lanes, and hits summed over the thresholds.
+
+        Recall is the sum of the hits over frames, divided by the number of thresholds times the sum of the lanes.
+        """
+        return {group: np.array(counts, int).reshape(-1, 2) for group, counts in self._recalled.items()}
+
+    def merge(self, other: Self) -> Self:
+        """Return an accumulator of the frames of both, in this order (neither changes)."""
+        if self.protocol != other.protocol or self._metrics.keys() != other._metrics.keys():
+            raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
+        merged = copy.copy(self)
+        merged._metrics = {group: metrics.merge(other._metrics[group]) for group, metrics in self._metrics.items()}
+        merged._recalled = {group: counts + other._recalled[group] for group, counts in self._recalled.items()}
+        return merged
+
+    def compute(self) -> dict[str, dict[str, float]]:
+        """Return the numbers of each group."""
+        return {group: metrics.compute() for group, metrics in self._metrics.items()}

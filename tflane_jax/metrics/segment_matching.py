@@ -1,0 +1,229 @@
+"""Lane segments and areas of one frame: truth, detections, and their matching.
+
+Source: openlanev2/lanesegment/evaluation of the OpenLane-V2 devkit; docs/reference/metrics.md, section 3, describes the
+rules. Type and distance errors of matched segments are named in LaneSegNet's paper (AE_type, AE_dist) without a public
+definition; docs/metrics.md gives the one used here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_lanes, relaxation
+from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines, check_shape
+from tflane_jax.metrics.frechet import end_distance, pair_frechet
+from tflane_jax.metrics.matching import greedy_match, nearest_truth
+
+AREA_THRESHOLDS = (0.5, 1.0, 1.5)  # metres, Chamfer
+CROSSING, BOUNDARY = 1, 2
+
+
+@dataclass(frozen=True)
+class AreaTruth:
+    """Crossings and road boundaries of one frame.
+
+    Attributes:
+        points: A polylines (n, 3), metres, ego frame; closed where the first vertex is repeated at the end.
+        categories: (A,) 1 pedestrian crossing, 2 road boundary.
+    """
+
+    points: Lines
+    categories: Int[np.ndarray, " a"]
+
+
+@dataclass(frozen=True)
+class AreaDetections:
+    """Detected crossings and road boundaries; as `AreaTruth`, with `scores` (A,), 0 to 1."""
+
+    points: Lines
+    categories: Int[np.ndarray, " a"]
+    scores: Float[np.ndarray, " a"]
+
+
+@dataclass(frozen=True)
+class SegmentTruth:
+    """Ground truth of one frame: G lane segments.
+
+    Attributes:
+        lanes: centerlines, successors, and traffic elements where there are any.
+        left, right: G side lines (n, 3), metres.
+        areas: crossings and boundaries.
+        left_type, right_type: (G,) `scene.LineType`; None where they are not known.
+    """
+
+    lanes: LaneTruth
+    left: Lines
+    right: Lines
+    areas: AreaTruth
+    left_type: Int[np.ndarray, " g"] | None = None
+    right_type: Int[np.ndarray, " g"] | None = None
+
+
+@dataclass(frozen=True)
+class SegmentDetections:
+    """Detections of one frame; fields as of `SegmentTruth`."""
+
+    lanes: LaneDetections
+    left: Lines
+    right: Lines
+    areas: AreaDetections
+    left_type: Int[np.ndarray, " p"] | None = None
+    right_type: Int[np.ndarray, " p"] | None = None
+
+
+@dataclass(frozen=True)
+class MatchedAreas:
+    """Matching results of the areas of one frame, P of them detected.
+
+    Attributes:
+        scores, categories: (P,) of the detections.
+        hits: (K, P) true positive at each of `AREA_THRESHOLDS`.
+        truths: (3,) number of true areas by category.
+    """
+
+    scores: Float[np.ndarray, " p"]
+    categories: Int[np.ndarray, " p"]
+    hits: Bool[np.ndarray, "k p"]
+    truths: Int[np.ndarray, "3"]
+
+    @classmethod
+    def none(cls) -> MatchedAreas:
+        """Return the results without areas."""
+        empty = np.zeros(0), np.zeros(0, np.int64), np.zeros((len(AREA_THRESHOLDS), 0), bool)
+        return cls(*empty, np.zeros(BOUNDARY + 1, np.int64))
+
+
+@dataclass(frozen=True)
+class MatchedSegments:
+    """Matching results of one frame with P detected segments.
+
+    Attributes:
+        segments: as of centerlines, by the distance of segments.
+        areas: crossings and boundaries.
+        distance: (P,) mean Chamfer distance of centerline, left and right line to those of the nearest segment, metres;
+            0 for a detection that is matched at no threshold.
+        wrong: (P,) fraction of the two boundary types that differ from those of the nearest segment; None where types
+            are not known.
+    """
+
+    segments: MatchedFrame
+    areas: MatchedAreas
+    distance: Float[np.ndarray, " p"]
+    wrong: Float[np.ndarray, " p"] | None
+
+    @property
+    def lanes(self) -> int:
+        """Number of true segments."""
+        return self.segments.lanes
+
+    @property
+    def hits(self) -> Bool[np.ndarray, "k p"]:
+        """Segments that are true positives at each of `LANE_THRESHOLDS`."""
+        return self.segments.hits
+
+    def select(self, lanes: Bool[np.ndarray, " g"]) -> MatchedSegments:
+        """Return the part of the frame that belongs to some of its segments, without areas and traffic elements."""
+        owned = self.segments.owned(lanes)
+        wrong = None if self.wrong is None else self.wrong[owned]
+        return MatchedSegments(self.segments.select(lanes), MatchedAreas.none(), self.distance[owned], wrong)
+
+
+def match_segments(detections: SegmentDetections, truth: SegmentTruth) -> MatchedSegments:
+    """Match the segments, areas and traffic elements of one frame; raise UserError for arrays that do not fit."""
+    true = [truth.lanes.points, truth.left, truth.right]
+    found = [detections.lanes.points, detections.left, detections.right]
+    distance, nearest = nearest_segments(true, found)
+    matched = match_lanes(detections.lanes, truth.lanes, distance, nearest)
+    pairs = np.flatnonzero(matched.hits.any(0))
+    error = np.zeros(len(distance))
+    for lines, others in zip(true, found, strict=True):
+        a, b = PaddedLines.of(lines, "truth").open_ends(), PaddedLines.of(others, "detections")
+        error[pairs] += pair_chamfer(a, b, nearest[pairs], pairs) / 3.0
+    areas = match_areas(detections.areas, truth.areas)
+    return MatchedSegments(matched, areas, error, _wrong_types(detections, truth, nearest, pairs))
+
+
+def _wrong_types(
+    detections: SegmentDetections, truth: SegmentTruth, nearest: Int[np.ndarray, " p"], pairs: Int[np.ndarray, " k"]
+) -> Float[np.ndarray, " p"] | None:
+    """Return the fraction of wrong boundary types of each matched detection; None where a side has no types."""
+    wrong = np.zeros(len(nearest))
+    for name in ("left_type", "right_type"):
+        true, found = getattr(truth, name), getattr(detections, name)
+        if true is None or found is None:
+            return None
+        true, found = np.asarray(true), np.asarray(found)
+        check_shape(true, (len(truth.left),), f"truth: {name}")
+        check_shape(found, (len(detections.left),), f"detections: {name}")
+        wrong[pairs] += 0.5 * (true[nearest[pairs]] != found[pairs])
+    return wrong
+
+
+def match_areas(detections: AreaDetections, truth: AreaTruth) -> MatchedAreas:
+    """Match the areas of one frame.
+
+    Only areas of the same category are compared. Only true areas lose their closing vertex.
+    """
+    true, found = PaddedLines.of(truth.points, "truth: areas"), PaddedLines.of(detections.points, "detections: areas")
+    true_categories = _checked_categories(truth.categories, len(true), "truth")
+    categories = _checked_categories(detections.categories, len(found), "detections")
+    scores = np.array(detections.scores)  # a copy, because the accumulator keeps it
+    check_shape(scores, (len(found),), "detections: area scores")
+    true = true.open_ends()
+    i, j = near_pairs(true, found, AREA_THRESHOLDS[-1], true_categories[:, None] == categories)
+    distance = np.full((len(true), len(found)), np.inf)
+    distance[i, j] = pair_chamfer(true, found, i, j)
+    least, nearest = nearest_truth(distance)
+    hits = np.stack([greedy_match(least < threshold, nearest, scores) >= 0 for threshold in AREA_THRESHOLDS])
+    return MatchedAreas(scores, categories, hits, np.bincount(true_categories, minlength=BOUNDARY + 1))
+
+
+def nearest_segments(
+    truth: list[Lines], detected: list[Lines]
+) -> tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Return for each detection the distance to its nearest true segment (metres) and the index of that segment.
+
+    The distance is half of Frechet(centerlines) + Chamfer(left) + Chamfer(right), with the relaxation of centerlines.
+    It is inf for pairs whose relaxed centerline Chamfer distance is 3 m or more. Other distances of 3 m or more, which
+    are never matched either, may be too large or inf, because not all of them are computed.
+
+    Args:
+        truth: G centerlines, left lines, right lines.
+        detected: P of each.
+    """
+    true, found = (
+        [PaddedLines.of(lines, f"{side}: {name}") for lines, name in zip(three, _NAMES, strict=True)]
+        for side, three in (("truth", truth), ("detections", detected))
+    )
+    for side, three in (("truth", true), ("detections", found)):
+        if len({len(lines) for lines in three}) > 1:
+            raise UserError(
+                f"{side}: {', '.join(f'{len(x)} {n}' for x, n in zip(three, _NAMES, strict=True))}"
+                ", expected as many of each"
+            )
+    relax = relaxation(true[0].points)
+    # Half the centerline distance is part of the total, and nothing beyond the largest threshold is matched.
+    true_centers, centers = true[0].points, found[0].points
+    lane, detection = np.nonzero(0.5 * relax[:, None] * end_distance(true_centers, centers) < LANE_THRESHOLDS[-1])
+    true = [lines.open_ends() for lines in true]
+    center, left, right = (pair_chamfer(a, b, lane, detection) for a, b in zip(true, found, strict=True))
+    total = pair_frechet(true_centers, centers, lane, detection) + left + right
+    distance = np.full((len(true[0]), len(found[0])), np.inf)
+    distance[lane, detection] = np.where(relax[lane] * center < LANE_THRESHOLDS[-1], relax[lane] * 0.5 * total, np.inf)
+    return nearest_truth(distance)
+
+
+_NAMES = ("centerlines", "left lines", "right lines")
+
+
+def _checked_categories(categories: Int[np.ndarray, " a"], count: int, side: str) -> Int[np.ndarray, " a"]:
+    categories = np.array(categories, np.int64)
+    check_shape(categories, (count,), f"{side}: area categories")
+    if ((categories != CROSSING) & (categories != BOUNDARY)).any():
+        raise UserError(f"{side}: area categories must be {CROSSING} (crossing) or {BOUNDARY} (boundary)")
+    return categories

@@ -53,7 +53,9 @@ def ablations() -> dict[str, RunConfig]:
         decoder=SegmentDecoderConfig(sampling_points=8, refine="iterative", offsets="lane", initial_score=0.01),
         denoising=DenoisingConfig(),
     )
+    lanesegnet = LaneGraphTask(segments, LaneSegNetLossConfig(dice_cost="probabilities"))
+    sides = WorldData(1000, 15, 100, WORLD, replace(EXAMPLE, crossings="sides"))
     return {
         "bevformer_detr": replace(config, task=LaneGraphTask(model, losses)),
-        "lanesegnet": replace(config, task=LaneGraphTask(segments, LaneSegNetLossConfig(dice_cost="probabilities"))),
+        "lanesegnet": replace(config, task=lanesegnet, data=sides),
     }

@@ -30,13 +30,14 @@ def ablations() -> dict[str, RunConfig]:
 
 def _tuned(row: RunConfig) -> RunConfig:
     """Return the fine-tuning of a row of `toponet_markers.py` with LaneSegNet in place of TopoNet."""
-    host = load_config(f"{HERE.with_name('host.py')}:lanesegnet").task
+    host = load_config(f"{HERE.with_name('host.py')}:lanesegnet")
     assert isinstance(row.task, LaneGraphTask)
-    assert isinstance(host, LaneGraphTask)
-    assert isinstance(host.model, LaneSegNetConfig)
-    model = replace(host.model, denoising=None, priors=row.task.model.priors)
+    assert isinstance(host.task, LaneGraphTask)
+    assert isinstance(host.task.model, LaneSegNetConfig)
+    model = replace(host.task.model, denoising=None, priors=row.task.model.priors)
     return replace(
         row,
-        task=replace(row.task, model=model, losses=host.losses),
+        task=replace(row.task, model=model, losses=host.task.losses),
+        data=host.data,
         training=replace(row.training, init_from=str(row.training.init_from).replace("/host/", "/lanesegnet/")),
     )

@@ -3,14 +3,14 @@
     tflane train --config tf_lane/lanesegnet
     tflane train --config tf_lane/lanesegnet:street
 
-Same data, encoder and optimizer as `toponet.py`, and the recipe of docs/small_models.md. `:street_published` has the
-decoder's published forms instead.
+Same roads, encoder and optimizer as `toponet.py`, and the recipe of docs/small_models.md. Crossings are labelled by their
+long sides. `:street_published` has the decoder's published forms instead.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.models.lane_queries import LaneProposalConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
@@ -54,5 +54,7 @@ def _segments(file: str) -> RunConfig:
     assert isinstance(config.task, LaneGraphTask)
     host = config.task.model
     assert isinstance(host, TopoNetConfig)
+    assert isinstance(config.data, WorldData)
     model = LaneSegNetConfig(encoder=host.encoder, range=host.range, decoder=DECODER, denoising=host.denoising)
-    return replace(config, task=replace(config.task, model=model, losses=LOSSES))
+    data = replace(config.data, example=replace(config.data.example, crossings="sides"))
+    return replace(config, task=replace(config.task, model=model, losses=LOSSES), data=data)

@@ -11,7 +11,8 @@ one frame each. `:remat` recomputes activations in the backward pass, `:bfloat16
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import RunConfig, load_ablations, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config
+from tflane_jax.datasets.photometric import LANESEGNET_PHOTOMETRIC
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig, paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -32,7 +33,11 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _segments(toponet: RunConfig, model: LaneSegNetConfig) -> RunConfig:
-    """Return TopoNet's configuration with LaneSegNet in place of TopoNet, and its encoder."""
+    """Return TopoNet's configuration, its encoder included, with LaneSegNet, its labels and its augmentation."""
     assert isinstance(toponet.task, LaneGraphTask)
-    losses = LaneSegNetLossConfig(raster="published")
-    return replace(toponet, task=LaneGraphTask(replace(model, encoder=toponet.task.model.encoder), losses))
+    assert isinstance(toponet.data, OpenLaneV2Data)
+    model = replace(model, encoder=toponet.task.model.encoder)
+    task = LaneGraphTask(model, LaneSegNetLossConfig(raster="published"), empty_frames="skip")
+    example = replace(toponet.data.example, crossings="sides")
+    data = replace(toponet.data, flavour="lane_segment", example=example, augmentation=LANESEGNET_PHOTOMETRIC)
+    return replace(toponet, task=task, data=data)

@@ -92,9 +92,7 @@ def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     incomplete = dict(state)
     del incomplete["pts_bbox_head.cls_branches.1.6.bias"]
     np.savez(path, **incomplete)
-    with pytest.raises(
-        UserError, match=r"heads_1/class.*bias is absent in the file and \d in the model"
-    ):
+    with pytest.raises(UserError, match=r"heads_1/class.*bias is absent in the file and \d in the model"):
         load_host(path, model)
     np.savez(path, **state, **{"pts_bbox_head.surplus.weight": np.zeros(3)})
     with pytest.raises(UserError, match="is no tensor of"):

@@ -8,12 +8,13 @@ import pytest
 from tests.golden import case_id, golden_modules, load_module_case, numbered
 from tests.golden_compare import compare
 from tflane_jax.convert.toponet import relationship_params
+from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig, matching_cost, successor_loss
 from tflane_jax.matching import Assignment, match
-from tflane_jax.models.segment_targets import CROSSING, SegmentTargets
-from tflane_jax.scene import LaneGraph, SegmentPrediction, stack_examples
+from tflane_jax.models.segment_truth import CROSSING, LANE
+from tflane_jax.scene import SegmentPrediction, stack_examples
 
 
 @pytest.mark.golden
@@ -25,10 +26,9 @@ def test_assignment_matches_the_reference(path):
     lines = case.inputs["lanes_pred"].reshape(queries, 3, -1, 3).swapaxes(0, 1)
     truth = case.inputs["gt_lanes"].reshape(count, 3, -1, 3).swapaxes(0, 1)
     prediction = SegmentPrediction(*lines, case.inputs["cls_pred"], mask_logits=case.inputs["mask_pred"])
-    graph = LaneGraph.empty(count, truth.shape[2])
-    graph = graph.replace(points=truth[0], left=truth[1], right=truth[2], valid=np.ones(count, bool))
     labels, config = case.inputs["gt_labels"], LaneSegNetLossConfig()
-    cost = jax.jit(lambda p, t: matching_cost(p, t, masks, config))(prediction, SegmentTargets(graph, labels))
+    targets = SegmentTargets(*truth, labels, labels, labels, np.zeros((count, count), bool), np.ones(count, bool))
+    cost = jax.jit(lambda p, t: matching_cost(p, t, masks, config))(prediction, targets)
     np.testing.assert_allclose(cost, case.outputs["cost"], rtol=1e-4, atol=1e-4)
     logits, cells = (jnp.asarray(x.reshape(len(x), -1)) for x in (case.inputs["mask_pred"], masks))
     terms = {
@@ -39,7 +39,7 @@ def test_assignment_matches_the_reference(path):
     for name, value in terms.items():
         np.testing.assert_allclose(value, case.outputs[name], rtol=1e-4, atol=1e-4, err_msg=name)
     assigned, own = np.zeros(queries, int), np.full(queries, -1)
-    query = np.asarray(match(cost, graph.valid).query)
+    query = np.asarray(match(cost, targets.valid).query)
     assigned[query], own[query] = np.arange(count) + 1, labels
     np.testing.assert_array_equal(assigned, case.outputs["gt_inds"])
     np.testing.assert_array_equal(own, case.outputs["labels"])
@@ -54,12 +54,11 @@ def test_topology_loss_matches_the_reference(path):
     capacity = 1 + max(max(len(adjacency), *(targets + 1)) for adjacency, _, targets in every)
     truth, found = [], []
     for adjacency, queries, rows in every:
-        graph, count = LaneGraph.empty(capacity, 2), len(adjacency)
-        graph.successor[:count, :count] = adjacency
-        graph.valid[: max(count, *(rows + 1))] = True
-        category = np.full(capacity, CROSSING, np.int32)  # rows after the lanes
-        category[:count] = 0
-        truth.append(SegmentTargets(graph, category))
+        count, line, label = len(adjacency), np.zeros((capacity, 2, 3)), np.zeros(capacity, np.int32)
+        category = np.where(np.arange(capacity) < count, LANE, CROSSING)  # rows after the lanes
+        successor, valid = np.zeros((capacity, capacity), bool), np.arange(capacity) < max(count, *(rows + 1))
+        successor[:count, :count] = adjacency
+        truth.append(SegmentTargets(line, line, line, category, label, label, successor, valid))
         assignment = Assignment(np.zeros(capacity, np.int32), np.zeros(capacity, bool))
         assignment.query[rows], assignment.matched[rows] = queries, True
         found.append(assignment)

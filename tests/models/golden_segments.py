@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.golden import implemented, numbered, options
+from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
-from tflane_jax.models.segment_targets import SegmentTargets
-from tflane_jax.scene import LaneGraph, stack_examples
+from tflane_jax.scene import stack_examples
 
 
 def decoder_config(case):
@@ -38,15 +38,12 @@ _PARTS = ("lanes", "labels", "masks", "left_type", "right_type")
 
 def _targets(arrays, capacity):
     count = len(arrays["lanes"])
-    points, left, right = arrays["lanes"].reshape(count, 3, -1, 3).swapaxes(0, 1)
-    graph = LaneGraph.empty(capacity, points.shape[1])
-    for name, value in {"points": points, "left": left, "right": right, "valid": True}.items():
-        getattr(graph, name)[:count] = value
-    for name in ("left_type", "right_type"):
-        getattr(graph, name)[:count] = arrays[name]
-    category, masks = np.zeros(capacity, np.int32), np.zeros((capacity, *arrays["masks"].shape[1:]), np.float32)
-    category[:count], masks[:count] = arrays["labels"], arrays["masks"]
-    return SegmentTargets(graph, category), masks
+    pad = lambda array: np.concatenate([array, np.zeros((capacity - count, *array.shape[1:]), array.dtype)])  # noqa: E731
+    lines = (pad(line) for line in arrays["lanes"].reshape(count, 3, -1, 3).swapaxes(0, 1))
+    labels = (pad(arrays[name].astype(np.int32)) for name in ("labels", "left_type", "right_type"))
+    return SegmentTargets(*lines, *labels, np.zeros((capacity,) * 2, bool), pad(np.ones(count, bool))), pad(
+        arrays["masks"]
+    )
 
 
 def segments_by_name(segments, queries):

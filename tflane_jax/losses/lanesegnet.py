@@ -17,6 +17,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
     HostLossConfig,
@@ -34,7 +35,7 @@ from tflane_jax.losses.segment_masks import Raster, segment_masks
 from tflane_jax.losses.toponet import lane_quality
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
-from tflane_jax.models.segment_targets import LANE, SegmentTargets, segment_targets
+from tflane_jax.models.segment_truth import LANE, ordered_targets, target_lanes, target_lines
 from tflane_jax.scene import Example, Prediction, SegmentPrediction
 
 
@@ -83,7 +84,7 @@ class LaneSegNetLossConfig(HostLossConfig):
         if segments is None or segments.mask_logits is None or segments.successor_logits is None:
             raise ValueError("LaneSegNet's loss needs predicted segments with masks and topology")
         bev_range, shape = host.encoder.bev_range, segments.mask_logits.shape[-2:]
-        targets = jax.vmap(segment_targets)(batch.segments, batch.areas)
+        targets = jax.vmap(partial(ordered_targets, center=host.center))(batch.segments, batch.areas)
         masks = jax.vmap(partial(target_masks, shape=shape, range_=bev_range, raster=self.raster))(targets)
         loss, report = segment_loss(segments, targets, masks, self)
 
@@ -93,7 +94,7 @@ class LaneSegNetLossConfig(HostLossConfig):
         further, more = auxiliary_losses(
             auxiliary,
             host.auxiliary,
-            targets.lanes,
+            target_lanes(targets),
             bev_range=bev_range,
             cell_weight=self.cell_weight,
             proposal_weights=(self.proposal_weight, self.points_weight),
@@ -107,7 +108,7 @@ class LaneSegNetLossConfig(HostLossConfig):
 
 def target_masks(targets: SegmentTargets, shape: tuple[int, int], range_: Any, raster: Raster) -> Float[Array, "n h w"]:
     """Return the masks of one example's targets, 0 for padding."""
-    masks = segment_masks(targets.lanes.left, targets.lanes.right, shape, range_, raster)  # pyright: ignore
+    masks = segment_masks(targets.left, targets.right, shape, range_, raster)  # pyright: ignore[reportArgumentType]
     return (masks & targets.valid[:, None, None]).astype(jnp.float32)
 
 
@@ -153,7 +154,7 @@ def matching_cost(
     """Return the cost of matching each query of one layer with each target; columns of padding are arbitrary."""
     by_class = focal_cost(prediction.logits, config.alpha, config.gamma)[:, targets.category]
     flat = lambda lines: lines.reshape(len(lines), -1)  # noqa: E731
-    apart = pairwise_l1(flat(_lines(prediction)), flat(targets.lines))
+    apart = pairwise_l1(flat(_lines(prediction)), flat(target_lines(targets)))
     logits, cells = flat(prediction.mask_logits), flat(masks)
     overlap = dice_cost(logits if config.dice_cost == "logits" else jax.nn.sigmoid(logits), cells)
     return (
@@ -197,7 +198,7 @@ def _layer_sums(
     config: LaneSegNetLossConfig,
 ) -> dict[str, Float[Array, ""]]:
     """Return the sums of losses over the queries of one layer of one example."""
-    logits, lanes = jnp.asarray(prediction.logits), targets.lanes
+    logits, true = jnp.asarray(prediction.logits), target_lines(targets)
     # Index `queries` lies outside, so unmatched targets write nowhere.
     query = jnp.where(assignment.matched, assignment.query, len(logits))
     lines = _lines(prediction)[assignment.query]
@@ -205,19 +206,19 @@ def _layer_sums(
     if config.class_target == "one":
         classes = focal(logits, target.at[query, targets.category].set(1.0, mode="drop"), config.alpha, config.gamma)
     else:
-        quality = lax.stop_gradient(segment_quality(lines, targets.lines))
+        quality = lax.stop_gradient(segment_quality(lines, true))
         classes = quality_focal(logits, target.at[query, targets.category].set(quality, mode="drop"), config.gamma)
     cells = jnp.asarray(prediction.mask_logits)[assignment.query]
-    sides = (prediction.left_type_logits, lanes.left_type), (prediction.right_type_logits, lanes.right_type)
+    sides = (prediction.left_type_logits, targets.left_type), (prediction.right_type_logits, targets.right_type)
     each = {
-        "points": jnp.abs(lines - targets.lines).sum((1, 2, 3)),
+        "points": jnp.abs(lines - true).sum((1, 2, 3)),
         "mask": optax.losses.sigmoid_binary_cross_entropy(cells, masks).mean((1, 2)),
         "dice": dice_loss(jax.nn.sigmoid(cells), masks),
     }
     return {
         "class": classes.sum(),
         **{name: jnp.where(assignment.matched, value, 0.0).sum() for name, value in each.items()},
-        "line_type": sum((_type_loss(found, query, true) for found, true in sides), jnp.zeros(())),
+        "line_type": sum((_type_loss(found, query, types) for found, types in sides), jnp.zeros(())),
     }
 
 
@@ -243,7 +244,7 @@ def successor_loss(
     def one(logits, assignment, targets):
         lane = assignment.matched & (targets.category == LANE)
         pairs: Bool[Array, "n n"] = lane[:, None] & lane[None]
-        edges = targets.lanes.successor & pairs
+        edges = targets.successor & pairs
         found = logits[assignment.query[:, None], assignment.query[None]]
         loss = focal(found, edges.astype(logits.dtype), config.alpha, config.gamma)
         counted = pairs & ~edges if config.successor_mean == "negatives" else pairs

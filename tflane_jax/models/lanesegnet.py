@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from tflane_jax.datasets.segment_targets import Center
 from tflane_jax.errors import UserError
 from tflane_jax.layers.graph import RelationshipHead
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
@@ -32,7 +33,7 @@ from tflane_jax.models.lane_segments import (
 )
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
-from tflane_jax.models.segment_targets import segment_targets
+from tflane_jax.models.segment_truth import ordered_targets, target_lanes
 from tflane_jax.scene import LaneGraph, Prediction, SegmentPrediction
 
 
@@ -45,12 +46,14 @@ class LaneSegNetConfig(HostConfig):
         denoising: noised segments in training (`models.lane_denoising`); None as in the paper.
         last_step: "twice": outside training, the last layer's change of the centerline is applied to its own result
             once more. The published code does so by mistake, and its weights reach their published numbers with it.
+        center: the centerline that is learned, see `datasets.segment_targets`.
         encoder, range, priors: see `HostConfig`. LaneSegNet predicts no traffic elements.
     """
 
     decoder: SegmentDecoderConfig = SegmentDecoderConfig()
     denoising: DenoisingConfig | None = None
     last_step: Literal["once", "twice"] = "once"
+    center: Center = "mean"
 
     truth: ClassVar[tuple[str, ...]] = ("segments", "areas")
     predicts: ClassVar[tuple[str, ...]] = ("segments",)
@@ -94,7 +97,7 @@ class LaneSegNet(Host):
     def decode_example(self, example, bev, elements, tokens, *, deterministic):
         lanes = None
         if self.is_mutable_collection(AUXILIARY) and example.segments is not None:
-            lanes = segment_targets(example.segments, example.areas).lanes
+            lanes = target_lanes(ordered_targets(example.segments, example.areas, self.config.center))
         return self.decode(bev, tokens, lanes, deterministic=deterministic)
 
     @nn.compact

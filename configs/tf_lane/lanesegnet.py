@@ -3,8 +3,8 @@
     tflane train --config tf_lane/lanesegnet
     tflane train --config tf_lane/lanesegnet:street
 
-Same roads, encoder and optimizer as `toponet.py`, and the recipe of docs/small_models.md. Crossings are labelled by their
-long sides. `:street_published` has the decoder's published forms instead.
+Same roads, encoder and optimizer as `toponet.py`, and the recipe of docs/small_models.md. Crossings are labelled by
+their long sides. `:street_published` has the decoder's published forms instead.
 """
 
 from dataclasses import replace

@@ -7,6 +7,7 @@ directed. Weights and conventions: docs/reference/lanesegnet.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -153,7 +154,7 @@ def matching_cost(
 ) -> Float[Array, "q n"]:
     """Return the cost of matching each query of one layer with each target; columns of padding are arbitrary."""
     by_class = focal_cost(prediction.logits, config.alpha, config.gamma)[:, targets.category]
-    flat = lambda lines: lines.reshape(len(lines), -1)  # noqa: E731
+    flat = lambda rows: rows.reshape(len(rows), math.prod(rows.shape[1:]))  # noqa: E731
     apart = pairwise_l1(flat(_lines(prediction)), flat(target_lines(targets)))
     logits, cells = flat(prediction.mask_logits), flat(masks)
     overlap = dice_cost(logits if config.dice_cost == "logits" else jax.nn.sigmoid(logits), cells)

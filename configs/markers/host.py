@@ -11,10 +11,13 @@ from dataclasses import replace
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
+from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lane_segments import SegmentDecoderConfig
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -40,9 +43,19 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return BEVFormer-DETR, the host without a graph."""
+    """Return BEVFormer-DETR, the host without a graph, and LaneSegNet."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
     model = BevFormerDetrConfig(encoder=config.task.model.encoder, elements=None, denoising=DenoisingConfig())
     losses = BevFormerDetrLossConfig(points_weight=0.025, successor_weight=20.0)
-    return {"bevformer_detr": replace(config, task=LaneGraphTask(model, losses))}
+    segments = LaneSegNetConfig(
+        encoder=config.task.model.encoder,
+        decoder=SegmentDecoderConfig(sampling_points=8, refine="iterative", offsets="lane", initial_score=0.01),
+        denoising=DenoisingConfig(),
+    )
+    lanesegnet = LaneGraphTask(segments, LaneSegNetLossConfig(dice_cost="probabilities"))
+    sides = WorldData(1000, 15, 100, WORLD, replace(EXAMPLE, crossings="sides"))
+    return {
+        "bevformer_detr": replace(config, task=LaneGraphTask(model, losses)),
+        "lanesegnet": replace(config, task=lanesegnet, data=sides),
+    }

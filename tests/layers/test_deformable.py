@@ -7,13 +7,34 @@ import pytest
 
 from tests.golden import batch_leading, case_id, golden_modules, implemented, load_module_case, options
 from tests.golden_compare import compare
-from tflane_jax.layers.deformable import DeformableAttention, compass_offsets, sampling_locations
+from tflane_jax.layers.deformable import DeformableAttention, compass_offsets, sampling_locations, star_offsets
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize("path", golden_modules("custom_msda_decoder*") + golden_modules("msda_module*"), ids=case_id)
+@pytest.mark.parametrize(
+    "path",
+    golden_modules("custom_msda_decoder*")
+    + golden_modules("msda_module*")
+    + [path for path in golden_modules("laneseg_lane_attention*") if not path.stem.endswith("_init")],
+    ids=case_id,
+)
 def test_module_matches_the_reference(path):
     check(load_module_case(path))
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("laneseg_lane_attention_init*"), ids=case_id)
+def test_lane_attention_starts_as_in_the_reference(path):
+    case = load_module_case(path)
+    sizes = options(case, "heads", "levels", "points")
+    offsets = star_offsets(sizes.heads, sizes.levels, sizes.points)
+    np.testing.assert_allclose(offsets.reshape(-1), case.outputs["sampling_offsets_bias"], atol=5e-6)
+    # The module uses them, and a query of zeros has no other offsets.
+    module = DeformableAttention(8, sizes.heads, sizes.points, sizes.levels, initial="star")
+    given = jnp.zeros((1, 8)), jnp.zeros((4, 8)), [(2, 2)] * sizes.levels, jnp.zeros((1, sizes.heads, 2))
+    params = jax.jit(lambda: module.init(jax.random.key(0), *given))()["params"]
+    np.testing.assert_allclose(params["sampling_offsets"]["bias"], case.outputs["sampling_offsets_bias"], atol=5e-6)
+    np.testing.assert_array_equal(params["sampling_offsets"]["kernel"], 0.0)
 
 
 def check(case):
@@ -31,7 +52,9 @@ def check(case):
         }
 
         def one(query, position, value, identity, reference, padded):
-            attended = module.apply({"params": params}, query + position, value, shapes, reference[:, None], ~padded)
+            # LaneSegNet's references are (Q, levels, R, 2), a point for each head; the others' (Q, levels, 2 or 4).
+            reference = reference.swapaxes(1, 2) if reference.ndim == 4 else reference[:, None]
+            attended = module.apply({"params": params}, query + position, value, shapes, reference, ~padded)
             # The reference adds the query, without its position, unless it is given another identity.
             return identity + attended
 
@@ -109,6 +132,13 @@ def test_padding_of_the_value_reaches_nothing():
     clean, garbage = both(value, valid), both(jnp.where(valid[:, None], value, jnp.nan), valid)
     jax.tree.map(np.testing.assert_array_equal, clean, garbage)
     assert np.abs(clean[0] - both(value, np.ones(16, bool))[0]).max() > 0.01
+
+
+def test_a_star_needs_all_its_points():
+    np.testing.assert_array_equal(star_offsets(2, 1, 4)[0], star_offsets(2, 1, 4)[1])
+    np.testing.assert_allclose(star_offsets(1, 1, 16)[0, 0, :3], [[1, 0], [2, 0], [1, 1]], atol=1e-6)
+    with pytest.raises(ValueError, match="12 points do not form a star"):
+        star_offsets(2, 1, 12)
 
 
 def test_compass_points_outward():

@@ -15,11 +15,13 @@ from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
+from tflane_jax.models.lane_segments import SegmentDecoderConfig
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
-from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
+from tflane_jax.scene import Areas, AreaType, CameraViews, Example, LaneGraph, TrafficElements
 
 BASELINE = TopoNetConfig(
     encoder=EvidenceEncoderConfig(dim=16, dilations=(1,)),
@@ -58,6 +60,41 @@ def make_example(seed: int = 0, instances: int = 9, lanes: int = 4) -> Example:
         previous_from_ego=np.eye(4, dtype=np.float32),
         has_previous=np.zeros((), bool),
     )
+
+
+SEGMENTS = LaneSegNetConfig(
+    encoder=BASELINE.encoder,
+    decoder=SegmentDecoderConfig(
+        dim=16, heads=2, layers=2, queries=6, points=11, sampling_points=4, hidden=16, relation=8
+    ),
+)
+"""LaneSegNet in its published forms."""
+SMALL_SEGMENTS = dataclasses.replace(
+    SEGMENTS,
+    decoder=dataclasses.replace(
+        SEGMENTS.decoder, refine="iterative", output="metric", offsets="lane", initial_score=0.01
+    ),
+    priors=WITH_TRAFFIC.priors,
+)
+"""LaneSegNet with traffic, in the forms of the small configurations."""
+
+
+def make_segment_example(seed: int = 0, instances: int = 9, lanes: int = 4, crossings: int = 1) -> Example:
+    """Return `make_example` with its lanes as segments 3.5 m wide, and with crossings and a road boundary."""
+    example = make_example(seed, instances, lanes)
+    across = np.array([0.0, 1.75, 0.0], np.float32)
+    graph = example.lanes
+    segments = graph.replace(
+        left=graph.points + across, right=graph.points - across, left_type=np.where(graph.valid, 1, 0).astype(np.int32)
+    )
+    areas = Areas.empty(3, 2 * graph.points.shape[1])
+    side = np.stack([np.full(11, 8.0), np.linspace(-7, 7, 11), np.zeros(11)], -1)
+    half = np.array([1.5, 0.0, 0.0])
+    ring = np.concatenate([side - half, side[::-1] + half])
+    for i in range(crossings + 1):
+        areas.points[i], areas.valid[i] = ring + 6.0 * i, True
+        areas.category[i] = AreaType.PEDESTRIAN_CROSSING if i < crossings else AreaType.ROAD_BOUNDARY
+    return example.replace(segments=segments, areas=areas)
 
 
 CAMERA = CameraEncoderConfig(

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from tflane_jax.convert.toponet import camera_shapes
-from tflane_jax.models import bevformer_detr, toponet
+from tflane_jax.convert.hosts import camera_shapes
+from tflane_jax.models import bevformer_detr, lanesegnet, toponet
 
 BACKBONE, PYRAMID, BEV = 23_508_032, 3_278_592, 7_667_648
 ELEMENTS, RELATIONS = 8_381_032, 460_801
 # The reference counts a constant weight for each coordinate of a lane among its parameters.
 TOPONET_LANES, POINT_LANES, CURVE_LANES = 20_030_524 - 33, 5_792_816 - 33, 5_765_042 - 15
+SEGMENTS, LANESEGNET = 10_497_781 - 90, 45_412_854
 MAP = jax.ShapeDtypeStruct((100, 200, 256), jnp.float32)
 
 
@@ -40,6 +41,23 @@ def test_toponet_is_as_large_as_the_reference():
     assert answer.centerlines.successor_logits.shape == (6, 200, 200)
     assert answer.elements.box.shape == (6, 100, 2, 2)
     assert answer.elements.lane_logits.shape == (6, 200, 100)
+
+
+def test_lanesegnet_is_as_large_as_the_reference():
+    config = lanesegnet.paper_config()
+    module, example = config.build(), camera_shapes(config.encoder)
+    answer, variables = jax.eval_shape(lambda key, e: module.init_with_output(key, e), jax.random.key(0), example)
+    params = dict(variables["params"])
+    # In the reference, scale and bias of frozen norms and 90 constant weights of coordinates count as parameters.
+    assert count(params) == LANESEGNET - 2 * 26_560 - 90
+    assert count(params.pop("encoder")) == BACKBONE - 2 * 26_560 + PYRAMID + BEV
+    assert count(params.pop("successor")) == RELATIONS
+    assert count(params) == SEGMENTS
+
+    segments = answer.segments
+    assert segments.points.shape == segments.left.shape == (6, 200, 10, 3)
+    assert segments.left_type_logits.shape == (6, 200, 3)
+    assert segments.successor_logits.shape == (1, 200, 200)
 
 
 @pytest.mark.parametrize(("control_points", "expected"), [(None, POINT_LANES), (5, CURVE_LANES)])

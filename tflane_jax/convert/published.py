@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tflane_jax.convert.hosts import PublishedHost, load_host
 from tflane_jax.convert.lstr import load_lstr
-from tflane_jax.convert.toponet import load_host
 from tflane_jax.errors import UserError
-from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.parameters import Params
-from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
@@ -22,6 +20,6 @@ def load_weights(path: Path, task: LaneShapeTask | LaneGraphTask) -> tuple[Param
     """
     if isinstance(task, LaneShapeTask):
         return load_lstr(path, task.model)
-    if not isinstance(task.model, TopoNetConfig | BevFormerDetrConfig):
+    if not isinstance(task.model, PublishedHost):
         raise UserError(f"no published weights are known for a {type(task.model).__name__}")
     return load_host(path, task.model)

@@ -1,31 +1,16 @@
-"""Weights of the published TopoNet and of BEVFormer-DETR (OpenLane-V2's baseline) as parameters of our hosts.
+"""Weights of the heads of the published TopoNet and of BEVFormer-DETR (OpenLane-V2's baseline) as our parameters.
 
 Names are those of the published state dicts (github.com/OpenDriveLab/TopoNet and OpenLane-V2). Decoders are built from
-mmcv's layers: attentions and norms are numbered in the order in which a layer runs them. Both detectors call their
-encoder `bev_constructor`, the head of traffic elements `bbox_head` and that of lanes `pts_bbox_head`.
+mmcv's layers: attentions and norms are numbered in the order in which a layer runs them.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
-from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
-from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, convert, renamed_params
-from tflane_jax.convert.torch_file import read_state_dict
-from tflane_jax.errors import UserError
+from tflane_jax.convert.renaming import Rule, below, convert, renamed_params
 from tflane_jax.geometry.namespace import AnyArray
-from tflane_jax.layers.batch_norm import STATISTICS
-from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.camera_encoder import CameraEncoderConfig
-from tflane_jax.models.parameters import Params
-from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import CameraViews, Example
 
 _DEFORMABLE = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
 _ATTENTION = (
@@ -83,14 +68,15 @@ TOPONET_LANES: tuple[Rule, ...] = (
     (r"te_embed_branches\.(\d+)\.0\.0\.(weight|bias)", r"element_embedding_\1/expand/\2", "linear"),
     (r"te_embed_branches\.(\d+)\.1\.(weight|bias)", r"element_embedding_\1/contract/\2", "linear"),
 )
-BASELINE_LANES: tuple[Rule, ...] = (
+# Queries and decoder layers without scene graph: of the baseline, and of LaneSegNet.
+PLAIN_DECODER: tuple[Rule, ...] = (
     _QUERIES,
     _REFERENCE,
     *below(_LAYER, r"layer_\1", _LANE_LAYER),
     *below(_LAYER + r"ffns\.0\.", r"layer_\1/feed_forward", _FEED_FORWARD),
     (_LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/feed_forward_norm/\2", "norm"),
-    *_LANE_HEADS,
 )
+BASELINE_LANES: tuple[Rule, ...] = (*PLAIN_DECODER, *_LANE_HEADS)
 _ENCODER = r"transformer\.encoder\.layers\.(\d+)\."
 ELEMENTS: tuple[Rule, ...] = (
     (r"transformer\.level_embeds", "level", "vector"),
@@ -136,59 +122,3 @@ def toponet_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
 def baseline_lane_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
     """Return the parameters of `BevFormerDetr.decode`, less relationship heads, from those of LCDeformableDETRHead."""
     return convert(state, BASELINE_LANES, "the baseline's lane head").variables["params"]
-
-
-def convert_host(state: Mapping[str, AnyArray], model: TopoNetConfig | BevFormerDetrConfig) -> Converted:
-    """Return the variables of a whole host with cameras, and an account of every tensor.
-
-    Args:
-        state: tensors of the reference's detector, with or without the prefix `module.`.
-        model: decides how many layers there are, and whether the backbone's norms are constants.
-
-    Raises:
-        UserError: a tensor that the detector does not have.
-    """
-    is_toponet = isinstance(model, TopoNetConfig)
-    last = f"heads_{model.decoder.layers - 1}"
-    rules = (
-        *below("", "encoder/images", IMAGE_ENCODER),
-        *below(r"bev_constructor\.", "encoder/bev", BEV_CONSTRUCTER),
-        *below(r"bbox_head\.", "elements", ELEMENTS),
-        *below(r"pts_bbox_head\.", "", TOPONET_LANES if is_toponet else BASELINE_LANES),
-        *(() if is_toponet else below(r"lclc_head\.", f"{last}/successor", RELATIONSHIP)),
-        *(() if is_toponet else below(r"lcte_head\.", f"{last}/element_lane", RELATIONSHIP)),
-    )
-    frozen = isinstance(model.encoder, CameraEncoderConfig) and model.encoder.images.backbone.frozen_norms
-    norms = r"encoder/images/backbone/(.*/)?\w*bn\d?/.*" if frozen else "(?!)"
-    return convert(state, rules, "TopoNet" if is_toponet else "BEVFormer-DETR", frozen=norms)
-
-
-def load_host(path: Path, model: TopoNetConfig | BevFormerDetrConfig) -> tuple[Params, list[dict[str, str]]]:
-    """Return a task's parameters from the reference's checkpoint (.pth, .pkl, .npz), and the account of its tensors.
-
-    Raises:
-        UserError: the file cannot be read, or its tensors are not exactly those of the model.
-    """
-    if not isinstance(model.encoder, CameraEncoderConfig):
-        raise UserError("published weights are those of models with cameras: give the model an encoder of cameras")
-    converted = convert_host(read_state_dict(path), model)
-    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), camera_shapes(model.encoder)))
-    check_fits(converted.variables, {"batch_stats": {}} | expected, path)
-    variables = converted.variables
-    return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
-
-
-def camera_shapes(encoder: CameraEncoderConfig) -> Any:
-    """Return the shapes of an example; parameters do not depend on the size of its images."""
-    count, side = encoder.bev.cameras, 128
-    shape = jax.ShapeDtypeStruct
-    cameras = CameraViews(
-        image=shape((count, side, side, 3), jnp.uint8),
-        size=shape((count, 2), jnp.int32),
-        intrinsics=shape((count, 3, 3), jnp.float32),
-        camera_from_ego=shape((count, 4, 4), jnp.float32),
-        valid=shape((count,), jnp.bool_),
-    )
-    nothing = dict.fromkeys(field.name for field in dataclasses.fields(Example))
-    pose, flag = shape((4, 4), jnp.float32), shape((), jnp.bool_)
-    return Example(**nothing | {"cameras": cameras, "previous_from_ego": pose, "has_previous": flag})  # pyright: ignore

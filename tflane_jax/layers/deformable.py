@@ -1,10 +1,10 @@
-"""Multi-scale deformable attention (Deformable DETR, Zhu et al. 2021), as BEVFormer and TopoNet use it."""
+"""Multi-scale deformable attention (Deformable DETR, Zhu et al. 2021), as BEVFormer, TopoNet and LaneSegNet use it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -25,6 +25,22 @@ def compass_offsets(heads: int, levels: int, points: int) -> np.ndarray:
     return np.broadcast_to(grid, (heads, levels, points, 2)).astype(np.float32)
 
 
+def star_offsets(heads: int, levels: int, points: int) -> np.ndarray:
+    """Return LaneSegNet's initial offsets (heads, levels, points, 2): a star of eight directions, alike for every head.
+
+    Point p has direction p // r and radius p % r + 1, with r = points / 8 radii per direction; fewer than eight points
+    have one direction each.
+
+    Raises:
+        ValueError: the points do not fill the star.
+    """
+    directions = min(points, 8)
+    if points % directions:
+        raise ValueError(f"{points} points do not form a star of 8 directions: choose a multiple of 8, or fewer than 8")
+    star = compass_offsets(directions, 1, points // directions).reshape(1, 1, points, 2)
+    return np.broadcast_to(star, (heads, levels, points, 2))
+
+
 class DeformableAttention(nn.Module):
     """Deformable attention with its projections.
 
@@ -32,12 +48,15 @@ class DeformableAttention(nn.Module):
         dim: channels in and out.
         heads, points: sampling points per head and level.
         levels: number of value levels.
+        initial: initial offsets. "compass": each head looks in its own direction (Deformable DETR); "star": each head
+            looks in all directions around its own reference point (LaneSegNet's LaneAttention).
     """
 
     dim: int
     heads: int = 8
     points: int = 4
     levels: int = 1
+    initial: Literal["compass", "star"] = "compass"
 
     @nn.compact
     def __call__(
@@ -63,7 +82,7 @@ class DeformableAttention(nn.Module):
         Raises:
             ValueError: a reference of another shape.
         """
-        offsets, logits = offsets_and_logits(query, self.heads, self.levels, self.points)
+        offsets, logits = offsets_and_logits(query, self.heads, self.levels, self.points, initial=self.initial)
         weights = jax.nn.softmax(logits, (-2, -1))
         # Before the projection too: padding must not reach the projection's gradient.
         value = nn.Dense(self.dim, name="value_proj")(_masked(value, valid))
@@ -74,10 +93,15 @@ class DeformableAttention(nn.Module):
 
 
 def offsets_and_logits(
-    query: Float[Array, "q c"], heads: int, levels: int, points: int, dtype: Any = None
+    query: Float[Array, "q c"],
+    heads: int,
+    levels: int,
+    points: int,
+    dtype: Any = None,
+    initial: Literal["compass", "star"] = "compass",
 ) -> tuple[Float[Array, "q heads levels p 2"], Float[Array, "q heads levels p"]]:
     """Return sampling offsets and logits in float32, with layers that belong to the calling module."""
-    bias = compass_offsets(heads, levels, points).reshape(-1)
+    bias = (star_offsets if initial == "star" else compass_offsets)(heads, levels, points).reshape(-1)
     offsets = nn.Dense(
         heads * levels * points * 2,
         kernel_init=nn.initializers.zeros,

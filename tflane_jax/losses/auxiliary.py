@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.common import Report, Terms, last_layer
@@ -15,7 +16,9 @@ from tflane_jax.losses.lane_cells import lane_cell_loss
 from tflane_jax.losses.lane_proposals import lane_proposal_sums
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryName, AuxiliaryOutputs
-from tflane_jax.scene import CenterlinePrediction, LaneGraph
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, SegmentPrediction
+
+T = TypeVar("T", CenterlinePrediction, SegmentPrediction)
 
 
 def auxiliary_losses(
@@ -26,7 +29,8 @@ def auxiliary_losses(
     bev_range: PerceptionRange,
     cell_weight: float,
     proposal_weights: tuple[float, float],
-    denoising: Callable[[CenterlinePrediction, LaneGraph], Terms],
+    denoising: Callable[[Any, LaneGraph], Terms],
+    cell_lanes: LaneGraph | None = None,
 ) -> tuple[list[Float[Array, ""]], Report]:
     """Return the weighted auxiliary losses of a batch, to be summed in this order, and the numbers to record.
 
@@ -38,6 +42,7 @@ def auxiliary_losses(
         cell_weight: weight of the loss on BEV cells.
         proposal_weights: weights of the heat map and of the shapes of proposed lanes.
         denoising: from predictions of denoised lanes and the ground truth to weighted losses per layer.
+        cell_lanes: ground truth of the BEV cells, where it is not `lanes`.
 
     Raises:
         ValueError: a declared auxiliary output is missing, or has no loss here.
@@ -50,7 +55,8 @@ def auxiliary_losses(
             report |= {f"denoised_{key}": value for key, value in last_layer(terms).items()}
         elif name == "lane_cells" and outputs.lane_cells is not None:
             each = jax.vmap(lane_cell_loss, in_axes=(0, 0, None))
-            report["cells"] = cell_weight * each(outputs.lane_cells, lanes, bev_range).mean()
+            inside = lanes if cell_lanes is None else cell_lanes
+            report["cells"] = cell_weight * each(outputs.lane_cells, inside, bev_range).mean()
             losses.append(report["cells"])
         elif name == "lane_proposals" and outputs.lane_proposals is not None:
             each = jax.vmap(partial(lane_proposal_sums, range_=bev_range))
@@ -66,24 +72,23 @@ def auxiliary_losses(
     return losses, report
 
 
-def denoising_pairs(
-    prediction: CenterlinePrediction, lanes: LaneGraph
-) -> tuple[CenterlinePrediction, Assignment, LaneGraph]:
+def denoising_pairs(prediction: T, truth: Any, valid: Bool[Array, "b n"]) -> tuple[T, Assignment, Any]:
     """Return predictions of noised lanes, their assignment and ground truth, with every copy as a separate example.
 
     Query i belongs to lane i; lanes beyond the number of queries are left out.
 
     Args:
-        prediction: leading axes (batch, copy, layer).
-        lanes: ground truth, leading axis batch.
+        prediction: centerlines or segments, leading axes (batch, copy, layer).
+        truth: pytree of the ground truth, leading axis batch.
+        valid: which lanes exist.
     """
     batch, copies, layers, queries = prediction.logits.shape[:4]
-    capacity = lanes.valid.shape[1]
+    capacity = valid.shape[1]
     own = jnp.arange(capacity)
-    there = lanes.valid & (own < queries)[None]
+    there = valid & (own < queries)[None]
     assignment = Assignment(
         query=jnp.broadcast_to(jnp.where(there, own[None], 0)[:, None, None], (batch, copies, layers, capacity)),
         matched=jnp.broadcast_to(there[:, None, None], (batch, copies, layers, capacity)),
     )
     prediction, assignment = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (prediction, assignment))
-    return prediction, assignment, jax.tree.map(lambda leaf: jnp.repeat(leaf, copies, 0), lanes)
+    return prediction, assignment, jax.tree.map(lambda leaf: jnp.repeat(leaf, copies, 0), truth)

@@ -22,6 +22,21 @@ def pairwise_l1(prediction: Float[Array, "*b q d"], target: Float[Array, "*#b n 
     return jnp.abs(prediction[..., :, None, :] - target[..., None, :, :]).sum(-1)
 
 
+def mask_cost(logits: Float[Array, "q m"], masks: Float[Array, "n m"]) -> Float[Array, "q n"]:
+    """Return the mean cross-entropy of every predicted mask with every true one, over M cells."""
+    # softplus(x) - x t is the cross-entropy of logit x and target t.
+    return (jax.nn.softplus(logits).sum(-1)[:, None] - logits @ masks.T) / logits.shape[-1]
+
+
+def dice_cost(values: Float[Array, "q m"], masks: Float[Array, "n m"], eps: float = 1.0) -> Float[Array, "q n"]:
+    """Return 1 - (2 sum x t + eps) / (sum x + sum t + eps) of every predicted mask x with every true mask t.
+
+    `values` should be probabilities; LaneSegNet passes logits, with which the cost can take any sign and size.
+    """
+    overlap = 2.0 * values @ masks.T + eps
+    return 1.0 - overlap / (values.sum(-1)[:, None] + masks.sum(-1)[None] + eps)
+
+
 def generalised_iou(a: Float[Array, "*#b 2 2"], b: Float[Array, "*#b 2 2"], eps: float = 1e-6) -> Float[Array, "*b"]:
     """Return the generalised IoU of boxes, -1 to 1 (Rezatofighi et al. 2019): IoU - (hull - union) / hull.
 

@@ -218,7 +218,7 @@ def lane_denoising_losses(
         control_points: see `matching_cost`.
     """
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
-    prediction, assignment, lanes = denoising_pairs(prediction, lanes)
+    prediction, assignment, lanes = denoising_pairs(prediction, lanes, lanes.valid)
     return lane_losses(prediction, assignment, lanes, config, control_points)
 
 

@@ -19,7 +19,7 @@ from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoder
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
 from tflane_jax.models.encoders import EncoderConfig, check_elements
 from tflane_jax.models.host import Host, HostConfig
-from tflane_jax.models.lane_decoder import LaneDecoderLayer, LaneHeads, make_prediction
+from tflane_jax.models.lane_decoder import LaneDecoderLayer, LaneHeads, attention_reference, make_prediction
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
 from tflane_jax.models.lane_queries import PAPER_LANE_DECODER, LaneDecoderConfig
 from tflane_jax.models.prior import HostQueries
@@ -109,7 +109,8 @@ class BevFormerDetr(Host):
             last = i == config.layers - 1
             queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, position))
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
-            queries = layer(queries, position, reference, bev, None, deterministic=deterministic)
+            around = attention_reference(reference, config)
+            queries = layer(queries, position, around, bev, None, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             element_queries = None if elements is None else elements.queries[i]
             heads = LaneHeads(config, spec.bev_range, last, spec.range, name=f"heads_{i}")

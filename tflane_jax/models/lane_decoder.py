@@ -1,5 +1,7 @@
 """Lane decoder of TopoNet and BEVFormer-DETR: lane queries attend to BEV features; heads predict centerlines.
 
+LaneSegNet shares the decoder layer and the refinement of centerlines; its heads are in `models.lane_segments`.
+
 In TopoNet, queries also pass messages along the predicted topology (docs/reference/toponet.md).
 
 Two modes of refinement. "fixed" is TopoNet's: a query samples around one reference point that never moves. "iterative"
@@ -10,7 +12,7 @@ Small models need "iterative" to converge.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -23,7 +25,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGraphFeedForward
-from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
 from tflane_jax.layers.sampling import sample_bilinear
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
 from tflane_jax.models.element_decoder import ElementOutput
@@ -32,16 +34,22 @@ from tflane_jax.scene import CenterlinePrediction, ElementPrediction, Prediction
 
 
 class LaneDecoderLayer(nn.Module):
-    """Self-attention, deformable attention to the BEV features, feed-forward or scene graph; post-norm."""
+    """Self-attention, deformable attention to the BEV features, feed-forward or scene graph; post-norm.
+
+    Attributes:
+        config: sizes.
+        initial: initial sampling offsets, see `DeformableAttention`.
+    """
 
     config: LaneDecoderConfig
+    initial: Literal["compass", "star"] = "compass"
 
     @nn.compact
     def __call__(
         self,
         queries: Float[Array, "q c"],
         position: Float[Array, "q c"],
-        reference: Float[Array, "q p 3"],
+        around: Float[Array, "q r 2"],
         bev: Float[Array, "h w e"],
         adjacency: Float[Array, "q q"] | None,
         elements: ElementNodes | None = None,
@@ -52,9 +60,10 @@ class LaneDecoderLayer(nn.Module):
 
         Args:
             queries, position: content of the queries and the position encoding added to it in attention.
-            reference: points of their lanes in [0, 1].
+            around: reference points in [0, 1], a common one for all heads or one for each head.
             bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
-            adjacency: the previous layer's edge probabilities; None: a layer without scene graph (BEVFormer-DETR).
+            adjacency: the previous layer's edge probabilities; None: a layer without scene graph (BEVFormer-DETR,
+                LaneSegNet).
             elements: traffic elements of the scene graph, or None.
             deterministic: no dropout.
         """
@@ -67,8 +76,10 @@ class LaneDecoderLayer(nn.Module):
         attend = MultiHeadAttention(config.dim, config.heads, config.dropout, name="self_attention")
         placed = queries + position
         queries = add("self_attention", queries, attend(placed, placed, queries, deterministic=deterministic))
-        sample = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
-        (h, w, e), around = bev.shape, attention_reference(reference, config)
+        sample = DeformableAttention(
+            config.dim, config.heads, config.sampling_points, initial=self.initial, name="bev_attention"
+        )
+        h, w, e = bev.shape
         sampled = sample(queries + position, bev.reshape(h * w, e), ((h, w),), around)
         queries = add("bev_attention", queries, sampled)
         if adjacency is None:
@@ -173,13 +184,7 @@ class LaneHeads(nn.Module):
         logits = nn.Dense(1, bias_init=nn.initializers.constant(-np.log(99.0)), name="class_out")(x)
         # The change of the reference, in logits of [0, 1] or in units of `metres`.
         change = Mlp((config.dim, config.dim, config.points * 3), name="points")(queries).reshape(reference.shape)
-        if config.refine == "iterative":
-            change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
-            change = change + PointwiseRefinement(config, self.range, name="pointwise")(queries, reference, bev)
-        if config.output == "sigmoid":
-            unit = nn.sigmoid(change + inverse_sigmoid(reference))
-        else:
-            unit = self._moved(reference, change)
+        unit = refined_points(config, self.range, self.limits, change, reference, queries, bev)
         successor = element_lane = None
         if self.relations:
             successor = RelationshipHead(config.relation, name="successor")(queries, queries)
@@ -187,14 +192,56 @@ class LaneHeads(nn.Module):
                 element_lane = RelationshipHead(config.relation, name="element_lane")(queries, elements)
         return LaneOutput(self.range.denormalise(unit), unit, logits, successor, element_lane)
 
-    def _moved(self, reference: Float[Array, "q p 3"], change: Float[Array, "q p 3"]) -> Float[Array, "q p 3"]:
-        """Return the reference plus the change in units of `metres`, clipped to the limits."""
-        scale = jnp.asarray(self.config.metres) / jnp.asarray(self.range.size())
-        unit = reference + change * scale[None, None]
-        box = self.limits or self.range
-        corners = self.range.normalise(jnp.array([[axis[end] for axis in (box.x, box.y, box.z)] for end in (0, 1)]))
-        low, high = (jnp.broadcast_to(corners[i], unit.shape[1:]) for i in (0, 1))
-        return jax.vmap(clip_with_return, in_axes=(0, None, None))(unit, low, high)
+
+def refined_points(
+    config: LaneDecoderConfig,
+    range_: PerceptionRange,
+    limits: PerceptionRange | None,
+    change: Float[Array, "q p 3"],
+    reference: Float[Array, "q p 3"],
+    queries: Float[Array, "q c"],
+    bev: Float[Array, "h w e"],
+) -> Float[Array, "q p 3"]:
+    """Return the points of a layer in [0, 1], from the change that its head gives; part of a compact module.
+
+    Args:
+        config: sizes and forms; "iterative" adds the module `pointwise`.
+        range_: the box that normalised coordinates span.
+        limits: the box at whose border lanes end, output "metric" only; None: `range_`.
+        change: of the reference, in logits of [0, 1] or in units of `metres`.
+        reference: points of the layer before, in [0, 1].
+        queries, bev: see `PointwiseRefinement`.
+    """
+    if config.refine == "iterative":
+        change = jnp.einsum("pk,qkc->qpc", smooth_basis(config.points), change)
+        change = change + PointwiseRefinement(config, range_, name="pointwise")(queries, reference, bev)
+    if config.output == "sigmoid":
+        return nn.sigmoid(change + inverse_sigmoid(reference))
+    scale = jnp.asarray(config.metres) / jnp.asarray(range_.size())
+    return clipped(reference + change * scale[None, None], range_, limits)
+
+
+def clipped(
+    unit: Float[Array, "q p 3"], range_: PerceptionRange, limits: PerceptionRange | None
+) -> Float[Array, "q p 3"]:
+    """Return points in [0, 1] of `range_` clipped to the limits by `clip_with_return`."""
+    box = limits or range_
+    corners = range_.normalise(jnp.array([[axis[end] for axis in (box.x, box.y, box.z)] for end in (0, 1)]))
+    low, high = (jnp.broadcast_to(corners[i], unit.shape[1:]) for i in (0, 1))
+    return jax.vmap(clip_with_return, in_axes=(0, None, None))(unit, low, high)
+
+
+def lane_position(
+    config: LaneDecoderConfig, layer: int, position: Float[Array, "q c"], reference: Float[Array, "q p 3"]
+) -> Float[Array, "q c"]:
+    """Return the position encoding of the queries in a layer; part of a compact module.
+
+    "iterative": the encoding follows the refined lane, by the module `lane_position_{layer}`.
+    """
+    if config.refine != "iterative":
+        return position
+    along = jnp.concatenate([sine_encoding(reference[..., :2], config.bands), reference], -1)
+    return position + Mlp((config.dim, config.dim), name=f"lane_position_{layer}")(along.reshape(len(reference), -1))
 
 
 @jax.custom_vjp

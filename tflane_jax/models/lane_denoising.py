@@ -99,7 +99,7 @@ def decode_lanes(
             deterministic)`, where `start` is as from `LaneQueries`.
         config: sizes of the queries.
         bev, elements, tokens, deterministic: passed to `decode_queries`.
-        lanes: ground truth to denoise; not used otherwise.
+        lanes: ground truth to denoise (lanes, or lane segments); not used otherwise.
     """
     range_, noise = host.config.spec.bev_range, host.config.denoising
     start = LaneQueries(config, range_, name="queries")()
@@ -117,7 +117,8 @@ def decode_lanes(
         split_rngs={"params": False, "dropout": True},
     )
     every = decode(host, starts, bev, elements, tokens, deterministic)
-    host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], every.centerlines))
+    found = every.centerlines if every.segments is None else every.segments
+    host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], found))
     return jax.tree.map(lambda leaf: leaf[0], every)
 
 

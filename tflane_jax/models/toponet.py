@@ -14,8 +14,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tflane_jax.layers.graph import ElementNodes, Mlp, edge_probabilities
-from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.layers.graph import ElementNodes, edge_probabilities
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
@@ -25,6 +24,8 @@ from tflane_jax.models.lane_decoder import (
     ElementEmbedding,
     LaneDecoderLayer,
     LaneHeads,
+    attention_reference,
+    lane_position,
     make_prediction,
     next_reference,
 )
@@ -101,12 +102,7 @@ class TopoNet(Host):
         element_edges = None if elements is None else jnp.zeros((config.queries, elements.logits.shape[1]))
         outputs = []
         for i in range(config.layers):
-            placed = position
-            if config.refine == "iterative":
-                # The position encoding follows the refined lane.
-                along = jnp.concatenate([sine_encoding(reference[..., :2], config.bands), reference], -1)
-                along = along.reshape(config.queries, -1)
-                placed = position + Mlp((config.dim, config.dim), name=f"lane_position_{i}")(along)
+            placed = lane_position(config, i, position, reference)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed))
             embedded = nodes = None
             if elements is not None and element_edges is not None:
@@ -114,7 +110,8 @@ class TopoNet(Host):
                 embedded = embed(elements.queries[i], deterministic=deterministic)
                 nodes = ElementNodes(embedded, elements.logits[i], element_edges)
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
-            queries = layer(queries, placed, reference, bev, adjacency, nodes, deterministic=deterministic)
+            around = attention_reference(reference, config)
+            queries = layer(queries, placed, around, bev, adjacency, nodes, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             heads = LaneHeads(config, spec.bev_range, limits=spec.range, name=f"heads_{i}")
             output = heads(queries, reference, bev, embedded)

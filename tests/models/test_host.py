@@ -1,15 +1,19 @@
-"""TopoNet's lane branch with and without the TFM: padding, order and absent inputs change no bit."""
+"""Hosts with and without the TFM: padding, order and absent inputs change no bit."""
 
 import dataclasses
+from functools import partial
 
 import chex
 import jax
 import numpy as np
 import pytest
 
-from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
+from tests.models.cases import BASELINE, SEGMENTS, SMALL_SEGMENTS, WITH_TRAFFIC, make_segment_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
+from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import TrafficFlow
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -24,7 +28,20 @@ MODELS = {
         ),
     ),
     "fixed": dataclasses.replace(WITH_TRAFFIC, decoder=dataclasses.replace(WITH_TRAFFIC.decoder, refine="fixed")),
+    "segments": SEGMENTS,
+    "segments, traffic": SMALL_SEGMENTS,
 }
+
+
+def make_task(config):
+    losses = LaneSegNetLossConfig() if isinstance(config, LaneSegNetConfig) else TopoNetLossConfig()
+    return LaneGraphTask(model=config, losses=losses)
+
+
+def predicted(task, params, example):
+    """Return the lanes or lane segments."""
+    answer = task.predict(params, example)
+    return answer.centerlines if answer.segments is None else answer.segments
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +49,9 @@ def fitted():
     """Parameters and a jitted predictor of each model."""
     out = {}
     for name, config in MODELS.items():
-        task = LaneGraphTask(model=config)
-        params = random_params(task.init, make_example(), spread=0.2)
-        out[name] = task, params, jax.jit(lambda p, e, t=task: t.predict(p, e).centerlines)
+        task = make_task(config)
+        params = random_params(task.init, make_segment_example(), spread=0.2)
+        out[name] = task, params, jax.jit(partial(predicted, task))
     return out
 
 
@@ -45,7 +62,7 @@ def same(a, b):
 @pytest.mark.parametrize("name", MODELS)
 def test_shapes_and_range(fitted, name):
     _, params, predict = fitted[name]
-    lanes = predict(params, make_example())
+    lanes = predict(params, make_segment_example())
     chex.assert_shape(lanes.points, (6, 11, 3))
     chex.assert_shape(lanes.successor_logits, (6, 6))
     assert np.abs(np.asarray(lanes.points)[..., 0]).max() <= 51.2
@@ -55,7 +72,7 @@ def test_shapes_and_range(fitted, name):
 @pytest.mark.parametrize("name", MODELS)
 def test_padding_may_hold_nan(fitted, name):
     _, params, predict = fitted[name]
-    example = make_example(3, instances=6)
+    example = make_segment_example(3, instances=6)
     flow = example.traffic_flow
     dirty = flow.replace(
         position=np.where(flow.valid[..., None], flow.position, np.nan),
@@ -66,10 +83,10 @@ def test_padding_may_hold_nan(fitted, name):
     same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
 
 
-@pytest.mark.parametrize("name", ["traffic", "every layer", "fixed"])
+@pytest.mark.parametrize("name", ["traffic", "every layer", "fixed", "segments, traffic"])
 def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
     _, params, predict = fitted[name]
-    example = make_example(4)
+    example = make_segment_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
     same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
     # The parameters of the temporal encoder must have no effect in an empty scene.
@@ -78,14 +95,16 @@ def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
     assert not np.array_equal(absent.points, predict(params, example).points)
 
 
-def test_baseline_does_not_depend_on_traffic(fitted):
-    _, params, predict = fitted["baseline"]
-    same(predict(params, make_example(5)), predict(params, make_example(5).replace(traffic_flow=None)))
+@pytest.mark.parametrize("name", ["baseline", "segments"])
+def test_baseline_does_not_depend_on_traffic(fitted, name):
+    _, params, predict = fitted[name]
+    same(predict(params, make_segment_example(5)), predict(params, make_segment_example(5).replace(traffic_flow=None)))
 
 
-def test_lanes_do_not_depend_on_the_order_of_instances(fitted):
-    _, params, predict = fitted["traffic"]
-    example = make_example(6)
+@pytest.mark.parametrize("name", ["traffic", "segments, traffic"])
+def test_lanes_do_not_depend_on_the_order_of_instances(fitted, name):
+    _, params, predict = fitted[name]
+    example = make_segment_example(6)
     order = np.random.default_rng(0).permutation(16)
     shuffled = example.replace(traffic_flow=jax.tree.map(lambda x: x[order], example.traffic_flow))
     same(predict(params, example), predict(params, shuffled))
@@ -94,9 +113,9 @@ def test_lanes_do_not_depend_on_the_order_of_instances(fitted):
 @pytest.mark.parametrize("name", MODELS)
 def test_batch_is_a_vmap(fitted, name):
     task, params, predict = fitted[name]
-    examples = [make_example(s, instances=s) for s in (0, 3, 9)]
+    examples = [make_segment_example(s, instances=s) for s in (0, 3, 9)]
     batch = jax.tree.map(lambda *x: np.stack(x), *examples)
-    together = jax.jit(jax.vmap(lambda p, e: task.predict(p, e).centerlines, in_axes=(None, 0)))(params, batch)
+    together = jax.jit(jax.vmap(partial(predicted, task), in_axes=(None, 0)))(params, batch)
     for i, example in enumerate(examples):
         alone = predict(params, example)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=2e-4, atol=2e-4), alone, together)
@@ -113,21 +132,22 @@ def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
         return jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(0))[0])(params)
 
     for instances, lanes in ((9, 4), (0, 0), (1, 1)):
-        batch = jax.tree.map(lambda x: np.stack([x, x]), make_example(1, instances, lanes))
+        batch = jax.tree.map(lambda x: np.stack([x, x]), make_segment_example(1, instances, lanes, min(lanes, 1)))
         loss, gradient = step(params, batch)
         assert np.isfinite(loss)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
     if "temporal_encoder" in params:
-        batch = jax.tree.map(lambda x: np.stack([x, x]), make_example(1, instances=0))
+        batch = jax.tree.map(lambda x: np.stack([x, x]), make_segment_example(1, instances=0))
         silent = step(params, batch)[1]["temporal_encoder"]
         assert all(not np.asarray(g).any() for g in jax.tree.leaves(silent))
 
 
-def test_same_key_same_parameters():
-    task = LaneGraphTask(model=WITH_TRAFFIC)
-    a, b = (jax.jit(task.init).lower(jax.random.key(7), make_example()) for _ in range(2))
+@pytest.mark.parametrize("model", [WITH_TRAFFIC, SMALL_SEGMENTS], ids=["toponet", "lanesegnet"])
+def test_same_key_same_parameters(model):
+    task = make_task(model)
+    a, b = (jax.jit(task.init).lower(jax.random.key(7), make_segment_example()) for _ in range(2))
     assert a.as_text() == b.as_text()
-    params = a.compile()(jax.random.key(7), make_example())
+    params = a.compile()(jax.random.key(7), make_segment_example())
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     names = {"/".join(str(k.key) for k in path) for path, _ in jax.tree_util.tree_leaves_with_path(params)}
     assert not [n for n in names if "Dense_" in n or "Conv_" in n or "Norm_" in n]
@@ -136,4 +156,4 @@ def test_same_key_same_parameters():
 def test_no_bev_is_an_error(fitted):
     task, params, _ = fitted["baseline"]
     with pytest.raises(UserError, match="bev is None"):
-        task.predict(params, make_example().replace(bev=None))
+        task.predict(params, make_segment_example().replace(bev=None))

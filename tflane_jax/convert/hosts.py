@@ -1,0 +1,101 @@
+"""Whole detectors: the reference's checkpoints as parameters of our hosts.
+
+All of them call the image encoder `img_backbone` and `img_neck`, the BEV encoder `bev_constructor`, the head of traffic
+elements `bbox_head`, that of lanes `pts_bbox_head`, and topology heads beside it `lclc_head` and `lcte_head`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
+from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
+from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, convert
+from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
+from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.namespace import AnyArray
+from tflane_jax.layers.batch_norm import STATISTICS
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.parameters import Params
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.scene import CameraViews, Example
+
+PublishedHost = TopoNetConfig | BevFormerDetrConfig | LaneSegNetConfig
+
+
+def _head_rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
+    """Return a detector's name and the rules of its heads."""
+    elements = below(r"bbox_head\.", "elements", ELEMENTS)
+    if isinstance(model, TopoNetConfig):
+        return "TopoNet", (*elements, *below(r"pts_bbox_head\.", "", TOPONET_LANES))
+    if isinstance(model, LaneSegNetConfig):
+        segments = below(r"pts_bbox_head\.", "", LANESEGNET_HEAD)
+        return "LaneSegNet", (*segments, *below(r"lclc_head\.", "successor", RELATIONSHIP))
+    last = f"heads_{model.decoder.layers - 1}"
+    return "BEVFormer-DETR", (
+        *elements,
+        *below(r"pts_bbox_head\.", "", BASELINE_LANES),
+        *below(r"lclc_head\.", f"{last}/successor", RELATIONSHIP),
+        *below(r"lcte_head\.", f"{last}/element_lane", RELATIONSHIP),
+    )
+
+
+def convert_host(state: Mapping[str, AnyArray], model: PublishedHost) -> Converted:
+    """Return the variables of a whole host with cameras, and an account of every tensor.
+
+    Args:
+        state: tensors of the reference's detector, with or without the prefix `module.`.
+        model: decides how many layers there are, and whether the backbone's norms are constants.
+
+    Raises:
+        UserError: a tensor that the detector does not have.
+    """
+    network, heads = _head_rules(model)
+    rules = (
+        *below("", "encoder/images", IMAGE_ENCODER),
+        *below(r"bev_constructor\.", "encoder/bev", BEV_CONSTRUCTER),
+        *heads,
+    )
+    frozen = isinstance(model.encoder, CameraEncoderConfig) and model.encoder.images.backbone.frozen_norms
+    norms = r"encoder/images/backbone/(.*/)?\w*bn\d?/.*" if frozen else "(?!)"
+    return convert(state, rules, network, frozen=norms)
+
+
+def load_host(path: Path, model: PublishedHost) -> tuple[Params, list[dict[str, str]]]:
+    """Return a task's parameters from the reference's checkpoint (.pth, .pkl, .npz), and the account of its tensors.
+
+    Raises:
+        UserError: the file cannot be read, or its tensors are not exactly those of the model.
+    """
+    if not isinstance(model.encoder, CameraEncoderConfig):
+        raise UserError("published weights are those of models with cameras: give the model an encoder of cameras")
+    converted = convert_host(read_state_dict(path), model)
+    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), camera_shapes(model.encoder)))
+    check_fits(converted.variables, {"batch_stats": {}} | expected, path)
+    variables = converted.variables
+    return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
+
+
+def camera_shapes(encoder: CameraEncoderConfig) -> Any:
+    """Return the shapes of an example; parameters do not depend on the size of its images."""
+    count, side = encoder.bev.cameras, 128
+    shape = jax.ShapeDtypeStruct
+    cameras = CameraViews(
+        image=shape((count, side, side, 3), jnp.uint8),
+        size=shape((count, 2), jnp.int32),
+        intrinsics=shape((count, 3, 3), jnp.float32),
+        camera_from_ego=shape((count, 4, 4), jnp.float32),
+        valid=shape((count,), jnp.bool_),
+    )
+    nothing = dict.fromkeys(field.name for field in dataclasses.fields(Example))
+    pose, flag = shape((4, 4), jnp.float32), shape((), jnp.bool_)
+    return Example(**nothing | {"cameras": cameras, "previous_from_ego": pose, "has_previous": flag})  # pyright: ignore

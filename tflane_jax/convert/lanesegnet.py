@@ -1,0 +1,38 @@
+"""Weights of the head of the published LaneSegNet (github.com/OpenDriveLab/LaneSegNet) as our parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tflane_jax.convert.renaming import Rule, convert
+from tflane_jax.convert.toponet import PLAIN_DECODER
+from tflane_jax.geometry.namespace import AnyArray
+
+
+def _branch(name: str, ours: str, *, norm: bool = False) -> tuple[Rule, ...]:
+    """Return the rules of one kind of branch: three linear layers, numbered with the layers between them."""
+    step = 3 if norm else 2
+    linear = [
+        (rf"{name}\.(\d+)\.{step * i}\.(weight|bias)", rf"heads_\1/{ours}/linear_{i}/\2", "linear") for i in range(3)
+    ]
+    norms = [
+        (rf"{name}\.(\d+)\.{step * i + 1}\.(weight|bias)", rf"heads_\1/{ours}/norm_{i}/\2", "norm") for i in range(2)
+    ]
+    return (*linear, *(norms if norm else ()))
+
+
+LANESEGNET_HEAD: tuple[Rule, ...] = (
+    *PLAIN_DECODER,
+    *_branch("cls_branches", "class", norm=True),
+    *_branch("cls_left_type_branches", "left_type", norm=True),
+    *_branch("cls_right_type_branches", "right_type", norm=True),
+    *_branch("reg_branches", "points"),
+    *_branch("reg_branches_offset", "offset"),
+    *_branch("mask_embed", "mask"),
+)
+
+
+def segment_head_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
+    """Return the parameters of `LaneSegNet.decode`, less those of the topology, from those of LaneSegHead."""
+    return convert(state, LANESEGNET_HEAD, "LaneSegNet's lane head").variables["params"]

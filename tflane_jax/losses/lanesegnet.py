@@ -1,0 +1,284 @@
+"""LaneSegNet's loss of lane segments, with deep supervision (Li et al. 2024).
+
+Per decoder layer: focal loss on the classes, L1 on centerline and boundaries in metres, cross-entropy and dice on the
+masks, cross-entropy on the line types. For the last layer: focal loss on the topology of matched segments. Segments are
+directed. Weights and conventions: docs/reference/lanesegnet.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.datasets.segment_targets import SegmentTargets
+from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
+from tflane_jax.losses.common import (
+    HostLossConfig,
+    Report,
+    Terms,
+    focal,
+    last_layer,
+    matched,
+    positives,
+    quality_focal,
+    total,
+)
+from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost, pairwise_l1
+from tflane_jax.losses.segment_masks import Raster, segment_masks
+from tflane_jax.losses.toponet import lane_quality
+from tflane_jax.matching import Assignment, match
+from tflane_jax.models.auxiliary import AuxiliaryOutputs
+from tflane_jax.models.segment_truth import LANE, ordered_targets, target_lanes, target_lines
+from tflane_jax.scene import Example, Prediction, SegmentPrediction
+
+
+@dataclass(frozen=True)
+class LaneSegNetLossConfig(HostLossConfig):
+    """Weights of matching costs and loss terms; the defaults are LaneSegNet's.
+
+    Attributes:
+        class_weight, points_weight: of both cost and loss; points of all three lines in metres, summed over
+            coordinates.
+        mask_weight, dice_weight: of both cost and loss.
+        type_weight: of the line types of either boundary.
+        successor_weight: of the topology.
+        alpha, gamma: parameters of every focal term.
+        matcher: backend of `matching.match`.
+        dice_cost: the dice cost takes the masks' "logits", as the published configuration does, or their
+            "probabilities", as the dice loss does.
+        successor_mean: the sum over matched pairs is divided by the number of "negatives", the pairs without an edge,
+            as in the published code, or of all "pairs".
+        raster: of the mask targets.
+        class_target: of a query matched with a segment: "one", or "quality" (`segment_quality`).
+        proposal_weight: of the heat map of proposals; their shapes have `points_weight`.
+        cell_weight: see `HostLossConfig`.
+    """
+
+    class_weight: float = 1.5
+    points_weight: float = 0.025
+    mask_weight: float = 3.0
+    dice_weight: float = 3.0
+    type_weight: float = 0.1
+    successor_weight: float = 5.0
+    alpha: float = 0.25
+    gamma: float = 2.0
+    matcher: Literal["scipy", "jax"] = "jax"
+    dice_cost: Literal["logits", "probabilities"] = "logits"
+    successor_mean: Literal["negatives", "pairs"] = "negatives"
+    raster: Raster = "cells"
+    class_target: Literal["one", "quality"] = "one"
+    proposal_weight: float = 1.5
+
+    def loss(
+        self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
+    ) -> tuple[Float[Array, ""], Report]:
+        """Return the loss of a batch and the numbers to record, see `HostLossConfig.loss`."""
+        segments = outputs.segments
+        if segments is None or segments.mask_logits is None or segments.successor_logits is None:
+            raise ValueError("LaneSegNet's loss needs predicted segments with masks and topology")
+        bev_range, shape = host.encoder.bev_range, segments.mask_logits.shape[-2:]
+        targets = jax.vmap(partial(ordered_targets, center=host.center))(batch.segments, batch.areas)
+        masks = jax.vmap(partial(target_masks, shape=shape, range_=bev_range, raster=self.raster))(targets)
+        loss, report = segment_loss(segments, targets, masks, self)
+
+        def denoising(found, _):
+            return segment_denoising_losses(found, targets, masks, self)
+
+        further, more = auxiliary_losses(
+            auxiliary,
+            host.auxiliary,
+            target_lanes(targets),
+            bev_range=bev_range,
+            cell_weight=self.cell_weight,
+            proposal_weights=(self.proposal_weight, self.points_weight),
+            denoising=denoising,
+            cell_lanes=batch.segments,
+        )
+        for term in further:
+            loss += term
+        return loss, report | more
+
+
+def target_masks(targets: SegmentTargets, shape: tuple[int, int], range_: Any, raster: Raster) -> Float[Array, "n h w"]:
+    """Return the masks of one example's targets, 0 for padding."""
+    masks = segment_masks(targets.left, targets.right, shape, range_, raster)  # pyright: ignore[reportArgumentType]
+    return (masks & targets.valid[:, None, None]).astype(jnp.float32)
+
+
+def segment_loss(
+    prediction: SegmentPrediction,
+    targets: SegmentTargets,
+    masks: Float[Array, "b n h w"],
+    config: LaneSegNetLossConfig,
+) -> tuple[Float[Array, ""], Report]:
+    """Return the loss of a batch and its terms.
+
+    Args:
+        prediction: outputs of every decoder layer, leading axes (batch, layer); the topology has the last layer only.
+        targets: ground truth, leading axis batch.
+        masks: of the targets.
+        config: weights.
+
+    Returns:
+        The sum over layers of all weighted terms, and the terms of the last layer under `class`, `points`, `mask`,
+        `dice`, `line_type`, `successor`; and `matching/segments`, the mean number of matched segments per example.
+    """
+    assignment = assign_segments(prediction, targets, masks, config)
+    terms = segment_losses(prediction, assignment, targets, masks, config)
+    return total(terms), last_layer(terms) | {"matching/segments": matched(assignment)}
+
+
+def assign_segments(
+    prediction: SegmentPrediction,
+    targets: SegmentTargets,
+    masks: Float[Array, "b n h w"],
+    config: LaneSegNetLossConfig,
+) -> Assignment:
+    """Return the assignment (B, D, N) of a batch."""
+    layers = prediction.replace(successor_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
+    each = jax.vmap(partial(matching_cost, config=config), in_axes=(0, None, None))
+    cost = jax.vmap(each)(layers, targets, masks)
+    return match(cost, targets.valid[:, None], config.matcher)
+
+
+def matching_cost(
+    prediction: SegmentPrediction, targets: SegmentTargets, masks: Float[Array, "n h w"], config: LaneSegNetLossConfig
+) -> Float[Array, "q n"]:
+    """Return the cost of matching each query of one layer with each target; columns of padding are arbitrary."""
+    by_class = focal_cost(prediction.logits, config.alpha, config.gamma)[:, targets.category]
+    flat = lambda rows: rows.reshape(len(rows), math.prod(rows.shape[1:]))  # noqa: E731
+    apart = pairwise_l1(flat(_lines(prediction)), flat(target_lines(targets)))
+    logits, cells = flat(prediction.mask_logits), flat(masks)
+    overlap = dice_cost(logits if config.dice_cost == "logits" else jax.nn.sigmoid(logits), cells)
+    return (
+        config.class_weight * by_class
+        + config.points_weight * apart
+        + config.mask_weight * mask_cost(logits, cells)
+        + config.dice_weight * overlap
+    )
+
+
+def segment_losses(
+    prediction: SegmentPrediction,
+    assignment: Assignment,
+    targets: SegmentTargets,
+    masks: Float[Array, "b n h w"],
+    config: LaneSegNetLossConfig,
+) -> Terms:
+    """Return the weighted losses of every layer of a batch; of the topology, those of the last layer."""
+    layers = prediction.replace(successor_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
+    each = jax.vmap(partial(_layer_sums, config=config), in_axes=(0, 0, None, None))
+    sums = jax.vmap(each)(layers, assignment, targets, masks)  # each (B, D)
+    count = positives(assignment)
+    weights = {
+        "class": config.class_weight,
+        "points": config.points_weight,
+        "mask": config.mask_weight,
+        "dice": config.dice_weight,
+        "line_type": config.type_weight,
+    }
+    terms = {name: weight * sums[name].sum(0) / count for name, weight in weights.items()}
+    last = jax.tree.map(lambda leaf: leaf[:, -1], assignment)
+    edges = jnp.asarray(prediction.successor_logits)[:, -1]
+    return terms | {"successor": successor_loss(edges, last, targets, config)[None]}
+
+
+def _layer_sums(
+    prediction: SegmentPrediction,
+    assignment: Assignment,
+    targets: SegmentTargets,
+    masks: Float[Array, "n h w"],
+    config: LaneSegNetLossConfig,
+) -> dict[str, Float[Array, ""]]:
+    """Return the sums of losses over the queries of one layer of one example."""
+    logits, true = jnp.asarray(prediction.logits), target_lines(targets)
+    # Index `queries` lies outside, so unmatched targets write nowhere.
+    query = jnp.where(assignment.matched, assignment.query, len(logits))
+    lines = _lines(prediction)[assignment.query]
+    target = jnp.zeros(logits.shape)
+    if config.class_target == "one":
+        classes = focal(logits, target.at[query, targets.category].set(1.0, mode="drop"), config.alpha, config.gamma)
+    else:
+        quality = lax.stop_gradient(segment_quality(lines, true))
+        classes = quality_focal(logits, target.at[query, targets.category].set(quality, mode="drop"), config.gamma)
+    cells = jnp.asarray(prediction.mask_logits)[assignment.query]
+    sides = (prediction.left_type_logits, targets.left_type), (prediction.right_type_logits, targets.right_type)
+    each = {
+        "points": jnp.abs(lines - true).sum((1, 2, 3)),
+        "mask": optax.losses.sigmoid_binary_cross_entropy(cells, masks).mean((1, 2)),
+        "dice": dice_loss(jax.nn.sigmoid(cells), masks),
+    }
+    return {
+        "class": classes.sum(),
+        **{name: jnp.where(assignment.matched, value, 0.0).sum() for name, value in each.items()},
+        "line_type": sum((_type_loss(found, query, types) for found, types in sides), jnp.zeros(())),
+    }
+
+
+def _type_loss(logits, query, types) -> Float[Array, ""]:
+    """Return the sum of cross-entropies of one boundary's type; an unmatched query has no type at all."""
+    target = jnp.zeros(logits.shape).at[query, types].set(1.0, mode="drop")
+    return optax.losses.sigmoid_binary_cross_entropy(logits, target).sum()
+
+
+def dice_loss(p: Float[Array, "n h w"], masks: Float[Array, "n h w"]) -> Float[Array, " n"]:
+    """Return 1 - (2 sum p t + 1) / (sum p + sum t + 1)."""
+    return 1.0 - (2.0 * (p * masks).sum((1, 2)) + 1.0) / (p.sum((1, 2)) + masks.sum((1, 2)) + 1.0)
+
+
+def successor_loss(
+    logits: Float[Array, "b q q"], assignment: Assignment, targets: SegmentTargets, config: LaneSegNetLossConfig
+) -> Float[Array, ""]:
+    """Return the weighted focal loss on the edges between matched lane segments of a batch; 0 without any.
+
+    Pairs with an unmatched query or a crossing do not count.
+    """
+
+    def one(logits, assignment, targets):
+        lane = assignment.matched & (targets.category == LANE)
+        pairs: Bool[Array, "n n"] = lane[:, None] & lane[None]
+        edges = targets.successor & pairs
+        found = logits[assignment.query[:, None], assignment.query[None]]
+        loss = focal(found, edges.astype(logits.dtype), config.alpha, config.gamma)
+        counted = pairs & ~edges if config.successor_mean == "negatives" else pairs
+        return jnp.where(pairs, loss, 0.0).sum(), counted.sum().astype(jnp.float32)
+
+    losses, counts = jax.vmap(one)(logits, assignment, targets)
+    return config.successor_weight * losses.sum() / jnp.maximum(counts.sum(), 1.0)
+
+
+def segment_quality(lines: Float[Array, "n 3 p 3"], truth: Float[Array, "n 3 p 3"]) -> Float[Array, " n"]:
+    """Return the mean `lane_quality` of the centerline and of the two boundaries, which count half each."""
+    each = jax.vmap(lane_quality, in_axes=1, out_axes=1)(lines, truth)
+    return each @ jnp.array([0.5, 0.25, 0.25])
+
+
+def segment_denoising_losses(
+    prediction: SegmentPrediction,
+    targets: SegmentTargets,
+    masks: Float[Array, "b n h w"],
+    config: LaneSegNetLossConfig,
+) -> Terms:
+    """Return the `segment_losses` of noised segments without matching: query i belongs to target i.
+
+    Args:
+        prediction: leading axes (batch, copy, layer); see `models.lane_denoising`.
+        targets: ground truth; rows beyond the number of queries are left out.
+        masks: of the targets.
+        config: weights.
+    """
+    prediction, assignment, (targets, masks) = denoising_pairs(prediction, (targets, masks), targets.valid)
+    return segment_losses(prediction, assignment, targets, masks, config)
+
+
+def _lines(prediction: SegmentPrediction) -> Float[Array, "q 3 p 3"]:
+    """Return centerlines, left and right boundaries, metres."""
+    return jnp.stack([jnp.asarray(line) for line in (prediction.points, prediction.left, prediction.right)], 1)

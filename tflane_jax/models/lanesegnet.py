@@ -1,0 +1,166 @@
+"""LaneSegNet (Li et al. 2024), with or without priors: lane segments with boundaries, line types and topology.
+
+Images -> BEV features -> segment queries -> (priors) -> decoder layers -> centerlines, boundaries, line types, classes,
+masks -> topology of the last layer. The small version reads BEV evidence instead of images; decoder, heads and losses
+are the same. Source: docs/reference/lanesegnet.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from tflane_jax.datasets.segment_targets import Center
+from tflane_jax.errors import UserError
+from tflane_jax.layers.graph import RelationshipHead
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
+from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
+from tflane_jax.models.host import Host, HostConfig
+from tflane_jax.models.lane_decoder import LaneDecoderLayer, lane_position
+from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
+from tflane_jax.models.lane_segments import (
+    PAPER_SEGMENT_DECODER,
+    SegmentDecoderConfig,
+    SegmentHeads,
+    SegmentOutput,
+    regions,
+)
+from tflane_jax.models.prior import HostQueries
+from tflane_jax.models.priors import ByPrior, fuse_into_queries
+from tflane_jax.models.segment_truth import ordered_targets, target_lanes
+from tflane_jax.scene import LaneGraph, Prediction, SegmentPrediction
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaneSegNetConfig(HostConfig):
+    """Configuration of LaneSegNet; without priors, the vision-only baseline.
+
+    Attributes:
+        decoder: segment decoder.
+        denoising: noised segments in training (`models.lane_denoising`); None as in the paper.
+        last_step: "twice": outside training, the last layer's change of the centerline is applied to its own result
+            once more. The published code does so by mistake, and its weights reach their published numbers with it.
+        center: the centerline that is learned, see `datasets.segment_targets`.
+        encoder, range, priors: see `HostConfig`. LaneSegNet predicts no traffic elements.
+    """
+
+    decoder: SegmentDecoderConfig = SegmentDecoderConfig()
+    denoising: DenoisingConfig | None = None
+    last_step: Literal["once", "twice"] = "once"
+    center: Center = "mean"
+
+    truth: ClassVar[tuple[str, ...]] = ("segments", "areas")
+    predicts: ClassVar[tuple[str, ...]] = ("segments",)
+
+    @property
+    def query_dim(self) -> int:
+        """Channels of a query."""
+        return self.decoder.dim
+
+    @property
+    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
+        """Those of the lane decoder, and those of every host."""
+        return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
+
+    def build(self) -> LaneSegNet:
+        """Return the Linen module; raises UserError where its parts do not fit together."""
+        if self.elements is not None:
+            raise UserError("LaneSegNet predicts no traffic elements: set task.model.elements to None")
+        self.decoder.check()
+        return LaneSegNet(self)
+
+
+def paper_config() -> LaneSegNetConfig:
+    """Return the published sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 queries of 10 points."""
+    return LaneSegNetConfig(encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_SEGMENT_DECODER)
+
+
+class LaneSegNet(Host):
+    """From one example to the predictions of every decoder layer."""
+
+    config: LaneSegNetConfig
+
+    @nn.nowrap
+    def init(self, *args: Any, **kwargs: Any) -> Any:
+        """Return initial variables, as Linen does; the heads of all layers start as copies of the first layer's."""
+        variables = super().init(*args, **kwargs)
+        params = dict(variables["params"])
+        copies = {f"heads_{i}": params["heads_0"] for i in range(self.config.decoder.layers) if "heads_0" in params}
+        return {**variables, "params": params | copies}
+
+    def decode_example(self, example, bev, elements, tokens, *, deterministic):
+        lanes = None
+        if self.is_mutable_collection(AUXILIARY) and example.segments is not None:
+            lanes = target_lanes(ordered_targets(example.segments, example.areas, self.config.center))
+        return self.decode(bev, tokens, lanes, deterministic=deterministic)
+
+    @nn.compact
+    def decode(
+        self,
+        bev: Float[Array, "h w e"],
+        tokens: ByPrior | None = None,
+        lanes: LaneGraph | None = None,
+        *,
+        deterministic: bool = True,
+    ) -> Prediction:
+        """Return segments of every decoder layer and the topology of the last, from BEV features and prior tokens.
+
+        Masks are predicted in training only. Sows the queries of every layer as `layer_queries` if the collection
+        `intermediates` is mutable.
+
+        Args:
+            bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
+            tokens: of the priors, by name.
+            lanes: ground truth of denoising and proposals; not used otherwise.
+            deterministic: no dropout, and the form of the evaluation.
+        """
+        return decode_lanes(self, self.config.decoder, bev, None, tokens or {}, lanes, deterministic)
+
+    def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
+        """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
+        config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
+        training = not deterministic
+        # Both boundaries start at the centerline.
+        around = regions(reference, reference, config)
+        outputs = []
+        for i in range(config.layers):
+            placed = lane_position(config, i, position, reference)
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed))
+            layer = LaneDecoderLayer(config, "star", name=f"layer_{i}")
+            queries = layer(queries, placed, around, bev, None, deterministic=deterministic)
+            self.sow("intermediates", "layer_queries", queries)
+            heads = SegmentHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
+            output = heads(queries, reference, bev, masks=training or self.is_initializing())
+            reference = lax.stop_gradient(output.unit)
+            if i == config.layers - 1 and not training and self.config.last_step == "twice":
+                output = heads(queries, reference, bev)
+            outputs.append(output)
+            boundaries = [spec.bev_range.normalise(line) for line in (output.left, output.right)]
+            around = lax.stop_gradient(regions(*boundaries, config))
+        successor = RelationshipHead(config.relation, name="successor")(queries, queries)
+        return make_prediction(outputs, successor)
+
+
+def make_prediction(outputs: list[SegmentOutput], successor: Float[Array, "q q"]) -> Prediction:
+    """Return segments with a leading axis over decoder layers; that of the topology has length 1, for the last."""
+    with_masks = all(output.mask is not None for output in outputs)
+    each = [output if with_masks else output._replace(mask=None) for output in outputs]
+    layers: SegmentOutput = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    return Prediction(
+        segments=SegmentPrediction(
+            points=layers.points,
+            left=layers.left,
+            right=layers.right,
+            logits=layers.logits,
+            left_type_logits=layers.left_type,
+            right_type_logits=layers.right_type,
+            mask_logits=layers.mask,
+            successor_logits=successor[None],
+        )
+    )

@@ -1,17 +1,22 @@
 """Pictures of a comparison: which frames and lanes they show, and what they say about them."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.fakes import FakeConfig, FakeDataset
+from tests.fakes import FakeConfig, FakeDataset, fake_views
 from tests.models.cases import WITH_TRAFFIC
 from tflane_jax.datasets.loading import stream
-from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.procedural import ProceduralConfig, WorldData
 from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.scene import CenterlinePrediction, Prediction
+from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.models.host import HostConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.scene import CenterlinePrediction, Prediction, SegmentPrediction
 from tflane_jax.tasks import Model
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -131,3 +136,96 @@ def test_a_single_model_is_drawn_on_the_frames_with_the_most_occluded_lanes(monk
     assert [title.rsplit(" at ")[0] for title in names["titles"]] == ["scene 0", "scene 0", "scene 1"]
     expected = [FakeDataset(FakeConfig(3)).example(i).lanes.points for i in (1, 0, 2)]
     np.testing.assert_array_equal(examples.lanes.points, expected)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentHost(TopoNetConfig):
+    """Stands for a host of segments; `KnowingSegments` predicts in its place."""
+
+    truth: ClassVar[tuple[str, ...]] = ("segments", "areas")
+    predicts: ClassVar[tuple[str, ...]] = ("segments",)
+
+
+@dataclass(frozen=True)
+class KnowingSegments(Knowing):
+    """As `Knowing`, of segments."""
+
+    model: HostConfig = SegmentHost()
+
+    def predict(self, params, example):
+        found = super().predict(params, example).centerlines
+        assert found is not None
+        side = jnp.array([[[0.0, 1.8, 0.0]]])
+        logits = jnp.concatenate([found.logits, jnp.full_like(found.logits, -9.0)], -1)
+        return Prediction(segments=SegmentPrediction(found.points, found.points + side, found.points - side, logits))
+
+
+class SegmentData(FakeDataset):
+    """Its segments are its lanes, with boundaries."""
+
+    def example(self, index):
+        example, side = super().example(index), np.array([0.0, 1.8, 0.0], np.float32)
+        lanes = example.lanes
+        segments = lanes.replace(left=lanes.points + side, right=lanes.points - side)
+        return example.replace(segments=segments, cameras=fake_views(index))
+
+
+@pytest.fixture
+def of_segments(monkeypatch):
+    monkeypatch.setattr(
+        "tflane_jax.datasets.sources.open_dataset", lambda *_, **__: SegmentData(FakeConfig(size=SIZE, seed=3))
+    )
+    return ProceduralConfig()
+
+
+def test_differences_of_segments_are_those_of_centerlines(drawn, of_segments, monkeypatch):
+    models = {name: model(*args, task=KnowingSegments()) for name, args in (("one", (1, 5)), ("two", (-1, 9)))}
+    lanes = drawn({name: model(*args) for name, args in (("one", (1, 5)), ("two", (-1, 9)))})
+    segments = drawn_with(of_segments, models, monkeypatch)
+    assert segments[3]["title"] == lanes[3]["title"]
+    np.testing.assert_array_equal(segments[2], lanes[2])
+    for name in models:
+        np.testing.assert_array_equal(segments[1][name].found, lanes[1][name].found)
+        assert isinstance(segments[1][name].lanes, SegmentPrediction)
+
+
+def drawn_with(source, models, monkeypatch):
+    calls = []
+    monkeypatch.setattr("tflane_jax.plots.save_differences", lambda *args, **names: calls.append((args, names)))
+    task = next(iter(models.values())).task
+    task.draw_comparison(models, source, task.load(source), "a.png")
+    ((_, examples, findings, outlined), words) = calls.pop()
+    return examples, findings, outlined, words
+
+
+def test_hosts_of_different_lanes_are_not_compared(of_segments, monkeypatch):
+    models = {"one": model(1, 5), "two": model(-1, 9, task=KnowingSegments())}
+    with pytest.raises(UserError, match="lanes of different kinds"):
+        drawn_with(of_segments, models, monkeypatch)
+
+
+def test_training_and_comparing_segments_leave_pictures(of_segments, tmp_path):
+    pytest.importorskip("matplotlib")
+    task = KnowingSegments()
+    knows = model(1, -500, task=task)
+    draw = task.drawing(WorldData(), EvaluationConfig(pictures=2))
+    draw(tmp_path, 3, knows.params)
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
+        "step_00000003.png",
+        "step_00000003_cameras.png",
+    ]
+    data = task.load(of_segments)
+    assert task.draw_comparison({"alone": knows}, of_segments, data, tmp_path / "a.png").is_file()
+    other = model(-1, -500, task=task)
+    assert task.draw_comparison({"a": knows, "b": other}, of_segments, data, tmp_path / "b.png").is_file()
+
+
+def test_the_numbers_of_a_host_of_segments_have_the_announced_names(of_segments):
+    task, config = KnowingSegments(), EvaluationConfig()
+    found = task.evaluate(model(1, -500, task=task).params, task.load(of_segments), config)
+    announced = task.score_names(WorldData(), config)
+    assert {name for name in found.scores() if "@" not in name} <= announced
+    assert found.scores()["all/AP_ls"] == 1.0
+    assert {"all/mAP", "hidden+traffic/recall", "occluded/AP_ls", "all/AE_dist"} <= announced
+    assert set(task.compared) & found.scores().keys() >= {"all/mAP", "all/AE_dist", "occluded/TOP_lsls"}
+    assert set(task.errors) <= set(task.compared)

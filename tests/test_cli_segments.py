@@ -1,0 +1,36 @@
+"""`tflane predict` for a model of lane segments."""
+
+import json
+from argparse import Namespace
+
+import numpy as np
+import pytest
+
+from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_segments
+from tflane_jax.commands import predict_lanes
+from tflane_jax.config import RunConfig
+from tflane_jax.runs import Run
+from tflane_jax.scene import Prediction, stack_examples
+
+pytest.importorskip("matplotlib")
+
+
+def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch):
+    dataset, segments, out = FakeDataset(FakeConfig(2)), fake_segments(), tmp_path / "predictions"
+    source = RunConfig().data.source("val")
+    answer = stack_examples([dataset.example(0)]), Prediction(segments=stack_examples([segments]))
+    monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
+    monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: dataset)
+    monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
+    options = Namespace(count=1, out=out, threshold=0.5, max_instances=None)
+    assert predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options) == 0
+
+    arrays, truth = np.load(out / "predictions.npz"), np.load(out / "truth.npz")
+    assert arrays["category"].tolist() == [[0, 0, 1, 0, 0, 0]]
+    assert (arrays["left_type"][0, :2].tolist(), arrays["right_type"][0, :2].tolist()) == ([1, 2], [0, 1])
+    np.testing.assert_array_equal(arrays["left"][0], segments.left)
+    assert truth["left"].shape == (1, 3, POINTS, 3)  # the segments of the example, not its centerlines
+    lanes = json.loads((out / "predictions.json").read_text())["frames"][0]["lanes"]
+    assert [lane["category"] for lane in lanes] == [0, 0, 1]
+    np.testing.assert_array_equal(np.float32(lanes[0]["right"]), segments.right[lanes[0]["query"]])
+    assert (out / "pictures.png").is_file()

@@ -51,6 +51,13 @@ def test_shipped_configurations_have_not_changed_silently(name, reference, monke
         pytest.fail(f"{name} has changed ({change}); if that is meant: python -m tests.test_config")
 
 
+@pytest.mark.parametrize("reference", [reference for reference in shipped().values() if reference])
+def test_checkpoints_are_rated_by_a_score_that_the_evaluation_computes(reference, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    config = load_config(reference)
+    assert config.training.best_metric in config.task.score_names(config.data, config.evaluation)
+
+
 def test_every_golden_text_has_its_configuration():
     assert {path.stem for path in GOLDEN.glob("*.txt")} == set(shipped())
 

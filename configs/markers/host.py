@@ -57,5 +57,7 @@ def ablations() -> dict[str, RunConfig]:
     sides = WorldData(1000, 15, 100, WORLD, replace(EXAMPLE, crossings="sides"))
     return {
         "bevformer_detr": replace(config, task=LaneGraphTask(model, losses)),
-        "lanesegnet": replace(config, task=lanesegnet, data=sides),
+        "lanesegnet": replace(
+            config, task=lanesegnet, data=sides, training=replace(config.training, best_metric="all/mAP")
+        ),
     }

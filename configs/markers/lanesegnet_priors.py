@@ -35,9 +35,10 @@ def _tuned(row: RunConfig) -> RunConfig:
     assert isinstance(host.task, LaneGraphTask)
     assert isinstance(host.task.model, LaneSegNetConfig)
     model = replace(host.task.model, denoising=None, priors=row.task.model.priors)
+    start = str(row.training.init_from).replace("/host/", "/lanesegnet/")
     return replace(
         row,
         task=replace(row.task, model=model, losses=host.task.losses),
         data=host.data,
-        training=replace(row.training, init_from=str(row.training.init_from).replace("/host/", "/lanesegnet/")),
+        training=replace(row.training, init_from=start, best_metric=host.training.best_metric),
     )

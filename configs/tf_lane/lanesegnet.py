@@ -57,4 +57,5 @@ def _segments(file: str) -> RunConfig:
     assert isinstance(config.data, WorldData)
     model = LaneSegNetConfig(encoder=host.encoder, range=host.range, decoder=DECODER, denoising=host.denoising)
     data = replace(config.data, example=replace(config.data.example, crossings="sides"))
-    return replace(config, task=replace(config.task, model=model, losses=LOSSES), data=data)
+    training = replace(config.training, best_metric="all/mAP")
+    return replace(config, task=replace(config.task, model=model, losses=LOSSES), data=data, training=training)

@@ -40,4 +40,4 @@ def _segments(toponet: RunConfig, model: LaneSegNetConfig) -> RunConfig:
     task = LaneGraphTask(model, LaneSegNetLossConfig(raster="published"), empty_frames="skip")
     example = replace(toponet.data.example, crossings="sides")
     data = replace(toponet.data, flavour="lane_segment", example=example, augmentation=LANESEGNET_PHOTOMETRIC)
-    return replace(toponet, task=task, data=data)
+    return replace(toponet, task=task, data=data, training=replace(toponet.training, best_metric="all/mAP"))

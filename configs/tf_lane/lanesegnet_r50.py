@@ -39,5 +39,11 @@ def _segments(toponet: RunConfig, model: LaneSegNetConfig) -> RunConfig:
     model = replace(model, encoder=toponet.task.model.encoder)
     task = LaneGraphTask(model, LaneSegNetLossConfig(raster="published"), empty_frames="skip")
     example = replace(toponet.data.example, crossings="sides")
-    data = replace(toponet.data, flavour="lane_segment", example=example, augmentation=LANESEGNET_PHOTOMETRIC)
+    data = replace(
+        toponet.data,
+        flavour="lane_segment",
+        example=example,
+        augmentation=LANESEGNET_PHOTOMETRIC,
+        map_changes="drop",
+    )
     return replace(toponet, task=task, data=data, training=replace(toponet.training, best_metric="all/mAP"))

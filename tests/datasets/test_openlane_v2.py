@@ -19,7 +19,7 @@ from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.openlane_export import export_openlane_v2
-from tflane_jax.datasets.openlane_frames import list_frames
+from tflane_jax.datasets.openlane_frames import MAP_CHANGES, list_frames
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
@@ -143,6 +143,22 @@ def test_crossings_may_be_two_sides(folder):
         ends = [0, -1] if form == "ring" else [0, 9, 10, 19]
         np.testing.assert_allclose(example.areas.points[1, ends], [outline[i] for i in corners], atol=1e-6)
         np.testing.assert_allclose(example.areas.points[0, [0, -1]], [[5, -3, 0], [5, 3, 0]], atol=1e-6)
+
+
+def test_logs_whose_map_has_changed_may_be_left_out(folder):
+    data = OpenLaneV2Data(folder, val="train", subset="B")
+    before = len(OpenLaneV2Dataset(data.source("train")))
+
+    def frames(split):
+        return len(OpenLaneV2Dataset(replace(data, map_changes="drop").source(split)))
+
+    assert frames("train") == before
+    for path in (folder / "train").rglob("info/*.json"):
+        change(path, lambda record: record["meta_data"].update(source_id=min(MAP_CHANGES)))
+    assert (frames("train"), frames("val")) == (0, before)
+    change(info(folder), lambda record: record.pop("meta_data"))
+    with pytest.raises(UserError, match="meta_data"):
+        frames("train")
 
 
 def test_items_beyond_capacity_are_left_out_with_their_edges(whole):

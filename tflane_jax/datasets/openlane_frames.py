@@ -10,7 +10,7 @@ Format: https://github.com/OpenDriveLab/OpenLane-V2/blob/master/data/README.md
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -165,6 +165,31 @@ def _time(key: FrameKey, root: Path) -> int:
     if not key.timestamp.isdecimal():
         raise UserError(f"{root}: frame {key} has no whole number as its timestamp: leave the file out")
     return int(key.timestamp)
+
+
+MAP_CHANGES = frozenset(
+    (
+        "75e8adad-50a6-3245-8726-5e612db3d165",
+        "54bc6dbc-ebfb-3fba-b5b3-57f88b4b79ca",
+        "af170aac-8465-3d7b-82c5-64147e94af7d",
+        "6e106cf8-f6dd-38f6-89c8-9be7a71e7275",
+    )
+)
+"""Logs of subset A whose streets differ from their map; LaneSegNet does not train on them."""
+
+
+def without_map_changes(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> list[FrameKey]:
+    """Return the frames that belong to none of the logs of `MAP_CHANGES`; reads one file of each segment.
+
+    Raises UserError for a file that is missing or does not name its log.
+    """
+    changed: dict[tuple[str, str], bool] = {}
+    for key in keys:
+        if (key.split, key.segment) not in changed:
+            path = info_path(root, key, suffix)
+            log = member(member(load_json(path), "meta_data", str(path)), "source_id", f"{path}: meta_data")
+            changed[key.split, key.segment] = log in MAP_CHANGES
+    return [key for key in keys if not changed[key.split, key.segment]]
 
 
 def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") -> FrameFile:

@@ -30,6 +30,7 @@ from tflane_jax.datasets.openlane_frames import (
     list_frames,
     read_frame,
     subset_of,
+    without_map_changes,
 )
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
@@ -61,6 +62,7 @@ class OpenLaneV2Config:
             pixels of the files).
         example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
         loading: workers; they change no example.
+        map_changes: "drop" leaves out the logs whose streets differ from their map, see `openlane_frames.MAP_CHANGES`.
     """
 
     root: Path
@@ -71,6 +73,7 @@ class OpenLaneV2Config:
     image: ImageConfig | None = TOPONET_SUBSET_A
     example: ExampleConfig = OPENLANE_V2_SIZES
     loading: StreamingConfig = StreamingConfig()
+    map_changes: Literal["keep", "drop"] = "keep"
 
 
 class OpenLaneV2Dataset:
@@ -92,6 +95,8 @@ class OpenLaneV2Dataset:
                 ".json, ...): unpack them, name a split file of those at hand (data_dict), or take what is there "
                 '(data_dict="folders")'
             )
+        if config.map_changes == "drop":
+            self.keys = without_map_changes(self.root, self.keys, self._suffixes[0])
         self._poses: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
@@ -236,6 +241,8 @@ class OpenLaneV2Data:
         train, val, test: which official split serves as each; the official test split has no annotations.
         subset, flavour, data_dict, image, example, loading: see `OpenLaneV2Config`.
         augmentation: of the colours of training images, or None.
+        map_changes: whether the training split keeps or drops logs whose streets differ from their map, as
+            `OpenLaneV2Config.map_changes`.
     """
 
     root: Path
@@ -249,6 +256,7 @@ class OpenLaneV2Data:
     example: ExampleConfig = OPENLANE_V2_SIZES
     augmentation: PhotometricConfig | None = PhotometricConfig()
     loading: StreamingConfig = StreamingConfig()
+    map_changes: Literal["keep", "drop"] = "keep"
 
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""
@@ -261,6 +269,7 @@ class OpenLaneV2Data:
             self.image,
             self.example,
             self.loading,
+            self.map_changes if split == "train" else "keep",
         )
 
 

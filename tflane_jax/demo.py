@@ -26,7 +26,7 @@ EXPERIMENT = """\
 tflane compare baseline=tf_lane/toponet:street +TFM=tf_lane/toponet_tfm:street \\
     +TFM+BEV=tf_lane/toponet_tfm:street_bev matched=tf_lane/toponet_tfm:street_control \\
     --treatment +TFM --primary hidden+traffic/recall --negative-control hidden-traffic/recall --alpha 0.01 \\
-    --seeds 0 1 2 3 4 5 6 7 --training.steps 4000 --jobs 2 --out runs/street"""
+    --seeds 0 1 2 3 4 5 6 7 --training.steps 2500 --jobs 2 --out runs/street"""
 _INTRODUCTION = """\
 Lanes around a vehicle on the built-in world, preset `street`, learned twice:
   baseline  from what the sensor shows (BEV evidence)

@@ -4,7 +4,7 @@
     tflane train --config tf_lane/toponet_tfm:street
 
 Same data, optimiser and host as `toponet.py`: the preset `city`, and for all ablations `street`. The paper runs its
-ablations on LaneSegNet; here they run on TopoNet.
+ablations on LaneSegNet (`lanesegnet_tfm.py`); here they run on TopoNet.
 """
 
 import dataclasses

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from jax import lax
 
-from tests.models.cases import BASELINE, CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
+from tests.models.cases import (
+    BASELINE,
+    CAMERA,
+    CAMERA_DETR,
+    CAMERA_TOPONET,
+    SEGMENTS,
+    make_camera_example,
+    make_example,
+)
 from tests.models.toy_prior import CrossingsConfig, with_crossings
 from tests.parameters import random_params
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
@@ -39,6 +47,8 @@ HOSTS = {
     ),
     "camera toponet": (CAMERA_TOPONET, make_camera_example),
     "camera detr": (CAMERA_DETR, make_camera_example),
+    "lanesegnet": (SEGMENTS, make_example),
+    "camera lanesegnet": (replace(SEGMENTS, encoder=CAMERA), make_camera_example),
 }
 
 
@@ -61,7 +71,7 @@ def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     one, two = (predict(params, with_crossings(example, count)) for count in (1, 2))
     same(one, predict(params, with_crossings(example, 1, filler=np.nan)))
     for a, b in ((absent, one), (one, two)):
-        assert not np.array_equal(a.centerlines.points, b.centerlines.points)
+        assert not np.array_equal(jax.tree.leaves(a)[0], jax.tree.leaves(b)[0])  # points
 
     # Without crossings, the host computes what it computes without the prior.
     plain = LaneGraphTask(replace(host, priors=PriorsConfig(traffic_flow=FLOW)))

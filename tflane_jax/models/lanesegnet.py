@@ -95,9 +95,10 @@ class LaneSegNet(Host):
         return {**variables, "params": params | copies}
 
     def decode_example(self, example, bev, elements, tokens, *, deterministic):
-        lanes = None
-        if self.is_mutable_collection(AUXILIARY) and example.segments is not None:
-            lanes = target_lanes(ordered_targets(example.segments, example.areas, self.config.center))
+        config, lanes = self.config, None
+        taught = lane_auxiliary(config.decoder, config.denoising) and self.is_mutable_collection(AUXILIARY)
+        if taught and example.segments is not None:
+            lanes = target_lanes(ordered_targets(example.segments, example.areas, config.center))
         return self.decode(bev, tokens, lanes, deterministic=deterministic)
 
     @nn.compact

@@ -73,4 +73,4 @@ def test_the_example_of_the_readme_runs(tmp_path, monkeypatch):
     (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
     names: dict = {}
     exec(compile(code, "README.md", "exec"), names)
-    assert names["lanes"].points.shape == (40, 11, 3)
+    assert names["lanes"].points.shape == (48, 11, 3)

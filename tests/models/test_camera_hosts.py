@@ -102,6 +102,7 @@ def test_padding_content_changes_no_output(fitted):
     same(fitted.predict(make_camera_example(2)), fitted.predict(soiled(make_camera_example(2))))
 
 
+@pytest.mark.slow
 def test_padding_content_changes_no_gradient(toponet):
     key, clean, dirty = jax.random.key(0), make_camera_example(2), soiled(make_camera_example(2))
     results = [toponet.train(toponet.params, batch_of(e, make_camera_example(3)), key) for e in (clean, dirty)]

@@ -96,6 +96,7 @@ def test_without_markers_in_sight_the_host_is_unchanged(params, step):
     assert not np.array_equal(guided.centerlines.points, expected.centerlines.points)
 
 
+@pytest.mark.slow
 def test_cameras_may_have_markers_too():
     model = replace(CAMERA_TOPONET, decoder=replace(CAMERA_TOPONET.decoder, dropout=0.0))
     plain, host = LaneGraphTask(model), LaneGraphTask(replace(model, priors=replace(model.priors, markers=CONFIG)))

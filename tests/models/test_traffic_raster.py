@@ -39,7 +39,11 @@ def restricted(params, shapes):
     return {k: restricted(params[k], v) if isinstance(v, dict) else params[k] for k, v in shapes.items()}
 
 
-@pytest.mark.parametrize(("host", "make"), [(BASELINE, make_example), (CAMERA_TOPONET, make_camera_example)])
+@pytest.mark.parametrize(
+    ("host", "make"),
+    [(BASELINE, make_example), pytest.param(CAMERA_TOPONET, make_camera_example, marks=pytest.mark.slow)],
+    ids=["evidence", "cameras"],
+)
 def test_absent_traffic_gives_the_host_without_the_prior(host, make):
     task, example = LaneGraphTask(with_flow(host, INTO_BEV)), make(0)
     params = random_params(task.init, example, spread=0.2)

@@ -30,7 +30,7 @@ lint: $(STAMP)
 	@if $(BIN)/pyright --version >/dev/null 2>&1; then $(BIN)/pyright; else echo "pyright skipped: it needs Node.js"; fi
 
 test: lint
-	$(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --durations=15
+	$(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations=15
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow --durations=15

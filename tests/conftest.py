@@ -28,3 +28,8 @@ jax.config.update("jax_compilation_cache_dir", _programs)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 # Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.
 gc.set_threshold(100_000, 50, 100)
+
+
+def pytest_collection_modifyitems(items):
+    """Run whole commands and notebooks first: few tests, but long ones, with which no worker should end alone."""
+    items.sort(key=lambda item: len(item.path.parts))

@@ -18,6 +18,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import Prediction, stack_examples
@@ -40,6 +41,17 @@ def test_a_raster_of_another_range_is_named():
         LaneGraphTask(TopoNetConfig()).check(data, EXAMPLES)
     model = TopoNetConfig(encoder=replace(TopoNetConfig().encoder, range=WIDE))
     LaneGraphTask(model).check(data, EXAMPLES)
+
+
+@pytest.mark.parametrize(
+    ("model", "setting"),
+    [(TopoNetConfig(), "lane_points"), (LaneSegNetConfig(), "segment_points"), (LaneSegNetConfig(), "area_points")],
+)
+def test_truth_of_other_points_is_named(model, setting):
+    task = LaneGraphTask(model)
+    task.check(WorldData(), EXAMPLES)
+    with pytest.raises(UserError, match=rf"data\.example\.{setting}=\d+, .*not 7"):
+        task.check(WorldData(example=ExampleConfig(**{setting: 7})), EXAMPLES)
 
 
 def test_truth_beyond_the_bev_features_is_named():

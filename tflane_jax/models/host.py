@@ -72,6 +72,11 @@ class HostConfig:
         return ("lane_cells",) if self.encoder.cells else ()
 
     @property
+    def example_points(self) -> dict[str, int]:
+        """Settings of `ExampleConfig` that the truth of this host's loss must have."""
+        return {}
+
+    @property
     def spec(self) -> HostSpec:
         """The properties of the host that priors depend on."""
         return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type)

@@ -68,6 +68,11 @@ class LaneSegNetConfig(HostConfig):
         """Those of the lane decoder, and those of every host."""
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
+    @property
+    def example_points(self) -> dict[str, int]:
+        """Segments are compared point by point; crossings have two sides."""
+        return {"segment_points": self.decoder.points, "area_points": 2 * self.decoder.points}
+
     def build(self) -> LaneSegNet:
         """Return the Linen module; raises UserError where its parts do not fit together."""
         if self.elements is not None:

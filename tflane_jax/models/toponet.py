@@ -59,6 +59,11 @@ class TopoNetConfig(HostConfig):
         """Those of the lane decoder, and those of every host."""
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
+    @property
+    def example_points(self) -> dict[str, int]:
+        """Lanes are compared point by point."""
+        return {"lane_points": self.decoder.points}
+
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""
         check_elements(self.encoder, self.decoder.layers, self.elements)

@@ -221,8 +221,15 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         return shapes_of(keep(sources.sample(data.source("train")), self.parts))
 
     def check(self, data: SplitData, train: Example | Streamed) -> None:
-        """Raise UserError if the ranges of model and data differ, or a camera sees more cells than `capacity`."""
-        self._check_ranges(data.source("train").example)
+        """Raise UserError if ranges or points of model and data differ, or a camera sees more cells than `capacity`."""
+        example = data.source("train").example
+        self._check_ranges(example)
+        for name, points in self.model.example_points.items():
+            if (found := getattr(example, name)) != points:
+                raise UserError(
+                    f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
+                    f"(task.model.decoder.points), not {found}: change either"
+                )
         encoder, cameras = self.model.encoder, first_example(train).cameras
         if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
             check_capacity(encoder.bev, cameras)

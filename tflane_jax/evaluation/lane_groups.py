@@ -16,7 +16,7 @@ over `SAMPLES` points, equally spaced along the lane.
 | `hidden+traffic` | below `HALF` | driven fraction at least `HALF` |
 | `hidden-traffic` | below `HALF` | no vehicle came within `NEARBY` of the lane, in any direction |
 | `visible+traffic`, `visible-traffic` | at least `HALF` | the same |
-| `hidden-neighbours` | below `HALF` | no vehicle came within `BESIDE_IT` of the lane |
+| `hidden-neighbours` | below `HALF` | no vehicle came within `NEXT_LANE` of the lane |
 
 Lanes with some traffic, but along less than half of their length, are in none of the first four groups. Lanes of the
 control may have traffic in the lane beside them, which tells of them too; `hidden-neighbours`, a part of it, has none
@@ -39,7 +39,7 @@ EVIDENCE = 64  # of 255
 TOLERANCE = 1.0  # metres
 BESIDE = 1.5  # metres
 HEADING = np.radians(30.0)
-NEARBY, BESIDE_IT = 2.5, 5.0  # metres; lanes are 3 to 3.75 m wide
+NEARBY, NEXT_LANE = 2.5, 5.0  # metres; lanes are 3 to 3.75 m wide
 HALF = 0.5
 
 
@@ -57,7 +57,7 @@ def lane_groups(
     hidden = shown_fraction(left, right, bev, ground) < HALF
     driven, distance = driven_fraction(center, flow)
     traffic, none = driven >= HALF, distance > NEARBY
-    remote = hidden & (distance > BESIDE_IT)
+    remote = hidden & (distance > NEXT_LANE)
     groups = hidden & traffic, hidden & none, ~hidden & traffic, ~hidden & none, remote
     return dict(zip(LANE_GROUPS, groups, strict=True))
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
+from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
 
 EXAMPLES = "examples"
 
@@ -28,7 +29,7 @@ def like_the_reference(*, mixed_history: bool = True):
     def intercept(run, args, kwargs, context):
         if context.method_name != "__call__":
             return run(*args, **kwargs)
-        if isinstance(context.module, SpatialCrossAttention):
+        if isinstance(context.module, (SpatialCrossAttention, GeometryKernelAttention)):
             return _served_by_the_first(run, args, kwargs, context.module)
         if isinstance(context.module, TemporalSelfAttention) and mixed_history:
             return _mixed_history(run, args, kwargs)

@@ -28,7 +28,7 @@ def test_basis_reaches_every_polyline(points):
 def test_initial_anchors_lie_as_in_scipys_halton_sequence():
     config = BASELINE.decoder
     sample = qmc.Halton(3, scramble=False).random(config.queries + 1)[1:]
-    middle = spread_lanes(config, RANGE, length=0.0)[:, 0, :2]
+    middle = spread_lanes(config.queries, config.points, RANGE, length=0.0)[:, 0, :2]
     np.testing.assert_allclose(middle, np.clip(sample[:, :2], 0.02, 0.98), atol=1e-6)
 
 
@@ -59,7 +59,7 @@ def test_pointwise_refinement_starts_at_zero_and_looks_only_where_the_point_is()
     config = BASELINE.decoder
     rng = np.random.default_rng(0)
     queries = jnp.asarray(rng.normal(size=(config.queries, config.dim)), jnp.float32)
-    reference = jnp.asarray(spread_lanes(config, RANGE))
+    reference = jnp.asarray(spread_lanes(config.queries, config.points, RANGE))
     bev = jnp.asarray(rng.normal(size=(6, 10, 5)), jnp.float32)
     module = PointwiseRefinement(config, RANGE)
     params = jax.jit(module.init)(jax.random.key(0), queries, reference, bev)

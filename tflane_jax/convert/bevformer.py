@@ -24,7 +24,8 @@ IMAGE_ENCODER: tuple[Rule, ...] = (
 _PROJECTIONS = "(sampling_offsets|attention_weights|value_proj|output_proj)"
 TEMPORAL_ATTENTION: tuple[Rule, ...] = ((rf"{_PROJECTIONS}\.(weight|bias)", r"\1/\2", "linear"),)
 SPATIAL_ATTENTION: tuple[Rule, ...] = (
-    (rf"deformable_attention\.{_PROJECTIONS}\.(weight|bias)", r"\1/\2", "linear"),
+    # `attention` is MapTR's geometry-guided kernel.
+    (rf"(?:deformable_)?attention\.{_PROJECTIONS}\.(weight|bias)", r"\1/\2", "linear"),
     (r"output_proj\.(weight|bias)", r"output_proj/\1", "linear"),
 )
 ENCODER: tuple[Rule, ...] = (

@@ -1,7 +1,8 @@
 """Whole detectors: the reference's checkpoints as parameters of our hosts.
 
 All of them call the image encoder `img_backbone` and `img_neck`, the BEV encoder `bev_constructor`, the head of traffic
-elements `bbox_head`, that of lanes `pts_bbox_head`, and topology heads beside it `lclc_head` and `lcte_head`.
+elements `bbox_head`, that of lanes `pts_bbox_head`, and topology heads beside it `lclc_head` and `lcte_head`. MapTR's
+BEV encoder is part of its head.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
+from tflane_jax.convert.maptr import MAPTR_HEAD
 from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, convert
 from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
 from tflane_jax.convert.torch_file import read_state_dict
@@ -25,11 +27,12 @@ from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.parameters import Params
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import CameraViews, Example
 
-PublishedHost = TopoNetConfig | BevFormerDetrConfig | LaneSegNetConfig
+PublishedHost = TopoNetConfig | BevFormerDetrConfig | LaneSegNetConfig | MapTrConfig
 
 
 def _head_rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
@@ -40,6 +43,8 @@ def _head_rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
     if isinstance(model, LaneSegNetConfig):
         segments = below(r"pts_bbox_head\.", "", LANESEGNET_HEAD)
         return "LaneSegNet", (*segments, *below(r"lclc_head\.", "successor", RELATIONSHIP))
+    if isinstance(model, MapTrConfig):
+        return "MapTR", below(r"pts_bbox_head\.", "", MAPTR_HEAD)
     last = f"heads_{model.decoder.layers - 1}"
     return "BEVFormer-DETR", (
         *elements,

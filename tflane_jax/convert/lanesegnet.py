@@ -10,7 +10,7 @@ from tflane_jax.convert.toponet import PLAIN_DECODER
 from tflane_jax.geometry.namespace import AnyArray
 
 
-def _branch(name: str, ours: str, *, norm: bool = False) -> tuple[Rule, ...]:
+def branch(name: str, ours: str, *, norm: bool = False) -> tuple[Rule, ...]:
     """Return the rules of one kind of branch: three linear layers, numbered with the layers between them."""
     step = 3 if norm else 2
     linear = [
@@ -24,12 +24,12 @@ def _branch(name: str, ours: str, *, norm: bool = False) -> tuple[Rule, ...]:
 
 LANESEGNET_HEAD: tuple[Rule, ...] = (
     *PLAIN_DECODER,
-    *_branch("cls_branches", "class", norm=True),
-    *_branch("cls_left_type_branches", "left_type", norm=True),
-    *_branch("cls_right_type_branches", "right_type", norm=True),
-    *_branch("reg_branches", "points"),
-    *_branch("reg_branches_offset", "offset"),
-    *_branch("mask_embed", "mask"),
+    *branch("cls_branches", "class", norm=True),
+    *branch("cls_left_type_branches", "left_type", norm=True),
+    *branch("cls_right_type_branches", "right_type", norm=True),
+    *branch("reg_branches", "points"),
+    *branch("reg_branches_offset", "offset"),
+    *branch("mask_embed", "mask"),
 )
 
 

@@ -6,6 +6,7 @@ differentiable, so that gradients by our names can be compared with gradients by
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +61,8 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
         for path, value in leaves.items():
             is_statistic = path.endswith(("/mean", "/var")) or re.fullmatch(frozen, path) is not None
             put(variables["batch_stats" if is_statistic else "params"], path, value)
-        table.append(row | {"becomes": ", ".join(leaves)})
+        unused = math.prod(tensor.shape) - sum(math.prod(value.shape) for value in leaves.values())
+        table.append(row | {"becomes": ", ".join(leaves) + (f" ({unused} unused numbers left out)" if unused else "")})
     return Converted(variables, table)
 
 
@@ -142,6 +144,8 @@ def _leaves(path: str, tensor: AnyArray, kind: str) -> dict[str, Any]:
         if last == "weight":
             return {f"{parent}/{part}/kernel": value.T for part, value in parts.items()}
         return {f"{parent}/{part}/bias": value for part, value in parts.items()}
+    if kind == "first_row":
+        return {path: tensor[:1]}
     if kind == "pair":  # a linear layer on [a | b] as one layer for each, the bias with the first
         half = tensor.shape[-1] // 2
         if last == "bias":

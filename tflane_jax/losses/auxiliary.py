@@ -16,20 +16,20 @@ from tflane_jax.losses.lane_cells import lane_cell_loss
 from tflane_jax.losses.lane_proposals import lane_proposal_sums
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryName, AuxiliaryOutputs
-from tflane_jax.scene import CenterlinePrediction, LaneGraph, SegmentPrediction
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, LinePrediction, SegmentPrediction
 
-T = TypeVar("T", CenterlinePrediction, SegmentPrediction)
+T = TypeVar("T", CenterlinePrediction, SegmentPrediction, LinePrediction)
 
 
 def auxiliary_losses(
     outputs: AuxiliaryOutputs,
     names: Sequence[AuxiliaryName],
-    lanes: LaneGraph,
+    lanes: Any,
     *,
     bev_range: PerceptionRange,
     cell_weight: float,
     proposal_weights: tuple[float, float],
-    denoising: Callable[[Any, LaneGraph], Terms],
+    denoising: Callable[[Any, Any], Terms],
     cell_lanes: LaneGraph | None = None,
 ) -> tuple[list[Float[Array, ""]], Report]:
     """Return the weighted auxiliary losses of a batch, to be summed in this order, and the numbers to record.
@@ -37,7 +37,7 @@ def auxiliary_losses(
     Args:
         outputs: auxiliary outputs, leading axis batch.
         names: the auxiliary outputs that the host declares.
-        lanes: ground truth, leading axis batch; padding may hold anything.
+        lanes: ground truth, leading axis batch; padding may hold anything. A `LaneGraph`, or what `denoising` takes.
         bev_range: the box that the BEV features cover, metres.
         cell_weight: weight of the loss on BEV cells.
         proposal_weights: weights of the heat map and of the shapes of proposed lanes.
@@ -78,7 +78,7 @@ def denoising_pairs(prediction: T, truth: Any, valid: Bool[Array, "b n"]) -> tup
     Query i belongs to lane i; lanes beyond the number of queries are left out.
 
     Args:
-        prediction: centerlines or segments, leading axes (batch, copy, layer).
+        prediction: centerlines, segments or map lines, leading axes (batch, copy, layer).
         truth: pytree of the ground truth, leading axis batch.
         valid: which lanes exist.
     """

@@ -9,7 +9,7 @@ from flax import struct
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
 
-from tflane_jax.scene import CenterlinePrediction, SegmentPrediction
+from tflane_jax.scene import CenterlinePrediction, LinePrediction, SegmentPrediction
 
 AUXILIARY = "auxiliary"
 """Collection of auxiliary outputs. A model computes them only where a caller makes the collection mutable."""
@@ -38,14 +38,14 @@ class AuxiliaryOutputs:
     """Auxiliary outputs of a model; None where it has none. `HostConfig.auxiliary` lists those of a host.
 
     Attributes:
-        denoised: centerlines or segments of the denoising queries, leading axes (copy, layer); see
+        denoised: centerlines, segments or map lines of the denoising queries, leading axes (copy, layer); see
             `models.lane_denoising`.
         lane_cells: (h, w, `CELL_CHANNELS`) lanes per BEV cell.
         lane_proposals: of the heads that propose lanes, see `models.lane_proposals`.
         line_cells: (h, w) logit per cell of the image features: does a lane line pass through it?
     """
 
-    denoised: CenterlinePrediction | SegmentPrediction | None = None
+    denoised: CenterlinePrediction | SegmentPrediction | LinePrediction | None = None
     lane_cells: Float[Array, "*b h w c"] | None = None
     lane_proposals: LaneProposalOutputs | None = None
     line_cells: Float[Array, "*b h w"] | None = None

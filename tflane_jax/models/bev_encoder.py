@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
+from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
 from tflane_jax.models.prior import BevHook
 
 
@@ -44,6 +45,9 @@ class BevFormerConfig:
         temporal_points: sampling points per head and frame.
         spatial_points: sampling points per head and level, a multiple of `anchors`.
         anchors: points per pillar, at different heights.
+        attention: to the cameras. "deformable": BEVFormer's; "kernel": the geometry-guided kernel of MapTR, with a head
+            for each anchor and one feature level. It does not use `spatial_points`.
+        kernel: rows and columns of the kernel.
         levels: feature levels of an image.
         cameras: largest number of cameras; each has its own embedding.
         capacity: largest number of queries that one camera serves, None for all (see `layers.bev_attention`);
@@ -75,6 +79,8 @@ class BevFormerConfig:
     value_projections: int = 1
     remat: bool = False
     precision: Literal["float32", "bfloat16"] = "float32"
+    attention: Literal["deformable", "kernel"] = "deformable"
+    kernel: tuple[int, int] = (3, 5)
 
     @property
     def dtype(self) -> Any:
@@ -203,9 +209,14 @@ class BevEncoderLayer(nn.Module):
             name="temporal_attention",
         )
         queries = add(queries, temporal(queries + position, *frames, (grid.rows, grid.columns), cells), "temporal")
-        spatial = SpatialCrossAttention(
-            config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
-        )
+        if config.attention == "kernel":
+            spatial = GeometryKernelAttention(
+                config.dim, config.anchors, config.kernel, config.capacity, config.dtype, name="spatial_attention"
+            )
+        else:
+            spatial = SpatialCrossAttention(
+                config.dim, config.heads, config.spatial_points, config.capacity, config.dtype, name="spatial_attention"
+            )
         queries = add(queries, spatial(queries, tokens, shapes, reference, visible), "spatial")
         # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
         queries = lax.optimization_barrier(queries)

@@ -1,6 +1,7 @@
 """Lane decoder of TopoNet and BEVFormer-DETR: lane queries attend to BEV features; heads predict centerlines.
 
-LaneSegNet shares the decoder layer and the refinement of centerlines; its heads are in `models.lane_segments`.
+LaneSegNet shares the decoder layer and the refinement of centerlines; its heads are in `models.lane_segments`. MapTR
+shares the decoder layer (`models.map_lines`).
 
 In TopoNet, queries also pass messages along the predicted topology (docs/reference/toponet.md).
 
@@ -12,7 +13,7 @@ Small models need "iterative" to converge.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
@@ -33,16 +34,33 @@ from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.scene import CenterlinePrediction, ElementPrediction, Prediction
 
 
+class LayerSizes(Protocol):
+    """Sizes of `LaneDecoderLayer`, see `LaneDecoderConfig`."""
+
+    @property
+    def dim(self) -> int: ...
+    @property
+    def heads(self) -> int: ...
+    @property
+    def sampling_points(self) -> int: ...
+    @property
+    def hidden(self) -> int: ...
+    @property
+    def dropout(self) -> float: ...
+
+
 class LaneDecoderLayer(nn.Module):
     """Self-attention, deformable attention to the BEV features, feed-forward or scene graph; post-norm.
 
     Attributes:
         config: sizes.
         initial: initial sampling offsets, see `DeformableAttention`.
+        edge_weight: of the scene graph, see `LaneDecoderConfig`.
     """
 
-    config: LaneDecoderConfig
+    config: LayerSizes
     initial: Literal["compass", "star"] = "compass"
+    edge_weight: float = 0.6
 
     @nn.compact
     def __call__(
@@ -85,7 +103,7 @@ class LaneDecoderLayer(nn.Module):
         if adjacency is None:
             block = FeedForward(TransformerConfig(config.heads, config.hidden, config.dropout), name="feed_forward")
             return add("feed_forward", queries, block(queries, deterministic=deterministic))
-        graph = SceneGraphFeedForward(config.dim, config.hidden, config.edge_weight, config.dropout, name="scene_graph")
+        graph = SceneGraphFeedForward(config.dim, config.hidden, self.edge_weight, config.dropout, name="scene_graph")
         queries = graph(queries, adjacency, elements, deterministic=deterministic)
         return nn.LayerNorm(epsilon=1e-5, name="scene_graph_norm")(queries)
 
@@ -222,11 +240,12 @@ def refined_points(
 
 
 def clipped(
-    unit: Float[Array, "q p 3"], range_: PerceptionRange, limits: PerceptionRange | None
-) -> Float[Array, "q p 3"]:
-    """Return points in [0, 1] of `range_` clipped to the limits by `clip_with_return`."""
+    unit: Float[Array, "q p d"], range_: PerceptionRange, limits: PerceptionRange | None
+) -> Float[Array, "q p d"]:
+    """Return points (d = 2 or 3) in [0, 1] of `range_` clipped to the limits by `clip_with_return`."""
     box = limits or range_
-    corners = range_.normalise(jnp.array([[axis[end] for axis in (box.x, box.y, box.z)] for end in (0, 1)]))
+    axes = (box.x, box.y, box.z)[: unit.shape[-1]]
+    corners = range_.normalise(jnp.array([[axis[end] for axis in axes] for end in (0, 1)]))
     low, high = (jnp.broadcast_to(corners[i], unit.shape[1:]) for i in (0, 1))
     return jax.vmap(clip_with_return, in_axes=(0, None, None))(unit, low, high)
 

@@ -21,7 +21,7 @@ from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.lane_proposals import LaneProposals
 from tflane_jax.models.lane_queries import LaneDecoderConfig, LaneQueries
-from tflane_jax.scene import LaneGraph, Prediction
+from tflane_jax.scene import LaneGraph, MapLines, Prediction
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,17 @@ def decode_lanes(
     if noise is None or lanes is None or not host.is_mutable_collection(AUXILIARY):
         return host.decode_queries(start, bev, elements, tokens, deterministic)
     noised = NoisedQueries(config, noise, range_, name="noised")(lanes)
+    return decode_groups(host, start, noised, bev, elements, tokens, deterministic)
+
+
+def decode_groups(host: Any, start: Any, noised: Any, *arguments: Any) -> Prediction:
+    """Return the predictions of the queries `start`, and sow those of `noised`, with a leading axis over copies.
+
+    Args:
+        host: as of `decode_lanes`.
+        start, noised: first argument of `decode_queries`.
+        arguments: the others; the same for all groups.
+    """
     starts = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, noised)
     decode = nn.vmap(
         type(host).decode_queries,
@@ -116,14 +127,14 @@ def decode_lanes(
         variable_axes={"params": None, "intermediates": 0},
         split_rngs={"params": False, "dropout": True},
     )
-    every = decode(host, starts, bev, elements, tokens, deterministic)
-    found = every.centerlines if every.segments is None else every.segments
+    every = decode(host, starts, *arguments)
+    found = next(part for part in (every.segments, every.lines, every.centerlines) if part is not None)
     host.sow(AUXILIARY, "denoised", jax.tree.map(lambda leaf: leaf[1:], found))
     return jax.tree.map(lambda leaf: leaf[0], every)
 
 
 def noised_lanes(
-    key: jax.Array, lanes: LaneGraph, count: int, range_: PerceptionRange, noise: DenoisingConfig
+    key: jax.Array, lanes: LaneGraph | MapLines, count: int, range_: PerceptionRange, noise: DenoisingConfig
 ) -> Float[Array, "q p 3"]:
     """Return the first `count` lanes noised, metres; in place of padding, random straight lanes in the range."""
     shift, turn, stretch, bend, place, way = jax.random.split(key, 6)

@@ -105,29 +105,27 @@ class LaneQueries(nn.Module):
         embedding = self.param("embedding", nn.initializers.normal(1.0), (config.learned_queries, 2 * config.dim))
         position, content = jnp.split(embedding, 2, -1)
         if config.refine == "iterative":
-            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(spread_lanes(config, self.range))))
+            start = spread_lanes(config.learned_queries, config.points, self.range)
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start)))
             return content, position, nn.sigmoid(anchors)
         spot = nn.sigmoid(nn.Dense(3, kernel_init=nn.initializers.xavier_uniform(), name="reference")(position))
         shape = (config.learned_queries, config.points, 3)
         return content, position, jnp.broadcast_to(spot[:, None], shape)
 
 
-def spread_lanes(
-    config: LaneDecoderConfig, range_: PerceptionRange, length: float = 24.0
-) -> Float[np.ndarray, "q p 3"]:
-    """Return the initial anchors: straight lanes spread evenly over the range, in [0, 1].
+def spread_lanes(count: int, points: int, range_: PerceptionRange, length: float = 24.0) -> Float[np.ndarray, "q p 3"]:
+    """Return the initial anchors: `count` straight lanes spread evenly over the range, in [0, 1].
 
     Centres and headings follow a Halton sequence: 30 percent head along the ego's x axis, 30 percent against it, 40
     percent in any direction. `length` is in metres.
     """
-    count = config.learned_queries
     sample = np.stack([_radical_inverse(np.arange(1, count + 1), base) for base in (2, 3, 5)], -1)
     middle = np.asarray(range_.low(2)) + sample[:, :2] * np.asarray(range_.size(2))
     fraction = sample[:, 2] / 0.6
     heading = np.where(fraction < 1.0, np.pi * (fraction < 0.5), 2 * np.pi * (sample[:, 2] - 0.6) / 0.4)
-    along = np.linspace(-length / 2, length / 2, config.points)
+    along = np.linspace(-length / 2, length / 2, points)
     direction = np.stack([np.cos(heading), np.sin(heading)], -1)
-    lanes = np.zeros((count, config.points, 3), np.float32)
+    lanes = np.zeros((count, points, 3), np.float32)
     lanes[..., :2] = middle[:, None] + along[None, :, None] * direction[:, None]
     # Away from 0 and 1, where the sigmoid of the points is flat.
     return np.clip(range_.normalise(lanes), 0.02, 0.98)

@@ -170,7 +170,7 @@ class Branch(nn.Module):
     bias: float | None = None
 
     @nn.compact
-    def __call__(self, x: Float[Array, "q c"]) -> Float[Array, "q d"]:
+    def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b d"]:
         """Return the last layer's output, without activation."""
         for i, width in enumerate(self.widths):
             limit = 1.0 / math.sqrt(x.shape[-1])

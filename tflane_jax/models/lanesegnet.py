@@ -31,6 +31,7 @@ from tflane_jax.models.lane_segments import (
     SegmentOutput,
     regions,
 )
+from tflane_jax.models.parameters import with_equal_heads
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.models.segment_truth import ordered_targets, target_lanes
@@ -94,10 +95,7 @@ class LaneSegNet(Host):
     @nn.nowrap
     def init(self, *args: Any, **kwargs: Any) -> Any:
         """Return initial variables, as Linen does; the heads of all layers start as copies of the first layer's."""
-        variables = super().init(*args, **kwargs)
-        params = dict(variables["params"])
-        copies = {f"heads_{i}": params["heads_0"] for i in range(self.config.decoder.layers) if "heads_0" in params}
-        return {**variables, "params": params | copies}
+        return with_equal_heads(super().init(*args, **kwargs), self.config.decoder.layers)
 
     def decode_example(self, example, bev, elements, tokens, *, deterministic):
         config, lanes = self.config, None

@@ -17,6 +17,13 @@ def split_statistics(params: Params) -> tuple[Params, Params]:
     return learned, {name: value for name, value in params.items() if name == STATISTICS}
 
 
+def with_equal_heads(variables: Any, layers: int) -> Any:
+    """Return initial variables in which the heads of all decoder layers, `heads_{i}`, are those of the first layer."""
+    params = dict(variables["params"])
+    copies = {f"heads_{i}": params["heads_0"] for i in range(layers) if "heads_0" in params}
+    return {**variables, "params": params | copies}
+
+
 def joined_statistics(variables: Any) -> Params:
     """Return the variables from `Module.init` as one tree of parameters."""
     return dict(variables["params"]) | {name: variables[name] for name in (STATISTICS,) if name in variables}

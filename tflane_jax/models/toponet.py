@@ -114,7 +114,7 @@ class TopoNet(Host):
                 embed = ElementEmbedding(config, name=f"element_embedding_{i}")
                 embedded = embed(elements.queries[i], deterministic=deterministic)
                 nodes = ElementNodes(embedded, elements.logits[i], element_edges)
-            layer = LaneDecoderLayer(config, name=f"layer_{i}")
+            layer = LaneDecoderLayer(config, edge_weight=config.edge_weight, name=f"layer_{i}")
             around = attention_reference(reference, config)
             queries = layer(queries, placed, around, bev, adjacency, nodes, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)

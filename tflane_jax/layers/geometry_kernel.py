@@ -1,0 +1,126 @@
+"""Geometry-guided kernel attention of BEV queries to the cameras (GKT, Chen et al. 2022), the default of MapTR.
+
+Each query's pillar is projected into the images, as in BEVFormer. Around every projected point, attention reads a fixed
+kernel of feature cells; only its weights are learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.layers.bev_attention import first_seen
+
+_INIT = nn.initializers.xavier_uniform()
+
+
+class GeometryKernelAttention(nn.Module):
+    """Attention to a kernel of cells around the pillars of the queries, in the cameras that see them.
+
+    Attributes:
+        dim: channels in and out.
+        heads: as many as a pillar has anchors; head z reads around anchor z.
+        kernel: (rows, columns) of the kernel, odd.
+        capacity: most queries per camera, see `SpatialCrossAttention`.
+        dtype: of the projections.
+    """
+
+    dim: int
+    heads: int = 4
+    kernel: tuple[int, int] = (3, 5)
+    capacity: int | None = None
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(
+        self,
+        query: Float[Array, "q c"],
+        features: Float[Array, "v hw c"],
+        shapes: Sequence[tuple[int, int]],
+        reference: Float[Array, "v q z 2"],
+        visible: Bool[Array, "v q z"],
+    ) -> Float[Array, "q c"]:
+        """Return the mean of the attended features over the cameras that see a query, without residual.
+
+        Args:
+            query: content.
+            features: of each camera; finite.
+            shapes: (h, w) of the only level.
+            reference: (x, y) of a query's Z anchors in each image, in [0, 1].
+            visible: anchors inside the image.
+
+        Raises:
+            ValueError: several levels, or another number of anchors than heads.
+        """
+        (cameras, queries, anchors), heads = visible.shape, self.heads
+        if len(shapes) != 1 or anchors != heads:
+            raise ValueError(f"one level and {heads} anchors are needed, not {len(shapes)} and {anchors}")
+        value = nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="value_proj")(features)
+        value = value.reshape(cameras, -1, heads, self.dim // heads).astype(jnp.float32)
+        rows, columns = self.kernel
+        logits = nn.Dense(
+            heads * rows * columns, kernel_init=nn.initializers.zeros, dtype=self.dtype, name="attention_weights"
+        )(query)
+        weights = jax.nn.softmax(logits.reshape(queries, heads, rows * columns).astype(jnp.float32), -1)
+        seen = visible.any(-1)
+        if self.capacity is None or self.capacity >= queries:
+            # Unseen queries have weight 0, so that their gradients are zero; their reference may be anything.
+            taken = jnp.where(seen[:, :, None, None], weights[None], 0.0)
+            around = jnp.where(seen[:, :, None, None], reference, 0.0)
+            total = kernel_sum(value, shapes[0], around, taken, self.kernel).sum(0)
+        else:
+            index = first_seen(seen, self.capacity)
+            self.sow("intermediates", "overflow", jnp.maximum(seen.sum(1) - self.capacity, 0).sum())
+            pick, there = jnp.minimum(index, queries - 1), (index < queries)[:, :, None, None]
+            around = jnp.where(there, jnp.take_along_axis(reference, pick[:, :, None, None], 1), 0.0)
+            found = kernel_sum(value, shapes[0], around, jnp.where(there, weights[pick], 0.0), self.kernel)
+            total = jnp.zeros((queries, self.dim), found.dtype)
+            total = total.at[index.reshape(-1)].add(found.reshape(-1, self.dim), mode="drop")
+        mean = total / jnp.maximum(seen.sum(0), 1)[:, None]
+        return nn.Dense(self.dim, kernel_init=_INIT, dtype=self.dtype, name="output_proj")(mean)
+
+
+def kernel_sum(
+    value: Float[Array, "v hw heads d"],
+    shape: tuple[int, int],
+    location: Float[Array, "v q heads 2"],
+    weights: Float[Array, "v q heads k"],
+    kernel: tuple[int, int],
+) -> Float[Array, "v q heads*d"]:
+    """Return the weighted sum of the cells around a location, heads concatenated.
+
+    A kernel cell's coordinates are those of the location, in cells, plus its integer offset, rounded to the nearest
+    even integer and clamped to the map. No gradient by the location.
+
+    Args:
+        value: features of V maps.
+        shape: (h, w) of a map.
+        location: (x, y) in [0, 1], finite.
+        weights: of the K cells of the kernel, column by column.
+        kernel: (rows, columns).
+    """
+    (height, width), (cameras, cells, heads, depth) = shape, value.shape
+    table = value.reshape(-1, depth)
+    x, y = location[..., 0] * width, location[..., 1] * height
+    first = np.arange(cameras, dtype=np.int32)[:, None, None] * cells
+    head = np.arange(heads, dtype=np.int32)[None, None]
+    total: Any = jnp.zeros((1, 1, 1, 1), value.dtype)
+    # One term after the other: all K samples at once would be K times the result in memory.
+    for k, (column, row) in enumerate(kernel_offsets(kernel)):
+        at_x = jnp.clip(jnp.round(x + column), 0, width - 1).astype(jnp.int32)
+        at_y = jnp.clip(jnp.round(y + row), 0, height - 1).astype(jnp.int32)
+        here = (first + at_y * width + at_x) * heads + head
+        total = total + table.at[here].get(mode="promise_in_bounds") * weights[..., k, None]
+    return total.reshape(*total.shape[:2], heads * depth)
+
+
+def kernel_offsets(kernel: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the offsets (x, y) of the cells of a kernel (rows, columns), column by column."""
+    rows, columns = kernel
+    return [(x - columns // 2, y - rows // 2) for x in range(columns) for y in range(rows)]

@@ -1,0 +1,192 @@
+"""Parts of MapTR's decoder (Liao et al. 2023): instance and point queries, and the heads of map lines.
+
+A line is a group of P point queries. Each starts as the sum of an embedding of its line and one of its place along the
+line. Every decoder layer moves all points; the class of a line comes from the mean of its queries.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.layers.graph import Mlp
+from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
+from tflane_jax.models.lane_decoder import clipped
+from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
+from tflane_jax.models.lane_queries import spread_lanes
+from tflane_jax.models.lane_segments import Branch
+from tflane_jax.scene import MapLines
+
+
+@dataclass(frozen=True)
+class LineDecoderConfig:
+    """Sizes and forms of the decoder. Sizes train on two CPU cores; `PAPER_LINE_DECODER` has MapTR's.
+
+    Attributes:
+        dim: channels of a query.
+        heads: attention heads.
+        layers: decoder layers.
+        queries: lines I.
+        points: points P of a line; the decoder has I P queries.
+        coordinates: of a point, x and y, or x, y and z.
+        classes: of `scene.LineClass`, the first three or four.
+        sampling_points: deformable sampling points per head.
+        hidden: channels inside the feed-forward block.
+        anchors: "linear": a point starts at the sigmoid of a linear function of its embedding, and its position
+            encoding stays, as in MapTR. "spread": the points start on learned lines, initially straight ones spread
+            over the range, and the position encoding follows them from layer to layer.
+        bands: frequencies per coordinate of that encoding.
+        output: "sigmoid" adds the change of a point to the logit of its reference, as in MapTR; "metric" adds it in
+            units of `metres` and clips at the border of the perception range, see `LaneDecoderConfig.output`.
+        metres: unit of change along x, y and z of output "metric".
+        dropout: probability, for attention weights, hidden channels and every residual branch.
+    """
+
+    dim: int = 64
+    heads: int = 8
+    layers: int = 3
+    queries: int = 30
+    points: int = 12
+    coordinates: Literal[2, 3] = 2
+    classes: Literal[3, 4] = 3
+    sampling_points: int = 4
+    hidden: int = 128
+    anchors: Literal["linear", "spread"] = "linear"
+    bands: int = 6
+    output: Literal["sigmoid", "metric"] = "sigmoid"
+    metres: tuple[float, float, float] = (5.0, 5.0, 0.3)
+    dropout: float = 0.0
+
+
+PAPER_LINE_DECODER = LineDecoderConfig(dim=256, layers=6, queries=50, points=20, hidden=512, dropout=0.1)
+
+
+class PointQueries(NamedTuple):
+    """The queries of I lines before the first layer.
+
+    Attributes:
+        content, position: (I, P, C); the position is added to the content in attention.
+        reference: (I, P, D) points in [0, 1].
+    """
+
+    content: Float[Array, "*b i p c"]
+    position: Float[Array, "*b i p c"]
+    reference: Float[Array, "*b i p d"]
+
+
+class LineQueries(nn.Module):
+    """The learned queries.
+
+    Attributes:
+        config: sizes and forms.
+        range: the box that normalised coordinates span.
+    """
+
+    config: LineDecoderConfig
+    range: PerceptionRange
+
+    @nn.compact
+    def __call__(self) -> PointQueries:
+        """Return content, position and initial points."""
+        config, normal = self.config, nn.initializers.normal(1.0)
+        lines = self.param("instances", normal, (config.queries, 2 * config.dim))
+        points = self.param("points", normal, (config.points, 2 * config.dim))
+        position, content = jnp.split(lines[:, None] + points[None], 2, -1)
+        if config.anchors == "spread":
+            start = spread_lanes(config.queries, config.points, self.range)[..., : config.coordinates]
+            anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start)))
+            return PointQueries(content, position, nn.sigmoid(anchors))
+        place = nn.Dense(config.coordinates, kernel_init=nn.initializers.xavier_uniform(), name="reference")
+        return PointQueries(content, position, nn.sigmoid(place(position)))
+
+
+class NoisedLines(nn.Module):
+    """Queries placed on noised map lines, for training (`models.lane_denoising`).
+
+    Attributes:
+        config: sizes and forms, with anchors "spread": only then do the queries tell where their points are.
+        noise: added to the lines.
+        range: the box that normalised coordinates span.
+    """
+
+    config: LineDecoderConfig
+    noise: DenoisingConfig
+    range: PerceptionRange
+
+    @nn.compact
+    def __call__(self, lines: MapLines) -> PointQueries:
+        """Return the queries of every copy, as a leading axis; line i of a copy belongs to line i of the truth."""
+        config, copies = self.config, self.noise.copies
+        keys = jax.random.split(self.make_rng("dropout"), copies)
+        noised = jax.vmap(lambda key: noised_lanes(key, lines, config.queries, self.range, self.noise))(keys)
+        # Away from 0 and 1, where the sigmoid of the points is flat.
+        border = 0.01 if config.output == "sigmoid" else 0.0
+        reference = jnp.clip(self.range.normalise(noised[..., : config.coordinates]), border, 1.0 - border)
+        learned = self.param("points", nn.initializers.normal(1.0), (config.points, 2 * config.dim))
+        learned = jnp.broadcast_to(learned, (*reference.shape[:2], *learned.shape))
+        position, content = jnp.split(learned, 2, -1)
+        return PointQueries(content, position, lax.stop_gradient(reference))
+
+
+def point_position(
+    config: LineDecoderConfig, layer: int, position: Float[Array, "i p c"], reference: Float[Array, "i p d"]
+) -> Float[Array, "i p c"]:
+    """Return the position encoding of the queries in a layer; part of a compact module.
+
+    Anchors "spread": the encoding follows the points, by the module `point_position_{layer}`.
+    """
+    if config.anchors == "linear":
+        return position
+    place = jnp.concatenate([sine_encoding(reference[..., :2], config.bands), reference], -1)
+    return position + Mlp((config.dim, config.dim), name=f"point_position_{layer}")(place)
+
+
+class LineOutput(NamedTuple):
+    """Outputs of the heads of one decoder layer.
+
+    Attributes:
+        points: (I, P, D) metres.
+        unit: the same points in [0, 1].
+        logits: (I, classes).
+    """
+
+    points: Float[Array, "i p d"]
+    unit: Float[Array, "i p d"]
+    logits: Float[Array, "i k"]
+
+
+class LineHeads(nn.Module):
+    """Classes and points of one decoder layer.
+
+    Attributes:
+        config: sizes and forms.
+        range: the box that normalised coordinates span.
+        limits: the box at whose border lines end, output "metric" only.
+    """
+
+    config: LineDecoderConfig
+    range: PerceptionRange
+    limits: PerceptionRange | None = None
+
+    @nn.compact
+    def __call__(self, queries: Float[Array, "i p c"], reference: Float[Array, "i p d"]) -> LineOutput:
+        """Return the layer's prediction; `reference` are the points of the layer before, in [0, 1]."""
+        config, hidden, size = self.config, (self.config.dim,) * 2, self.config.coordinates
+        # The initial probability is 0.01 (focal loss prior, Lin et al. 2017).
+        classify = Branch((*hidden, config.classes), norm=True, bias=-math.log(99.0), name="class")
+        logits = classify(queries.mean(1))
+        change = Branch((*hidden, size), name="points")(queries)
+        if config.output == "sigmoid":
+            unit = nn.sigmoid(change + inverse_sigmoid(reference))
+        else:
+            scale = jnp.asarray(config.metres[:size]) / jnp.asarray(self.range.size(size))
+            unit = clipped(reference + change * scale[None, None], self.range, self.limits)
+        return LineOutput(self.range.denormalise(unit), unit, logits)

@@ -17,11 +17,22 @@ from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.map_lines import LineDecoderConfig
+from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
-from tflane_jax.scene import Areas, AreaType, CameraViews, Example, LaneGraph, TrafficElements
+from tflane_jax.scene import (
+    Areas,
+    AreaType,
+    CameraViews,
+    Example,
+    LaneGraph,
+    LineClass,
+    MapLines,
+    TrafficElements,
+)
 
 BASELINE = TopoNetConfig(
     encoder=EvidenceEncoderConfig(dim=16, dilations=(1,)),
@@ -95,6 +106,31 @@ def make_segment_example(seed: int = 0, instances: int = 9, lanes: int = 4, cros
         areas.points[i], areas.valid[i] = ring + 6.0 * i, True
         areas.category[i] = AreaType.PEDESTRIAN_CROSSING if i < crossings else AreaType.ROAD_BOUNDARY
     return example.replace(segments=segments, areas=areas)
+
+
+LINES = MapTrConfig(
+    encoder=BASELINE.encoder,
+    decoder=LineDecoderConfig(dim=16, heads=2, layers=2, queries=6, points=5, sampling_points=2, hidden=16),
+)
+"""MapTR in its published forms."""
+SMALL_LINES = dataclasses.replace(
+    LINES,
+    decoder=dataclasses.replace(LINES.decoder, anchors="spread", output="metric", bands=3),
+    priors=WITH_TRAFFIC.priors,
+)
+"""MapTR with traffic, in the forms of the small configurations."""
+
+
+def make_line_example(seed: int = 0, instances: int = 9, lanes: int = 4, crossings: int = 1) -> Example:
+    """Return `make_segment_example` with its lanes as dividers of five points, and crossings as rings."""
+    example = make_segment_example(seed, instances, lanes, crossings)
+    lines = MapLines.empty(8, 5)
+    lines.points[:lanes] = example.lanes.points[:lanes, ::2][:, [0, 1, 2, 3, 5]]
+    lines.valid[: lanes + crossings] = True
+    for i in range(lanes, lanes + crossings):
+        lines.points[i] = [[8, -7, 0], [10, -7, 0], [10, 7, 0], [8, 7, 0], [8, -7, 0]]
+        lines.category[i], lines.closed[i] = LineClass.CROSSING, True
+    return example.replace(map_lines=lines)
 
 
 CAMERA = CameraEncoderConfig(

@@ -161,10 +161,10 @@ def order_distances(
     points: Float[Array, "q p d"], targets: LineTargets, range_: PerceptionRange
 ) -> Float[Array, "q l o"]:
     """Return the L1 distance of each prediction to each order of each target, in fractions; infinite for no order."""
-    lines, orders = targets.orders.shape[:2]
+    lines, orders, count, size = targets.orders.shape
     found, true = range_.normalise(jnp.asarray(points)), range_.normalise(targets.orders)
-    apart = pairwise_l1(found.reshape(len(found), -1), true.reshape(lines * orders, -1))
-    return jnp.where(targets.order_valid[None], apart.reshape(-1, lines, orders), jnp.inf)
+    apart = pairwise_l1(found.reshape(-1, count * size), true.reshape(lines * orders, count * size))
+    return jnp.where(targets.order_valid[None], apart.reshape(len(found), lines, orders), jnp.inf)
 
 
 def line_losses(

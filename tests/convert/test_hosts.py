@@ -1,5 +1,7 @@
 """Checkpoints of whole detectors: every tensor is accounted for, and none is missing."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,8 @@ from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.map_lines import LineDecoderConfig
+from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.toponet import TopoNetConfig
 
 ENCODER = CameraEncoderConfig(
@@ -69,10 +73,34 @@ LANESEGNET = LaneSegNetConfig(
     encoder=ENCODER,
     decoder=SegmentDecoderConfig(dim=16, heads=8, layers=2, queries=7, hidden=24, relation=128, sampling_points=8),
 )
+
+
+def maptr_checkpoint(head):
+    """Return MapTR's tensors; as in the published files, the levels' embeddings have four rows."""
+    state = {name: value for name, value in checkpoint(head).items() if name.startswith(("img_", "pts_bbox_head."))}
+    state = {name: value for name, value in state.items() if "convs.1." not in name}
+    for kind in ("lateral", "fpn"):  # of the coarsest stage alone
+        inputs, size = (32, 1) if kind == "lateral" else (16, 3)
+        state[f"img_neck.{kind}_convs.0.conv.weight"] = np.ones((16, inputs, size, size), np.float32)
+    levels = "pts_bbox_head.transformer.level_embeds"
+    return state | {levels: np.concatenate([state[levels], np.zeros((3, 16), np.float32)])}
+
+
+def maptr(attention):
+    bev = BevFormerConfig(
+        BevGrid(rows=6, columns=4), dim=16, heads=4, layers=1, hidden=24, levels=1, cameras=3, attention=attention
+    )
+    images = dataclasses.replace(ENCODER.images, stages=(3,), pyramid=FeaturePyramidConfig(16, 1))
+    decoder = LineDecoderConfig(dim=16, heads=4, layers=2, queries=5, points=4, hidden=24)
+    return MapTrConfig(encoder=CameraEncoderConfig(images, bev), decoder=decoder)
+
+
 CASES = {
     "toponet": (TOPONET, lambda: checkpoint("toponet_head")),
     "baseline": (BASELINE, lambda: checkpoint("olv2_lc_head", ("lclc_head", "lcte_head"))),
     "lanesegnet": (LANESEGNET, lanesegnet_checkpoint),
+    "maptr": (maptr("kernel"), lambda: maptr_checkpoint("maptr_head_gkt")),
+    "maptr, bevformer": (maptr("deformable"), lambda: maptr_checkpoint("maptr_head_bevformer")),
 }
 
 
@@ -88,6 +116,9 @@ def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     unused = [leaf for leaf in leaves if "not needed" in leaf or leaf.startswith("a ")]
     assert unused == ["a constant of the loss", "not needed"]
     assert len(set(leaves)) == len(leaves)
+    partly = [row["tensor"] for row in table if "unused" in row["becomes"]]
+    four_levels = name.startswith("maptr")
+    assert partly == (["module.pts_bbox_head.transformer.level_embeds"] if four_levels else [])
 
     incomplete = dict(state)
     del incomplete["pts_bbox_head.cls_branches.1.6.bias"]

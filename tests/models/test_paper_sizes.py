@@ -7,13 +7,15 @@ import jax.numpy as jnp
 import pytest
 
 from tflane_jax.convert.hosts import camera_shapes
-from tflane_jax.models import bevformer_detr, lanesegnet, toponet
+from tflane_jax.models import bevformer_detr, lanesegnet, maptr, toponet
 
 BACKBONE, PYRAMID, BEV = 23_508_032, 3_278_592, 7_667_648
 ELEMENTS, RELATIONS = 8_381_032, 460_801
 # The reference counts a constant weight for each coordinate of a lane among its parameters.
 TOPONET_LANES, POINT_LANES, CURVE_LANES = 20_030_524 - 33, 5_792_816 - 33, 5_765_042 - 15
 SEGMENTS, LANESEGNET = 10_497_781 - 90, 45_412_854
+# Of the embeddings of four levels in MapTR's checkpoints, one is used; four numbers are constant weights.
+MAPTR, MAPTR_HEAD, MAPTR_UNUSED = 36_193_568, 11_570_912, 3 * 256 + 4
 MAP = jax.ShapeDtypeStruct((100, 200, 256), jnp.float32)
 
 
@@ -58,6 +60,24 @@ def test_lanesegnet_is_as_large_as_the_reference():
     assert segments.points.shape == segments.left.shape == (6, 200, 10, 3)
     assert segments.left_type_logits.shape == (6, 200, 3)
     assert segments.successor_logits.shape == (1, 200, 200)
+
+
+@pytest.mark.parametrize(("attention", "expected"), [("kernel", MAPTR_HEAD), ("deformable", 11_604_836)])
+def test_maptr_is_as_large_as_the_reference(attention, expected):
+    config = maptr.paper_config()
+    bev = dataclasses.replace(config.encoder.bev, attention=attention)
+    config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, bev=bev))
+    module, example = config.build(), camera_shapes(config.encoder)
+    answer, variables = jax.eval_shape(lambda key, e: module.init_with_output(key, e), jax.random.key(0), example)
+    params = dict(variables["params"])
+    if attention == "kernel":
+        assert count(params) == MAPTR - 2 * 26_560 - MAPTR_UNUSED
+    images = params["encoder"].pop("images")
+    assert count(images) == BACKBONE - 2 * 26_560 + 1_114_624
+    assert count(params) == expected - MAPTR_UNUSED
+
+    assert answer.lines.points.shape == (6, 50, 20, 2)
+    assert answer.lines.logits.shape == (6, 50, 3)
 
 
 @pytest.mark.parametrize(("control_points", "expected"), [(None, POINT_LANES), (5, CURVE_LANES)])

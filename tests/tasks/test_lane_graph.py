@@ -14,11 +14,14 @@ from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.map_lines import LineDecoderConfig
+from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import Prediction, stack_examples
@@ -52,6 +55,15 @@ def test_truth_of_other_points_is_named(model, setting):
     task.check(WorldData(), EXAMPLES)
     with pytest.raises(UserError, match=rf"data\.example\.{setting}=\d+, .*not 7"):
         task.check(WorldData(example=ExampleConfig(**{setting: 7})), EXAMPLES)
+
+
+def test_map_lines_of_other_points_or_none_at_all_are_named():
+    task = LaneGraphTask(MapTrConfig(decoder=LineDecoderConfig(points=12)))
+    with pytest.raises(UserError, match=r"data\.example\.map_lines\.points=12, .*not None"):
+        task.check(WorldData(), EXAMPLES)
+    with pytest.raises(UserError, match=r"data\.example\.map_lines\.points=12, .*not 20"):
+        task.check(WorldData(example=ExampleConfig(map_lines=MapLinesConfig())), EXAMPLES)
+    task.check(WorldData(example=ExampleConfig(map_lines=MapLinesConfig(points=12))), EXAMPLES)
 
 
 def test_truth_beyond_the_bev_features_is_named():

@@ -70,6 +70,11 @@ class MapTrConfig(HostConfig):
         """The denoised lines, and the outputs of every host."""
         return (*(() if self.denoising is None else ("denoised",)), *super().auxiliary)
 
+    @property
+    def example_points(self) -> dict[str, int]:
+        """Lines are compared point by point."""
+        return {"map_lines.points": self.decoder.points}
+
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
         self.check()

@@ -225,7 +225,11 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         example = data.source("train").example
         self._check_ranges(example)
         for name, points in self.model.example_points.items():
-            if (found := getattr(example, name)) != points:
+            part, _, inner = name.partition(".")
+            found = getattr(example, part)
+            if inner and found is not None:
+                found = getattr(found, inner)
+            if found != points:
                 raise UserError(
                     f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
                     f"(task.model.decoder.points), not {found}: change either"

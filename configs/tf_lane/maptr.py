@@ -1,0 +1,56 @@
+"""MapTR on the built-in world, at a size for two cores: the baseline without priors.
+
+    tflane train --config tf_lane/maptr
+    tflane train --config tf_lane/maptr:street
+
+Same roads, encoder and optimizer as `toponet.py`, and the parts of the recipe of docs/small_models.md that a decoder of
+points can have. `:street_published` has the decoder's published forms and losses instead.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.datasets.map_lines import MapLinesConfig
+from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.models.map_lines import LineDecoderConfig
+from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+# A frame of `street` has 5 lines in the mean, one of `city` 8.
+DECODER = LineDecoderConfig(layers=2, queries=20, points=20, anchors="spread", output="metric")
+# The world's crossings turn either way.
+LOSSES = MapTrLossConfig(class_target="quality", rings="both")
+
+
+def get_config() -> RunConfig:
+    """Return the baseline on the preset `city`."""
+    return _map_lines("toponet.py")
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the baseline on the preset `street`, and the same with MapTR's published decoder and losses."""
+    street = _map_lines("toponet.py:street")
+    assert isinstance(street.task, LaneGraphTask)
+    decoder = LineDecoderConfig(layers=3, queries=DECODER.queries, points=DECODER.points)
+    model = replace(street.task.model, decoder=decoder, denoising=None)
+    losses = MapTrLossConfig(rings=LOSSES.rings)
+    return {
+        "street": street,
+        "street_published": replace(street, task=replace(street.task, model=model, losses=losses)),
+    }
+
+
+def _map_lines(file: str) -> RunConfig:
+    """Return TopoNet's configuration with MapTR in place of TopoNet."""
+    config = load_config(str(Path(__file__).with_name(file)))
+    assert isinstance(config.task, LaneGraphTask)
+    host = config.task.model
+    assert isinstance(host, TopoNetConfig)
+    assert isinstance(config.data, WorldData)
+    model = MapTrConfig(encoder=host.encoder, range=host.range, decoder=DECODER, denoising=host.denoising)
+    lines = MapLinesConfig(lines=32, points=DECODER.points)
+    data = replace(config.data, example=replace(config.data.example, map_lines=lines))
+    training = replace(config.training, best_metric="lines/mAP")
+    return replace(config, task=replace(config.task, model=model, losses=LOSSES), data=data, training=training)

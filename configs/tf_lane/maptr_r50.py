@@ -1,0 +1,60 @@
+"""MapTR at the paper's size (tiny, GKT): ResNet-50, six cameras, 50 lines of 20 points, on the built-in world.
+
+    tflane summary --config tf_lane/maptr_r50 --no-compile          # needs no data
+    tflane train --config tf_lane/maptr_r50 --data.train 8 --data.val 2 --data.test 2 --training.steps 20 \\
+        --optim.epoch_steps 0 --optim.warmup_steps 0
+
+The cameras are nuScenes' ring with images of 800 x 480 pixels, as the paper has them. The reference trains 24 epochs of
+28,130 frames on eight GPUs, four frames each. `:bevformer` has BEVFormer's attention to the cameras instead of the
+kernel, `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
+"""
+
+from dataclasses import replace
+
+from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.map_lines import MapLinesConfig
+from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, paper_config
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.cameras.ring import CameraRigConfig
+
+EPOCH = 28_130 // 32
+
+
+def get_config() -> RunConfig:
+    """Return the paper's configuration."""
+    example = ExampleConfig(
+        range=PAPER_RANGE,
+        sensor=None,
+        cameras=CameraRigConfig(scale=0.5, multiple=32),
+        map_lines=MapLinesConfig(),
+    )
+    return RunConfig(
+        task=LaneGraphTask(paper_config(), MapTrLossConfig(rings="both")),
+        data=WorldData(example=example),
+        optim=OptimConfig(lr=6e-4, epoch_steps=EPOCH, ema_decay=0.0),
+        training=TrainingConfig(
+            steps=24 * EPOCH, batch_size=32, eval_every=EPOCH, checkpoint_every=EPOCH, best_metric="lines/mAP"
+        ),
+    )
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return variants of the encoder."""
+    config, encoder = get_config(), PAPER_MAP_ENCODER
+
+    def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
+        task = replace(config.task, model=replace(paper_config(), encoder=encoder))
+        return replace(config, task=task)
+
+    images, bev = replace(encoder.images, remat=True), replace(encoder.bev, remat=True)
+    half = replace(images, precision="bfloat16"), replace(bev, precision="bfloat16")
+    return {
+        "bevformer": with_encoder(replace(encoder, bev=replace(encoder.bev, attention="deformable"))),
+        "remat": with_encoder(CameraEncoderConfig(images, bev)),
+        "bfloat16": with_encoder(CameraEncoderConfig(*half)),
+    }

@@ -18,6 +18,7 @@ from tests.models.golden_maps import (
     targets,
 )
 from tflane_jax.convert.maptr import map_head_params
+from tflane_jax.evaluation.vector_maps import detections_of_lines
 from tflane_jax.losses.maptr import MapTrLossConfig, assign_lines, line_losses, matching_cost
 from tflane_jax.models.bevformer import BevFormer
 from tflane_jax.models.maptr import MapTr, MapTrConfig
@@ -73,12 +74,13 @@ def check_head(case):
 
 
 def check_decoded(case, lines):
-    """Compare the best predictions: every pair of query and class, by score, whose box is not far outside."""
-    for image, points in enumerate(lines.points[:, -1]):
+    """Compare the best pairs of query and class; the reference leaves out lines far outside the range."""
+    for image in range(len(lines.logits)):
         if f"decoded.{image}.pts" not in case.outputs:
             continue
-        scores, labels, found = (case.outputs[f"decoded.{image}.{name}"] for name in ("scores", "labels", "pts"))
-        every = jax.nn.sigmoid(lines.logits[image, -1])
-        query = np.abs(np.asarray(points)[None] - found[:, None]).sum((2, 3)).argmin(1)
-        np.testing.assert_allclose(points[query], found, rtol=1e-4, atol=1e-3)
-        np.testing.assert_allclose(every[query, labels], scores, rtol=1e-4)
+        scores, labels, points = (case.outputs[f"decoded.{image}.{name}"] for name in ("scores", "labels", "pts"))
+        found = detections_of_lines(jax.tree.map(lambda leaf, image=image: np.asarray(leaf)[image, -1], lines))
+        assert len(scores) == len(found.scores)
+        np.testing.assert_allclose(found.scores, scores, rtol=1e-4)
+        np.testing.assert_array_equal(found.classes, labels)
+        np.testing.assert_allclose(found.points, points, rtol=1e-4, atol=1e-3)

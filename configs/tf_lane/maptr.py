@@ -23,7 +23,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 DECODER = LineDecoderConfig(layers=2, queries=16, points=20, heads=4, anchors="spread", output="metric")
 CITY_QUERIES = 28
 # The world's crossings turn either way.
-LOSSES = MapTrLossConfig(class_target="quality", rings="both")
+LOSSES = MapTrLossConfig(class_target="quality", rings="both", least_step=0.1)
 
 
 def get_config() -> RunConfig:

@@ -211,6 +211,16 @@ def test_a_perfect_prediction_in_any_order_costs_next_to_nothing():
     assert float(report["matching/lines"]) == 2.0
 
 
+@pytest.mark.parametrize(("least_step", "most"), [(1e-6, 2e6), (0.1, 20.0)])
+def test_coinciding_points_have_a_direction_with_a_bounded_gradient(least_step, most):
+    truth = jnp.asarray(np.arange(4.0, dtype=np.float32)[:, None] * [1.0, 0.0])
+    lines = truth.at[2].set(truth[1])
+    run = jax.jit(jax.value_and_grad(lambda x: direction_errors(x, truth, least_step).sum()))
+    value, gradient = run(lines)
+    np.testing.assert_allclose(value, 1.0, atol=0.02)
+    assert most / 4 < np.abs(gradient).max() < most
+
+
 def test_quality_falls_with_the_mean_distance_of_the_nearest_order():
     truth = np.zeros((2, 4, 2), np.float32)
     moved = truth.copy()

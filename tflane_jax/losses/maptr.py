@@ -45,6 +45,9 @@ class MapTrLossConfig(HostLossConfig):
     Attributes:
         class_weight, points_weight: of both cost and loss; points in fractions of the range, summed over coordinates.
         direction_weight: of the steps' directions.
+        least_step: metres. The gradient of a direction grows as 1 / length of the predicted step; shorter steps than
+            this count less. The default is PyTorch's epsilon, with which a single pair of coinciding points, as lines
+            have them in a corner of the range, can exceed all other gradients.
         alpha, gamma: parameters of every focal term.
         rings: directions in which a true ring may be matched, see `geometry.line_orders`: "one" as MapTR does, "both"
             for truth whose rings turn either way.
@@ -56,6 +59,7 @@ class MapTrLossConfig(HostLossConfig):
     class_weight: float = 2.0
     points_weight: float = 5.0
     direction_weight: float = 0.005
+    least_step: float = 1e-6
     alpha: float = 0.25
     gamma: float = 2.0
     rings: Ways = "one"
@@ -205,7 +209,7 @@ def _layer_sums(
         classes = quality_focal(logits, target.at[query, targets.category].set(quality, mode="drop"), config.gamma)
     each = {
         "points": jnp.abs(range_.normalise(lines) - range_.normalise(true)).sum((1, 2)),
-        "direction": direction_errors(lines, true).sum(1),
+        "direction": direction_errors(lines, true, config.least_step).sum(1),
     }
     sums = {name: jnp.where(assignment.matched, value, 0.0).sum() for name, value in each.items()}
     return {"class": classes.sum()} | sums
@@ -219,11 +223,15 @@ def nearest_order(lines: Float[Array, "l p d"], targets: LineTargets, range_: Pe
     return jnp.take_along_axis(targets.orders, index[:, None, None, None], 1)[:, 0]
 
 
-def direction_errors(lines: Float[Array, "*b p d"], truth: Float[Array, "*b p d"]) -> Float[Array, "*b s"]:
-    """Return 1 - cos of the angle between the steps from point to point, S = P - 1; 1 for a step without length."""
+def direction_errors(
+    lines: Float[Array, "*b p d"], truth: Float[Array, "*b p d"], least_step: float = 1e-6
+) -> Float[Array, "*b s"]:
+    """Return 1 - cos of the angle between the steps from point to point, S = P - 1; 1 for a step without length.
+
+    Lengths a and b count as sqrt(a^2 + least_step^2), as in PyTorch's cosine.
+    """
     a, b = jnp.diff(lines, axis=-2), jnp.diff(truth, axis=-2)
-    # PyTorch's cosine: finite, with a finite gradient, at zero.
-    scale = jnp.sqrt(((a**2).sum(-1) + 1e-12) * ((b**2).sum(-1) + 1e-12))
+    scale = jnp.sqrt(((a**2).sum(-1) + least_step**2) * ((b**2).sum(-1) + least_step**2))
     return 1.0 - (a * b).sum(-1) / scale
 
 

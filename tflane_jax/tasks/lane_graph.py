@@ -40,7 +40,7 @@ from tflane_jax.models.parameters import Params, joined_statistics, split_statis
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of
-from tflane_jax.tasks import lane_scores
+from tflane_jax.tasks import score_names
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
@@ -65,9 +65,9 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     clip: int = 1
     empty_frames: Literal["keep", "skip"] = "keep"
 
-    columns: ClassVar[tuple[str, ...]] = lane_scores.COLUMNS
-    compared: ClassVar[tuple[str, ...]] = lane_scores.COMPARED
-    errors: ClassVar[tuple[str, ...]] = lane_scores.ERRORS
+    columns: ClassVar[tuple[str, ...]] = score_names.COLUMNS
+    compared: ClassVar[tuple[str, ...]] = score_names.COMPARED
+    errors: ClassVar[tuple[str, ...]] = score_names.ERRORS
 
     # -----------------------------------------------------------------------------------------------------------------
     # Learning
@@ -236,7 +236,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
         """Return the names of the host's metrics by group, with those of traffic elements if it predicts them."""
         example: ExampleConfig = data.source("val").example
-        return lane_scores.score_names(self.model, example, config, grouped=self._ground is not None)
+        return score_names.score_names(self.model, example, config, grouped=self._ground is not None)
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws a few validation examples from above and in their camera images."""

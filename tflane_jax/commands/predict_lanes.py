@@ -7,9 +7,11 @@ predictions.npz, arrays over F frames and Q queries:
     (F, E, 13); element_lane (F, Q, E), 0 to 1: [f, i, e] is the score that element e governs lane i.
     A model of lane segments has their centerlines in `points` and adds left, right (F, Q, P, 3) and category (F, Q),
     0 lane segment, 1 crossing; one with line types adds left_type, right_type (F, Q), 0 none, 1 solid, 2 dashed.
-truth.npz, the ground-truth lanes, or segments, of the same frames over G slots:
-    points (F, G, P, 3), successor (F, G, G), valid (F, G), visibility (F, G), scene and timestamp_ns. `tflane score`
-    reads both files.
+    A model of the lines of a vector map has these in `points`, as (F, Q, P, 2) if it predicts no heights, adds category
+    (F, Q), 0 divider, 1 crossing, 2 boundary, 3 centerline, and has no successor.
+truth.npz, the ground-truth lanes, segments or labelled lines of the same frames over G slots:
+    points (F, G, P, 3), successor (F, G, G) or category (F, G), valid (F, G), visibility (F, G), scene and
+    timestamp_ns. `tflane score` reads both files, but not those of lines.
 
 predictions.json, lanes with a score of at least `threshold`, best first:
     {"run", "step", "seed", "threshold", "frames": [{"source", "scene", "timestamp_ns",
@@ -17,7 +19,8 @@ predictions.json, lanes with a score of at least `threshold`, best first:
      "successors": [{"from": position in lanes, "to": position in lanes, "score"}, ...],
      "elements": [{"query", "score", "attribute", "box": [[left, top], [right, bottom]]}, ...],
      "governs": [{"element": position in elements, "lane": position in lanes, "score"}, ...]}, ...]}
-    Lane segments add "left", "right", "category" and, with line types, "left_type" and "right_type".
+    Lane segments add "left", "right", "category" and, with line types, "left_type" and "right_type"; lines add
+    "category".
     Relations have a score of at least 0.5. "elements" and "governs" exist if the model predicts traffic elements.
 """
 
@@ -40,9 +43,9 @@ from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
-from tflane_jax.scene import SegmentPrediction
+from tflane_jax.scene import Example, LinePrediction, SegmentPrediction
 from tflane_jax.tasks import spread
-from tflane_jax.tasks.lane_pictures import lanes_of, titles
+from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
 
 _RELATION_THRESHOLD = 0.5
 _OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
@@ -60,11 +63,14 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     lanes, elements = lanes_of(answer), answer.elements
     infos = [dataset.info(index) for index in indices]
     points, scores = np.asarray(lanes.points), expit(lanes.logits).max(-1)
-    edges = lanes.successor_logits
+    edges = None if isinstance(lanes, LinePrediction) else lanes.successor_logits
     successor = np.zeros((*scores.shape, scores.shape[-1])) if edges is None else expit(np.asarray(edges))
 
     make_folder(options.out)
     arrays = {"points": points, "scores": scores, "successor": successor}
+    if isinstance(lanes, LinePrediction):
+        del arrays["successor"]
+        arrays["category"] = np.asarray(lanes.logits).argmax(-1)
     if isinstance(lanes, SegmentPrediction):
         arrays |= {"left": np.asarray(lanes.left), "right": np.asarray(lanes.right)}
         arrays["category"] = np.asarray(lanes.logits).argmax(-1)
@@ -77,10 +83,9 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     arrays["scene"] = np.array([info.scene for info in infos])
     arrays["timestamp_ns"] = np.array([info.timestamp_ns for info in infos], np.int64)
     _save_arrays(options.out / "predictions.npz", arrays)
-    true, kept = true_lanes(examples, lanes), ["points", "successor", "valid", "visibility"]
-    kept += [name for name in ("left", "right", "left_type", "right_type") if name in arrays]
-    truth = {name: np.asarray(getattr(true, name)) for name in kept}
-    _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
+    truth = _truth(examples, lanes, arrays)
+    if truth is not None:
+        _save_arrays(options.out / "truth.npz", truth | {name: arrays[name] for name in ("scene", "timestamp_ns")})
     frames = [
         _frame(info, {name: array[i] for name, array in arrays.items()}, options.threshold)
         for i, info in enumerate(infos)
@@ -97,7 +102,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         view=view,
         threshold=options.threshold,
     )
-    written = ["predictions.npz", "truth.npz", "predictions.json", "pictures.png"]
+    written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
     if examples.cameras is not None:
         save_camera_views(
             options.out / "cameras.png",
@@ -114,6 +119,18 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     return 0
 
 
+def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:
+    """Return the arrays of truth.npz but for the names of the frames; None for lines that are not labelled."""
+    if isinstance(lanes, LinePrediction):
+        true, kept = examples.map_lines, ["points", "category", "valid", "visibility"]
+    else:
+        true, kept = true_lanes(examples, lanes), ["points", "successor", "valid", "visibility"]
+        kept += [name for name in ("left", "right", "left_type", "right_type") if name in arrays]
+    if true is None:
+        return None
+    return {name: np.asarray(getattr(true, name)) for name in kept if getattr(true, name) is not None}
+
+
 def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> dict[str, Any]:
     """Return one frame as plain values; `arrays` are those of predictions.npz for this frame."""
     scores, points = arrays["scores"], arrays["points"]
@@ -127,8 +144,9 @@ def _frame(info: FrameInfo, arrays: dict[str, np.ndarray], threshold: float) -> 
             | {name: arrays[name][q].tolist() for name in _OF_SEGMENTS if name in arrays}
             for q in kept
         ],
-        "successors": _relations(arrays["successor"][np.ix_(kept, kept)], "from", "to"),
     }
+    if "successor" in arrays:
+        frame["successors"] = _relations(arrays["successor"][np.ix_(kept, kept)], "from", "to")
     if "box" in arrays:
         best = arrays["attribute_score"].max(-1)
         shown = _best_first(best, threshold)

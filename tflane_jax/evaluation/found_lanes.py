@@ -3,6 +3,7 @@
 A lane counts as found if a detection whose nearest lane it is lies within `WITHIN` of it, with a confidence of at least
 the model's threshold. Distances are those of the metric (`metrics.centerline_matching.nearest_lanes`, or
 `metrics.segment_matching.nearest_segments`), so without a threshold the fraction of found lanes is `recall@2.0`.
+Lines of a vector map take the place of lanes, within `LINE_WITHIN` by MapTR's Chamfer distance to lines of their class.
 Confidences of two models have different scales: the threshold of each is the one with its best F-score.
 """
 
@@ -12,21 +13,30 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import expit
 
+from tflane_jax.evaluation.vector_maps import detections_of_lines, measured_lines, truth_of_lines
 from tflane_jax.metrics.centerline_matching import nearest_lanes
 from tflane_jax.metrics.segment_matching import nearest_segments
-from tflane_jax.scene import CenterlinePrediction, LaneGraph, SegmentPrediction
+from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, match_map
+from tflane_jax.scene import CenterlinePrediction, LaneGraph, LinePrediction, MapLines, SegmentPrediction
 
 WITHIN = 2.0  # metres
+LINE_WITHIN = MAP_THRESHOLDS[-1]  # metres
 
 
-def confidences_of(truth: LaneGraph, found: CenterlinePrediction | SegmentPrediction) -> Float[np.ndarray, " n"]:
+def confidences_of(
+    truth: LaneGraph | MapLines, found: CenterlinePrediction | SegmentPrediction | LinePrediction
+) -> Float[np.ndarray, " n"]:
     """Return for each row of the padded truth the highest confidence of the detections that find it; else -inf.
 
     Args:
-        truth: merged centerlines, or segments where the detections are segments.
+        truth: merged centerlines, segments where the detections are segments, or labelled lines.
         found: all detections of the frame; crossings find no lane.
     """
+    if isinstance(found, LinePrediction):
+        assert isinstance(truth, MapLines)
+        return _line_confidences(truth, found)
     valid, names = np.asarray(truth.valid), ("points", "left", "right")
     true = [np.asarray(getattr(truth, name))[valid] for name in names]
     confidences, scores = np.full(len(valid), -np.inf), lane_scores(found)
@@ -38,8 +48,21 @@ def confidences_of(truth: LaneGraph, found: CenterlinePrediction | SegmentPredic
     return confidences
 
 
-def lane_scores(found: CenterlinePrediction | SegmentPrediction) -> Float[np.ndarray, "*b p"]:
-    """Return the confidences of detected lanes; 0 for crossings."""
+def _line_confidences(truth: MapLines, found: LinePrediction) -> Float[np.ndarray, " n"]:
+    kept = measured_lines(truth, found)
+    detections = detections_of_lines(found)
+    matched = match_map(detections, truth_of_lines(truth, found))
+    confidences = np.full(len(kept), -np.inf)
+    # Beyond the largest threshold the distance is inf.
+    confidences[kept] = _highest(matched.distance, matched.nearest, matched.scores, int(kept.sum()))
+    return confidences
+
+
+def lane_scores(found: CenterlinePrediction | SegmentPrediction | LinePrediction) -> Float[np.ndarray, "*b p"]:
+    """Return the confidences of detected lanes, 0 for crossings; of lines those of the best pairs of query, class."""
+    if isinstance(found, LinePrediction):
+        every = expit(np.asarray(found.logits, np.float64))
+        return -np.sort(-every.reshape(*every.shape[:-2], -1))[..., : every.shape[-2]]
     scores = np.asarray(found.scores)
     if isinstance(found, SegmentPrediction):
         return np.where(np.asarray(found.logits).argmax(-1) == 0, scores, 0.0)

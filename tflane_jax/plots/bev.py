@@ -14,13 +14,20 @@ from jaxtyping import Array, Bool, Float, UInt8
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.plots import style
 from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_links, faded, turned, valid_rows
-from tflane_jax.plots.segments import draw_segment_prediction, draw_segments, true_lanes, visibility_colours
+from tflane_jax.plots.map_lines import draw_line_prediction, draw_map_lines
+from tflane_jax.plots.segments import (
+    LanePrediction,
+    draw_segment_prediction,
+    draw_segments,
+    true_lanes,
+    visibility_colours,
+)
 from tflane_jax.scene import (
     Areas,
     AreaType,
-    CenterlinePrediction,
     Example,
     LaneGraph,
+    LinePrediction,
     RoadUser,
     SegmentPrediction,
     TrafficElements,
@@ -30,7 +37,7 @@ from tflane_jax.scene import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Layer = Literal["evidence", "hidden", "areas", "lanes", "segments", "traffic", "elements"]
+Layer = Literal["evidence", "hidden", "areas", "lanes", "segments", "map_lines", "traffic", "elements"]
 # The ground that rasters cover, and the part of it that is shown by default.
 GROUND = BevGrid().range
 VIEW = PerceptionRange()
@@ -53,7 +60,8 @@ def draw_scene(
     Args:
         ax: where to draw.
         example: layers that it does not have are skipped.
-        layers: to draw, in a fixed order; by default all but "segments", which cover the lanes.
+        layers: to draw, in a fixed order; by default all but "segments" and "map_lines", which cover the
+            lanes.
         ground: range of `example.bev` and `example.hidden`.
         view: range to show.
         strength: of the evidence, 0 to 1.
@@ -70,6 +78,8 @@ def draw_scene(
         draw_lanes(ax, example.lanes)
     if "segments" in layers:
         draw_segments(ax, example.segments)
+    if "map_lines" in layers and example.map_lines is not None:
+        draw_map_lines(ax, example.map_lines)
     if "traffic" in layers and example.traffic_flow is not None:
         draw_traffic(ax, example.traffic_flow)
     if "elements" in layers and example.traffic_elements is not None:
@@ -190,12 +200,15 @@ def draw_ego(ax: Axes, size: tuple[float, float] = (4.8, 2.0)) -> None:
     ax.add_collection(PolyCollection(list(nose), facecolors=style.ROAD, zorder=6.1))
 
 
-def draw_prediction(ax: Axes, prediction: CenterlinePrediction | SegmentPrediction, *, threshold: float = 0.3) -> None:
+def draw_prediction(ax: Axes, prediction: LanePrediction, *, threshold: float = 0.3) -> None:
     """Draw lanes with a score of at least `threshold`, opacity by score, and their topology.
 
     A link runs from the end of a lane to the start of its successor if the score of the edge is above 0.5. Segments
-    have boundaries by type, see `draw_boundaries`; crossings are shaded.
+    have boundaries by type, see `draw_boundaries`; crossings are shaded. Lines of a vector map are coloured by class.
     """
+    if isinstance(prediction, LinePrediction):
+        draw_line_prediction(ax, prediction, threshold=threshold)
+        return
     if isinstance(prediction, SegmentPrediction):
         draw_segment_prediction(ax, prediction, threshold=threshold)
         return
@@ -212,7 +225,7 @@ def draw_prediction(ax: Axes, prediction: CenterlinePrediction | SegmentPredicti
 def draw_found(
     ax: Axes,
     example: Example,
-    prediction: CenterlinePrediction | SegmentPrediction,
+    prediction: LanePrediction,
     *,
     ground: PerceptionRange = GROUND,
     view: PerceptionRange = VIEW,
@@ -223,14 +236,19 @@ def draw_found(
     prepare(ax, view, title)
     if example.bev is not None:
         draw_evidence(ax, example.bev, ground, strength=0.3)
-    draw_lanes(ax, true_lanes(example, prediction), colour="white", width=0.8, alpha=0.45)
+    if not isinstance(prediction, LinePrediction):
+        draw_lanes(ax, true_lanes(example, prediction), colour="white", width=0.8, alpha=0.45)
+    elif example.map_lines is not None:
+        draw_map_lines(ax, example.map_lines, colour="white", width=0.8, alpha=0.45)
     draw_prediction(ax, prediction, threshold=threshold)
     draw_ego(ax)
 
 
-def truth_layer(prediction: CenterlinePrediction | SegmentPrediction | None) -> Layer:
-    """Return the layer that shows the ground truth of a prediction."""
-    return "segments" if isinstance(prediction, SegmentPrediction) else "lanes"
+def truth_layers(prediction: LanePrediction | None) -> tuple[Layer, ...]:
+    """Return the layers that show the ground truth of a prediction; crossings and boundaries are lines of a map."""
+    if isinstance(prediction, LinePrediction):
+        return ("map_lines",)
+    return ("areas", "segments") if isinstance(prediction, SegmentPrediction) else ("areas", "lanes")
 
 
 def box_corners(

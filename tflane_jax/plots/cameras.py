@@ -15,11 +15,22 @@ from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.geometry.cameras import project
 from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene
+from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
+from tflane_jax.plots.lines import valid_rows
+from tflane_jax.plots.map_lines import chosen_lines
 from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_segments, outline_of_sides
-from tflane_jax.scene import CameraViews, ElementPrediction, Example, LineType, SegmentPrediction, TrafficElements
+from tflane_jax.scene import (
+    CameraViews,
+    ElementPrediction,
+    Example,
+    LineClass,
+    LinePrediction,
+    LineType,
+    SegmentPrediction,
+    TrafficElements,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -68,7 +79,8 @@ def save_camera_views(
     """Write two rows per example: the front cameras with the scene from above, then the rear cameras.
 
     Camera images show the predictions, or the truth if there are none; the view from above shows both, the truth thin.
-    The colour of a lane is its driving direction relative to the vehicle.
+    The colour of a lane is its driving direction relative to the vehicle. Lines of a vector map have the colours of
+    their classes, and their truth is thin and white in the camera images, too.
 
     Args:
         path: .png, .pdf or .svg.
@@ -143,8 +155,17 @@ def draw_camera(
     predicted = lanes is not None or elements is not None
     if isinstance(lanes, SegmentPrediction):
         _draw_segments(ax, views, number, lanes, threshold)
+    elif isinstance(lanes, LinePrediction):
+        if example.map_lines is not None:
+            known = np.asarray(example.map_lines.points)[np.asarray(example.map_lines.valid)]
+            draw_projected(ax, views, number, known, colour="white", width=0.6)
+        points, category, _ = chosen_lines(lanes, threshold)
+        _draw_by_class(ax, views, number, points, category)
     elif lanes is not None:
         draw_projected(ax, views, number, np.asarray(lanes.points)[np.asarray(lanes.scores) >= threshold])
+    elif not predicted and example.map_lines is not None:
+        points, category = valid_rows(example.map_lines.valid, example.map_lines.points, example.map_lines.category)
+        _draw_by_class(ax, views, number, points, category)
     elif not predicted:
         draw_projected(ax, views, number, np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)])
     if number == 0 and elements is not None:
@@ -220,6 +241,14 @@ def _draw_segments(ax: Axes, views: CameraViews, number: int, found: SegmentPred
     draw_projected(ax, views, number, closed, colour=style.CROSSING, width=1.5)
 
 
+def _draw_by_class(
+    ax: Axes, views: CameraViews, number: int, points: Float[np.ndarray, "n p 3"], category: Int[np.ndarray, " n"]
+) -> None:
+    for kind, colour in style.MAP_LINE.items():
+        width = 0.8 if kind == LineClass.CENTERLINE else 1.5
+        draw_projected(ax, views, number, points[category == kind], colour=colour, width=width)
+
+
 def draw_boxes(
     ax: Axes, box: Float[np.ndarray, "e 2 2"], attribute: Int[np.ndarray, " e"], chosen: Bool[np.ndarray, " e"]
 ) -> None:
@@ -243,7 +272,8 @@ def _draw_above(
     view: PerceptionRange,
 ) -> None:
     if lanes is None:
-        layers = ("hidden", "areas", "lanes", "traffic", "elements")
+        true = truth_layers(None) if example.map_lines is None else ("map_lines",)
+        layers = ("hidden", *true, "traffic", "elements")
         draw_scene(ax, example, layers=layers, ground=ground, view=view, title=title)
         return
     draw_found(ax, example, lanes, ground=ground, view=view, threshold=threshold, title=title)

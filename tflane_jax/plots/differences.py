@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layer
+from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
-from tflane_jax.plots.gallery import boundary_entries, label_edges, panel_size, pick
-from tflane_jax.plots.segments import LanePrediction, true_lanes
+from tflane_jax.plots.gallery import boundary_entries, label_edges, panel_size, pick, prediction_entries
+from tflane_jax.plots.map_lines import class_entries
+from tflane_jax.plots.segments import LanePrediction, truth_lines
 from tflane_jax.scene import BevChannel, Example, RoadUser
 
 if TYPE_CHECKING:
@@ -79,11 +80,11 @@ def save_differences(
     figure.suptitle(title, fontsize=13, x=0.01, ha="left")
     for row, (line, name) in enumerate(zip(axes, titles, strict=True)):
         example, (truth, seen, *places) = pick(examples, row), line
-        lanes = np.asarray(true_lanes(example, shown).points)
+        lanes = truth_lines(example, shown)
         draw_scene(
             truth,
             example,
-            layers=("hidden", "areas", truth_layer(shown)),
+            layers=("hidden", *truth_layers(shown)),
             ground=ground,
             view=view,
             title=f"truth, {name}",
@@ -100,7 +101,7 @@ def save_differences(
             draw_outlines(ax, lanes[found], "filled")
             draw_outlines(ax, lanes[outlined[row] & ~found], "dashed")
     label_edges(axes)
-    _add_legend(figure, caption, meaning, segments=truth_layer(shown) == "segments")
+    _add_legend(figure, caption, meaning, drawn=truth_layers(shown))
     return save_figure(figure, path)
 
 
@@ -133,21 +134,22 @@ def band(line: Float[np.ndarray, "n 2"], half_width: float) -> Float[np.ndarray,
     return np.concatenate([line - half_width * left, (line + half_width * left)[::-1]])
 
 
-def _add_legend(figure: Figure, caption: str, meaning: str, *, segments: bool = False) -> None:
+def _add_legend(figure: Figure, caption: str, meaning: str, *, drawn: Collection[Layer]) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     edge = {"edgecolor": style.OUTLINE, "lw": 1.3}
     car = style.ROAD_USER[RoadUser.CAR]
+    sight = [
+        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in line of sight"),
+        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
+    ]
     entries: list = [  # column by column
         Patch(facecolor="none", label=meaning, **edge),
         Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
         Patch(facecolor=style.OUTLINE + "4d", label="this model finds it", **edge),
         Patch(facecolor="none", ls="--", label="this model misses it", **edge),
-        Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
-        Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
-        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in line of sight"),
-        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
+        *(class_entries() if "map_lines" in drawn else [*prediction_entries(), *sight]),
         Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
         Patch(facecolor=car + "8c", edgecolor=car, label="road user, its track"),
         Patch(facecolor="none", edgecolor=car, label="not seen at present"),
@@ -155,7 +157,7 @@ def _add_legend(figure: Figure, caption: str, meaning: str, *, segments: bool = 
             Patch(facecolor=style.EVIDENCE[channel], label=f"evidence: {channel.name.lower().replace('_', ' ')}")
             for channel in (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE, BevChannel.OBSTACLE)
         ),
-        *(boundary_entries() if segments else ()),
+        *(boundary_entries() if "segments" in drawn else ()),
     ]
     legend = figure.legend(
         handles=entries,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -12,8 +12,9 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import style
-from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layer
+from tflane_jax.plots.bev import GROUND, VIEW, Layer, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+from tflane_jax.plots.map_lines import class_entries
 from tflane_jax.plots.segments import LINE_STYLES, LanePrediction
 from tflane_jax.scene import Example, LineType
 
@@ -45,7 +46,7 @@ def save_examples(
         path: .png, .pdf or .svg.
         examples: B of them, stacked along a leading axis.
         predictions: by the name of the model, stacked in the same way. The truth is that of the first: lane segments
-            with boundaries by type, or merged centerlines.
+            with boundaries by type, merged centerlines, or lines of a vector map by class.
         titles: one per row; default their numbers.
         ground, view: see `draw_scene`.
         threshold: lowest score of a lane that is drawn.
@@ -62,7 +63,7 @@ def save_examples(
     sizes = {"titles": len(titles)} | {name: len(stacked.points) for name, stacked in predictions.items()}
     if any(size != count for size in sizes.values()):
         raise ValueError(f"{count} examples, but {sizes}")
-    layer = truth_layer(next(iter(predictions.values()), None))
+    true = truth_layers(next(iter(predictions.values()), None))
     panels = 2 + len(predictions)
     lines = -(-panels // _MOST_COLUMNS)
     figure, axes = new_figure(count * lines, -(-panels // lines), panel=panel_size(view), footer=0.5)
@@ -74,7 +75,7 @@ def save_examples(
         draw_scene(
             truth,
             example,
-            layers=("hidden", "areas", layer, "elements"),
+            layers=("hidden", *true, "elements"),
             ground=ground,
             view=view,
             title=f"{title}: truth",
@@ -85,7 +86,7 @@ def save_examples(
         for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
             draw_found(ax, example, pick(stacked, row), ground=ground, view=view, threshold=threshold, title=name)
     label_edges(axes)
-    add_legend(figure, "with predictions" if predictions else "scenes", segments=layer == "segments")
+    add_legend(figure, "with predictions" if predictions else "scenes", drawn=true)
     return save_figure(figure, path)
 
 
@@ -101,12 +102,14 @@ def show_dataset(
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).round().astype(int))
     pairs = 2 if len(chosen) > 1 else 1
     figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view), footer=0.5)
+    true: tuple[Layer, ...] = ()
     for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
         example, info = dataset.example(index), dataset.info(index)
+        true = truth_layers(None) if example.map_lines is None else ("map_lines",)
         draw_scene(
             truth,
             example,
-            layers=("hidden", "areas", "lanes", "elements"),
+            layers=("hidden", *true, "elements"),
             ground=ground,
             view=view,
             title=f"{index}: {info.scene[:16]}, truth",
@@ -116,20 +119,19 @@ def show_dataset(
         )
     hide_unused(axes, 2 * len(chosen))
     label_edges(axes)
-    add_legend(figure, "scenes")
+    add_legend(figure, "scenes", drawn=true)
     return save_figure(figure, out)
 
 
 def add_legend(
-    figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes", *, segments: bool = False
+    figure: Figure, kind: Literal["scenes", "with predictions"] = "scenes", *, drawn: Collection[Layer] = ("lanes",)
 ) -> None:
-    """Add the legend of all colours below the panels, once for the figure; with `segments`, types of boundaries too."""
+    """Add the legend of all colours below the panels, once for the figure, for the `drawn` layers of true lanes."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     entries: list = [
-        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in view"),
-        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane hidden"),
+        *(class_entries() if "map_lines" in drawn else _visibility_entries()),
         Patch(facecolor="#0f1116", edgecolor=style.HATCH, hatch="////", lw=0, label="ground out of sight"),
         *(Patch(facecolor=colour, label=user.name.lower()) for user, colour in style.ROAD_USER.items()),
         Patch(facecolor="none", edgecolor=style.OTHER_ELEMENT, label="road user not seen"),
@@ -143,15 +145,34 @@ def add_legend(
     if kind == "with predictions":
         entries += [
             Line2D([], [], color="#b0b3ba", lw=1, label="truth, in predictions"),
-            Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
-            Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
         ]
-    if segments:
+        if "map_lines" not in drawn:
+            entries += prediction_entries()
+    if "segments" in drawn:
         entries += boundary_entries()
     fitting = max(4, int(figure.get_figwidth() // 1.6))
     rows = -(-len(entries) // fitting)
     columns = -(-len(entries) // rows)
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
+
+
+def _visibility_entries() -> list:
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in view"),
+        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane hidden"),
+    ]
+
+
+def prediction_entries() -> list:
+    """Return the entries of a legend for predicted lanes and their topology."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color=style.PREDICTION, lw=2, label="predicted lane"),
+        Line2D([], [], color=style.LINK, lw=1.2, marker="o", ms=3, label="predicted topology"),
+    ]
 
 
 def boundary_entries() -> list:

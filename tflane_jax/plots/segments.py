@@ -7,24 +7,37 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.errors import UserError
 from tflane_jax.plots import style
 from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_links, faded, valid_rows
-from tflane_jax.scene import CenterlinePrediction, Example, LaneGraph, LineType, SegmentPrediction
+from tflane_jax.scene import CenterlinePrediction, Example, LaneGraph, LinePrediction, LineType, SegmentPrediction
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LanePrediction = CenterlinePrediction | SegmentPrediction
-"""Predictions that the pictures of lanes show."""
+LanePrediction = CenterlinePrediction | SegmentPrediction | LinePrediction
+"""Predictions that the pictures of lanes, or of lines of a vector map, show."""
 
 LINE_STYLES = {LineType.NONE: (0, (1.0, 2.5)), LineType.SOLID: "solid", LineType.DASHED: (0, (5.0, 3.0))}
 """Dashes of boundaries, in widths of the line; NONE is dotted and thin."""
 _THIN = 0.55
 
 
-def true_lanes(example: Example, prediction: LanePrediction | None) -> LaneGraph:
+def true_lanes(example: Example, prediction: CenterlinePrediction | SegmentPrediction | None) -> LaneGraph:
     """Return the ground truth of a prediction: segments, or else merged centerlines."""
     return example.segments if isinstance(prediction, SegmentPrediction) else example.lanes
+
+
+def truth_lines(example: Example, prediction: LanePrediction | None) -> Float[np.ndarray, "g p 3"]:
+    """Return the ground truth of a prediction as lines, padded: of lanes their centerlines.
+
+    Raises UserError for lines of a vector map that the example does not label.
+    """
+    if not isinstance(prediction, LinePrediction):
+        return np.asarray(true_lanes(example, prediction).points)
+    if example.map_lines is None:
+        raise UserError("these examples label no lines of a vector map: set data.example.map_lines")
+    return np.asarray(example.map_lines.points)
 
 
 def chosen_segments(

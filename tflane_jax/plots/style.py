@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tflane_jax.scene import BevChannel, RoadUser
+from tflane_jax.scene import BevChannel, LineClass, RoadUser
 
 ROAD = "#1b1f27"
 GRID = "#39404d"
@@ -21,6 +21,14 @@ LANE_HIDDEN = "#ff9d3c"
 BOUNDARY = "#e6e2d3"
 ROAD_BOUNDARY = "#7f8da3"
 CROSSING = "#b9a5e2"
+
+# Lines of a vector map.
+MAP_LINE = {
+    LineClass.DIVIDER: "#ffc46b",
+    LineClass.CROSSING: CROSSING,
+    LineClass.BOUNDARY: "#7f8fff",
+    LineClass.CENTERLINE: LANE_CLEAR,
+}
 
 # Colour of each evidence channel at full strength (red, green, blue, 0 to 1).
 EVIDENCE = {

@@ -72,6 +72,11 @@ class LinePrediction:
     points: Float[Array, "*layers q p d"]
     logits: Float[Array, "*layers q c"]
 
+    @property
+    def scores(self) -> Float[Array, "*layers q"]:
+        """Confidence of the best class, 0 to 1."""
+        return jax.nn.sigmoid(self.logits).max(-1)
+
 
 @struct.dataclass
 class ElementPrediction:

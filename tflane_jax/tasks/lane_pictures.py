@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,19 +17,37 @@ from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.data_source import LaneGraphSource
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.found_lanes import WITHIN, best_threshold, confidences_of, frames_of_difference, lane_scores
+from tflane_jax.evaluation.found_lanes import (
+    LINE_WITHIN,
+    WITHIN,
+    best_threshold,
+    confidences_of,
+    frames_of_difference,
+    lane_scores,
+)
 from tflane_jax.evaluation.interventions import scene_numbers
-from tflane_jax.evaluation.lane_groups import lane_groups
+from tflane_jax.evaluation.lane_groups import lane_groups, line_groups
 from tflane_jax.evaluation.predict import predict_examples, predicted_batches
-from tflane_jax.scene import CenterlinePrediction, Example, Prediction, SegmentPrediction, stack_examples
+from tflane_jax.scene import (
+    CenterlinePrediction,
+    Example,
+    LaneGraph,
+    LinePrediction,
+    MapLines,
+    Prediction,
+    SegmentPrediction,
+    stack_examples,
+)
 from tflane_jax.tasks.base import Model, spread
 
 Group = Literal["hidden+traffic", "occluded"]
-Field = Literal["lanes", "segments"]
+Field = Literal["lanes", "segments", "map_lines"]
+Found = CenterlinePrediction | SegmentPrediction | LinePrediction
 _MEANING: dict[Group, str] = {
-    "hidden+traffic": "lanes that the sensor hardly shows and vehicles drove along",
-    "occluded": "lanes of which less than half is in line of sight",
+    "hidden+traffic": "that the sensor hardly shows and vehicles drove along",
+    "occluded": "of which less than half is in line of sight",
 }
+_groups_of: Mapping[type, Callable[..., Mapping[str, np.ndarray]]] = {LaneGraph: lane_groups, MapLines: line_groups}
 _FRAMES = 4
 _FRAMES_OF_ONE_MODEL = 6
 _BATCH = 16
@@ -38,16 +56,11 @@ _BATCH = 16
 def draw_examples(
     model: Model, source: LaneGraphSource, dataset: Dataset, indices: list[int], folder: Path, step: int
 ) -> None:
-    """Write pictures of some examples to a folder, from above and, where there are any, in their camera images.
-
-    Predictions without lanes of a kind that can be drawn leave no picture.
-    """
+    """Write pictures of some examples to a folder, from above and, where there are any, in their camera images."""
     from tflane_jax.plots import save_camera_views, save_examples
 
     examples, answer = predict_examples(model.task, model.params, dataset, indices)
-    found = answer.centerlines if answer.segments is None else answer.segments
-    if found is None:
-        return
+    found = lanes_of(answer)
     path, names = folder / f"step_{step:08d}.png", titles(dataset, indices)
     ground, view = source.example.ground, source.example.range
     save_examples(path, examples, {f"step {step}": found}, titles=names, ground=ground, view=view)
@@ -68,7 +81,7 @@ def draw_hidden_lanes(
         indices = spread(len(data), _FRAMES_OF_ONE_MODEL)
     else:
         lanes = getattr(data, field)
-        hidden = (lanes.valid & (lanes.visibility < 0.5)).sum(-1)
+        hidden = (lanes.valid & _occluded(lanes)).sum(-1)
         indices = np.argsort(-hidden, kind="stable")[:_FRAMES_OF_ONE_MODEL].tolist()
     examples = stack_examples([dataset.example(index) for index in indices])
     found = {
@@ -91,7 +104,7 @@ class _Answers:
 
     found: Bool[np.ndarray, "f g"]
     threshold: float
-    lanes: CenterlinePrediction | SegmentPrediction
+    lanes: Found
 
 
 def draw_differences(
@@ -100,7 +113,7 @@ def draw_differences(
     """Draw the frames in which the first two models differ most, and outline the lanes that only one of them finds.
 
     All models predict the whole split once. `evaluation.found_lanes` says which lanes are found and which frames are
-    drawn. Lanes are merged centerlines, or segments where the models predict these.
+    drawn. Lanes are merged centerlines, or segments or lines of a vector map where the models predict these.
 
     Args:
         models: by name, at least two.
@@ -110,20 +123,24 @@ def draw_differences(
             BEV evidence and traffic flow; or lanes of which less than half is in line of sight.
 
     Raises:
-        UserError: some models predict centerlines, others segments.
+        UserError: the models predict lanes of different kinds, or lines of a vector map that the data do not label.
     """
     from tflane_jax.plots import Findings, save_differences
 
     parts, answers = next(iter(models.values())).task.parts, {}
     fields: list[Field] = sorted({truth_of(model) for model in models.values()})
     if len(fields) > 1:
-        raise UserError("these models predict lanes of different kinds: compare hosts of centerlines or of segments")
+        raise UserError("these models predict lanes of different kinds: compare hosts of one kind")
     field = fields[0]
+    lanes = "lines" if field == "map_lines" else "lanes"
+    if field == "map_lines" and source.example.map_lines is None:
+        raise UserError("these examples label no lines of a vector map: set data.example.map_lines")
     for name, model in models.items():
         mine = data if model.task.parts == parts else model.task.load(source, progress=False)
         answers[name] = _answers(model, mine, field)
     first, second = list(answers)[:2]
-    members = _members(data, source, group, field)
+    kinds = min(np.shape(one.lanes.logits)[-1] for one in answers.values())
+    members = _members(data, source, group, field, kinds)
     by_first, by_second = (members & answers[name].found for name in (first, second))
     alone = {first: by_first & ~by_second, second: by_second & ~by_first}
     frames = frames_of_difference(alone[first].sum(1), alone[second].sum(1), scene_numbers(data), _FRAMES)
@@ -140,23 +157,24 @@ def draw_differences(
             for name, one in answers.items()
         },
         (alone[first] | alone[second])[chosen],
-        title=f"Of {members.sum()} {_MEANING[group]}, both models find {(by_first & by_second).sum()}, {only}",
-        caption=_caption(answers, {name: ahead[name] for name in (second, first)}, len(members)),
-        meaning=f"lane that only one of {first} and {second} finds",
+        title=f"Of {members.sum()} {lanes} {_MEANING[group]}, both models find {(by_first & by_second).sum()}, {only}",
+        caption=_caption(answers, {name: ahead[name] for name in (second, first)}, len(members), field),
+        meaning=f"{lanes[:-1]} that only one of {first} and {second} finds",
         titles=titles(dataset, chosen),
         ground=source.example.ground,
         view=source.example.range,
     )
 
 
-def _caption(answers: Mapping[str, _Answers], ahead: Mapping[str, Sequence[int]], frames: int) -> str:
+def _caption(answers: Mapping[str, _Answers], ahead: Mapping[str, Sequence[int]], frames: int, field: Field) -> str:
     """Return the rules by which the frames were chosen and the lanes found."""
     rows = [f"the {len(rows)} in which {name} is ahead the most" for name, rows in ahead.items() if rows]
     chosen = " and ".join(rows) + ", in the ratio of the lanes that only they find (for each, one frame of a scene)"
     chosen = chosen if rows else "those with the most such lanes, because no model is ahead in any"
+    within = LINE_WITHIN if field == "map_lines" else WITHIN
     levels = ", ".join(f"{one.threshold:.2f} ({name})" for name, one in answers.items())
     return (
-        f"Of {frames} frames, {chosen}.\nFound: within {WITHIN:g} m of a drawn prediction. Drawn: predictions with at "
+        f"Of {frames} frames, {chosen}.\nFound: within {within:g} m of a drawn prediction. Drawn: predictions with at "
         f"least the confidence of the model's best F-score, {levels}."
     )
 
@@ -177,36 +195,44 @@ def _answers(model: Model, data: Example | Streamed, field: Field) -> _Answers:
     return _Answers(found >= threshold, threshold, stacked)
 
 
-def _members(data: Example | Streamed, source: LaneGraphSource, group: Group, field: Field) -> Bool[np.ndarray, "f g"]:
-    """Return which true lanes, by row of the padded truth, belong to the group."""
+def _members(
+    data: Example | Streamed, source: LaneGraphSource, group: Group, field: Field, kinds: int
+) -> Bool[np.ndarray, "f g"]:
+    """Return which true lanes, by row of the padded truth, belong to the group; of lines, the first `kinds` classes."""
     every = []
     for indices, batch in ordered_batches(data, _BATCH):
         for row in range(len(indices)):
             lanes, bev, flow = jax.tree.map(
                 lambda leaf, i=row: np.asarray(leaf[i]), (getattr(batch, field), batch.bev, batch.traffic_flow)
             )
-            members = lanes.valid & (lanes.visibility < 0.5)
+            members = lanes.valid & _occluded(lanes)
             if group != "occluded":
-                members = np.zeros(len(lanes.valid), bool)
-                members[lanes.valid] = lane_groups(lanes, bev, flow, source.example.ground)[group]
-            every.append(members)
+                members, groups = np.zeros(len(lanes.valid), bool), _groups_of[type(lanes)]
+                members[lanes.valid] = groups(lanes, bev, flow, source.example.ground)[group]
+            every.append(members & (lanes.category < kinds) if isinstance(lanes, MapLines) else members)
     return np.stack(every)
 
 
-def lanes_of(prediction: Prediction) -> CenterlinePrediction | SegmentPrediction:
-    """Return the predicted segments or centerlines; raise UserError for a host that predicts neither."""
-    found = prediction.centerlines if prediction.segments is None else prediction.segments
-    if found is None:
-        raise UserError(
-            "this host predicts neither centerlines nor segments: pictures of other lanes are not drawn yet"
-        )
-    return found
+def _occluded(lanes: LaneGraph | MapLines) -> Bool[np.ndarray, "*b n"]:
+    """Return which lanes are out of sight along more than half of their length; none where it is not known."""
+    return np.zeros(lanes.valid.shape, bool) if lanes.visibility is None else np.asarray(lanes.visibility) < 0.5
+
+
+def lanes_of(prediction: Prediction) -> Found:
+    """Return the predicted segments, centerlines or lines of a vector map; raise UserError for none of them."""
+    for found in (prediction.segments, prediction.centerlines, prediction.lines):
+        if found is not None:
+            return found
+    raise UserError("this host predicts no lanes, so there is nothing to draw")
 
 
 def truth_of(model: Model) -> Field:
     """Return the field of `Example` that holds the truth of what `lanes_of` returns for this model."""
     host: Any = getattr(model.task, "model", None)
-    return "segments" if host is not None and "segments" in host.predicts else "lanes"
+    predicts = () if host is None else host.predicts
+    if "lines" in predicts and "segments" not in predicts and "centerlines" not in predicts:
+        return "map_lines"
+    return "segments" if "segments" in predicts else "lanes"
 
 
 def titles(dataset: Dataset, indices: list[int]) -> list[str]:

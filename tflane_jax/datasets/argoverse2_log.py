@@ -19,7 +19,7 @@ from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 from tflane_jax.scene import RoadUser
-from tflane_jax.scene.logs import KeyFrame, Log, Tracks
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 
 ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
 _POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
@@ -78,6 +78,7 @@ def load_log(
     keyframes: Keyframes = "openlane_v2",
     openlane: Path | None = None,
     categories: Mapping[str, RoadUser | None] = CATEGORIES,
+    with_map: bool = True,
 ) -> Log:
     """Read one log folder.
 
@@ -87,6 +88,7 @@ def load_log(
         openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps (of the front camera). Without
             it, or for a log that is not in them, "openlane_v2" takes every fifth annotated frame.
         categories: road user of each category, None to leave it out.
+        with_map: False leaves the map empty, for tracks alone.
 
     Raises:
         UserError: a file is missing or unreadable, lacks a column, or holds no frame.
@@ -107,7 +109,7 @@ def load_log(
     return Log(
         name=folder.name,
         source="argoverse2",
-        map=read_map(folder / "map"),
+        map=read_map(folder / "map") if with_map else VectorMap({}),
         timestamps_ns=times,
         global_from_ego=_poses_at(times, pose_times, poses, folder),
         tracks=tracks,

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.models.cases import CAMERA_TOPONET, WITH_TRAFFIC
 from tests.shared import shared_path
 from tflane_jax.cli import main
+from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
 from tflane_jax.datasets.base import ExampleConfig
@@ -16,9 +18,17 @@ from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.datasets.streaming import StreamingConfig
+from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
+from tflane_jax.runs import open_run, train_run
 from tflane_jax.scene import shapes_of
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
 from tflane_jax.world.simulate import WorldConfig
 
@@ -148,6 +158,29 @@ def test_tracks_are_written_once_and_only_beside_seven_cameras(written, tmp_path
     arguments = ["data", "export", "--config", "camera/toponet", "--splits", "val", "--out", str(out)]
     assert main([*arguments, "--tracks", str(tmp_path / "t"), "--data.val", "1"]) == 2
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path):
+    """The whole chain: both layouts, workers, prior, camera model, update, evaluation with and without traffic."""
+    frames, tracks = written
+    loading = StreamingConfig(threads=1, ahead=2)
+    image = ImageConfig(divisor=16)
+    data = OpenLaneV2Data(
+        frames, "val", example=EXAMPLE, image=image, loading=loading, tracks=tracks, augmentation=None
+    )
+    traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=EXAMPLE.history))
+    encoder = replace(CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=7))
+    model = replace(CAMERA_TOPONET, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
+    training = TrainingConfig(steps=2, batch_size=2, eval_every=2)
+    run = RunConfig(LaneGraphTask(model), data, OptimConfig(warmup_steps=0), training)
+    result = train_run(run, tmp_path / "run", progress=False)
+    assert result.step == 2
+    flows = {name: replace(run.evaluation, traffic=name) for name in ("own", "none")}
+    trained = open_run(tmp_path / "run", "last")
+    examples = run.task.load(data.source("val"), progress=False)
+    answers = {name: run.task.evaluate(trained.params[0], examples, config) for name, config in flows.items()}
+    assert all(np.isfinite(answer.groups["all"]["DET_l"]) for answer in answers.values())
 
 
 def test_a_real_log_and_the_frames_of_its_segment():

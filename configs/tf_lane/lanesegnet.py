@@ -11,7 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.losses.areas import AreaLossConfig
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.lane_queries import LaneProposalConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
@@ -38,14 +40,32 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the baseline on the preset `street`, and the same with LaneSegNet's published decoder and losses."""
+    """Return the baseline on the preset `street`, and variants of it.
+
+    `street_published` has LaneSegNet's published decoder and losses, `street_areas` crossings and road boundaries as
+    areas with a decoder of their own, as the map-element-bucket variant.
+    """
     street = _segments("toponet.py:street")
     assert isinstance(street.task, LaneGraphTask)
     model = replace(street.task.model, decoder=SegmentDecoderConfig(layers=3, queries=48), denoising=None)
     return {
         "street": street,
         "street_published": replace(street, task=replace(street.task, model=model, losses=LaneSegNetLossConfig())),
+        "street_areas": _with_areas(street),
     }
+
+
+def _with_areas(config: RunConfig) -> RunConfig:
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.task.model, LaneSegNetConfig)
+    assert isinstance(config.data, WorldData)
+    areas = AreaDecoderConfig(layers=2, heads=4, anchors="spread", output="metric")
+    model = replace(config.task.model, decoder=replace(DECODER, classes=1), areas=areas)
+    # The world's crossings turn either way.
+    losses = replace(LOSSES, areas=AreaLossConfig(rings="both", least_step=0.1, class_target="quality"))
+    example = replace(config.data.example, crossings="ring", area_points=areas.points)
+    data = replace(config.data, example=example)
+    return replace(config, task=replace(config.task, model=model, losses=losses), data=data)
 
 
 def _segments(file: str) -> RunConfig:

@@ -214,11 +214,15 @@ def test_traffic_elements_are_tied_to_the_chains_of_their_segments():
     cropped = crop(vector_map, capacity=4)
     prepared = prepare_map(vector_map, bike_lanes=True)
     shown = np.array([1, 2, 3])
-    out, dropped = traffic_elements(elements, shown, prepared, cropped, np.eye(4), RANGE, capacity=3)
+    out, dropped = traffic_elements(elements, shown, prepared.chain_of, cropped, np.eye(4), RANGE, capacity=3)
     out.validate()
     assert out.valid.tolist() == [True, True, False]
     assert out.attribute[:2].tolist() == [1, 2]
     assert out.lane.tolist() == [[True, False, False], [False, True, False], [False] * 3, [False] * 3]
     assert dropped == 0
-    out, dropped = traffic_elements(elements, shown, prepared, cropped, np.eye(4), RANGE, capacity=1)
+    out, dropped = traffic_elements(elements, shown, prepared.chain_of, cropped, np.eye(4), RANGE, capacity=1)
     assert (out.position[0, 0], dropped) == (30.0, 1)
+    # The same elements tied to the segments themselves: 11 is a row of its own.
+    segments = crop(vector_map, flavour="segments", capacity=4)
+    out, _ = traffic_elements(elements, shown, prepared.segment_of, segments, np.eye(4), RANGE, capacity=3)
+    assert out.lane.tolist() == [[False] * 3, [True, False, False], [False, True, False], [False] * 3]

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tflane_jax.evaluation.lane_segments import segment_detections, segment_truth
+from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_detections, segment_truth
 from tflane_jax.metrics import ElementDetections, LaneSegmentMetrics
-from tflane_jax.scene import Areas, AreaType, LaneGraph, TrafficElements
+from tflane_jax.scene import AreaPrediction, Areas, AreaType, LaneGraph, SegmentPrediction, TrafficElements
 
 VALID = np.array([True, False, True, True])
 
@@ -161,3 +161,21 @@ def test_empty_input():
     assert metrics.compute()["mAP"] == 1.0
     assert np.shape(empty.lanes.points) == (0, 5, 3)
     assert np.shape(none.areas.points) == (0, 10, 3)
+
+
+def test_areas_of_their_own_are_measured_by_class():
+    """Perfect areas get the full score; the two classes exchanged get none."""
+    segments, _, areas, _ = scene(0.0)
+    truth = segment_truth(segments, areas)
+    rows = np.flatnonzero(areas.valid)
+    logits = np.where(np.arange(2) == areas.category[rows, None] - 1, 4.0, -4.0)
+    queries = SegmentPrediction(
+        segments.points, segments.left, segments.right, np.where(segments.valid, 3.0, -3.0)[:, None]
+    )
+    scores = []
+    for columns in (logits, logits[:, ::-1]):
+        found = detections_of_segments(queries.replace(areas=AreaPrediction(areas.points[rows], columns)))
+        metrics = LaneSegmentMetrics("OpenLane-V2")
+        metrics.update(found, truth)
+        scores.append(metrics.compute()["DET_a"])
+    assert scores == [1.0, 0.0]

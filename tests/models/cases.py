@@ -108,6 +108,12 @@ def make_segment_example(seed: int = 0, instances: int = 9, lanes: int = 4, cros
     return example.replace(segments=segments, areas=areas)
 
 
+def make_bucket_example(seed: int = 0, elements: int = 2) -> Example:
+    """Return `make_camera_example` with segments, areas, and elements that govern segments."""
+    example, segments = make_camera_example(seed, elements=elements), make_segment_example(seed)
+    return example.replace(segments=segments.segments, areas=segments.areas)
+
+
 LINES = MapTrConfig(
     encoder=BASELINE.encoder,
     decoder=LineDecoderConfig(dim=16, heads=2, layers=2, queries=6, points=5, sampling_points=2, hidden=16),

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import CAMERA, ELEMENTS, SEGMENTS, SMALL_SEGMENTS, make_segment_example
+from tests.models.cases import CAMERA, ELEMENTS, SEGMENTS, SMALL_SEGMENTS, make_bucket_example, make_segment_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import LaneProposalConfig
 from tflane_jax.models.lane_segments import SegmentHeads, regions
@@ -106,7 +107,10 @@ def test_boundaries_of_the_small_form_start_beside_the_lane_and_end_at_the_borde
     [
         ({"decoder": replace(SEGMENTS.decoder, heads=3)}, "heads even"),
         ({"decoder": replace(SEGMENTS.decoder, sampling_points=12)}, "multiple of 8"),
-        ({"encoder": CAMERA, "elements": ELEMENTS}, "no traffic elements"),
+        ({"elements": ELEMENTS}, "encoder of cameras"),
+        ({"encoder": CAMERA, "elements": replace(ELEMENTS, layers=3)}, "elements.layers and decoder.layers"),
+        ({"areas": AreaDecoderConfig()}, "decoder.classes to 1"),
+        ({"decoder": replace(SEGMENTS.decoder, classes=1)}, "to 2 without"),
     ],
 )
 def test_sizes_that_do_not_fit_are_named(change, message):
@@ -130,6 +134,59 @@ def test_it_trains_with_proposals_and_denoising_and_all_their_parameters_learn()
     silent = [
         f"{part}/{name}"
         for part in ("proposals", "noised", "heads_0", "heads_1", "successor")
+        for name, leaf in gradient[part].items()
+        if not any(np.any(x) for x in jax.tree.leaves(leaf))
+    ]
+    assert not silent
+
+
+AREAS = AreaDecoderConfig(dim=16, heads=2, layers=2, queries=4, points=22, sampling_points=2, hidden=16)
+BUCKET = replace(SEGMENTS, decoder=replace(SEGMENTS.decoder, classes=1), areas=AREAS)
+"""The map-element-bucket variant on BEV evidence; with cameras it has traffic elements as well."""
+
+
+def test_areas_are_predicted_apart_and_segments_have_one_class():
+    module = BUCKET.build()
+    params = random_params(lambda key: module.init(key, BEV, method=LaneSegNet.decode)["params"])
+    found = jax.jit(lambda p: module.apply({"params": p}, BEV, method=LaneSegNet.decode))(params)
+    assert found.segments.logits.shape == (2, 6, 1)
+    assert found.segments.areas.points.shape == (2, 4, 22, 3)
+    assert found.segments.areas.logits.shape == (2, 4, 2)
+
+
+def test_the_published_fault_of_the_areas_changes_their_points_alone():
+    """Points are the raw change scaled to the range; references, and with them all else, are refined as meant."""
+    meant, raw = (replace(BUCKET, areas=replace(AREAS, output=output)).build() for output in ("sigmoid", "raw"))
+    params = random_params(lambda key: meant.init(key, BEV, method=LaneSegNet.decode)["params"])
+    right, wrong = (
+        jax.jit(lambda p, m=module: m.apply({"params": p}, BEV, method=LaneSegNet.decode).segments)(params)
+        for module in (meant, raw)
+    )
+    np.testing.assert_allclose(right.areas.logits, wrong.areas.logits, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(right.points, wrong.points, rtol=1e-5, atol=1e-5)
+    box = BUCKET.spec.bev_range
+    unit, change = box.normalise(right.areas.points), box.normalise(wrong.areas.points)
+    logit = jnp.log(unit / (1 - unit))
+    # The second layer starts from the first one's points: logits differ by the change.
+    np.testing.assert_allclose(logit[1] - logit[0], change[1], rtol=1e-2, atol=1e-3)
+
+
+def test_the_bucket_trains_on_areas_and_elements_and_all_their_parameters_learn():
+    model = replace(BUCKET, encoder=CAMERA, elements=ELEMENTS)
+    task = LaneGraphTask(model, LaneSegNetLossConfig(cell_weight=0.0))
+    examples = [make_bucket_example(0), make_bucket_example(1, elements=0)]
+    params = random_params(task.init, examples[0])
+    run = jax.jit(jax.value_and_grad(task.loss, has_aux=True))
+    (_, report), gradient = run(params, stack_examples(examples), jax.random.key(1))
+    names = {"area_class", "area_points", "area_direction", "element_class", "element_box", "element_lane"}
+    assert names <= set(report)
+    assert float(report["matching/areas"]) == 2.0  # a crossing and a boundary
+    assert float(report["matching/elements"]) == 1.0
+    assert float(report["matching/segments"]) == 4.0  # no crossing among them
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    silent = [
+        f"{part}/{name}"
+        for part in ("areas", "elements", "element_lane", "successor")
         for name, leaf in gradient[part].items()
         if not any(np.any(x) for x in jax.tree.leaves(leaf))
     ]

@@ -9,8 +9,15 @@ from tflane_jax.plots import Findings, save_camera_views, save_differences, save
 from tflane_jax.plots.bev import draw_found, draw_prediction, draw_scene
 from tflane_jax.plots.cameras import draw_camera, draw_projected
 from tflane_jax.plots.figure import new_figure
-from tflane_jax.plots.segments import LINE_STYLES, boundary_types, chosen_segments, draw_boundaries, draw_segments
-from tflane_jax.scene import LineType, stack_examples
+from tflane_jax.plots.segments import (
+    LINE_STYLES,
+    boundary_types,
+    chosen_areas,
+    chosen_segments,
+    draw_boundaries,
+    draw_segments,
+)
+from tflane_jax.scene import AreaPrediction, AreaType, LineType, stack_examples
 
 collections = pytest.importorskip("matplotlib.collections")
 colors = pytest.importorskip("matplotlib.colors")
@@ -79,6 +86,22 @@ def test_predicted_segments_crossings_and_links(ax):
     ring = shapes[0].get_paths()[0].vertices[:-1]
     np.testing.assert_allclose(ring[:4], prediction.left[2, :, :2])
     np.testing.assert_allclose(ring[4:], prediction.right[2, ::-1, :2])
+
+
+def test_areas_of_their_own_take_the_place_of_crossings(ax):
+    segments = fake_segments()
+    assert len(chosen_areas(segments, 0.5, AreaType.PEDESTRIAN_CROSSING)[0]) == 1
+    assert len(chosen_areas(segments, 0.5, AreaType.ROAD_BOUNDARY)[0]) == 0
+    lines = np.arange(3 * 5 * 3, dtype=np.float32).reshape(3, 5, 3)
+    areas = AreaPrediction(lines, np.array([[2.0, -3.0], [-3.0, 1.0], [-3.0, -3.0]]))
+    apart = segments.replace(areas=areas)
+    rings, scores = chosen_areas(apart, 0.5, AreaType.PEDESTRIAN_CROSSING)
+    np.testing.assert_array_equal(rings, lines[:1])
+    np.testing.assert_allclose(scores, 1 / (1 + np.exp(-2.0)))
+    np.testing.assert_array_equal(chosen_areas(apart, 0.5, AreaType.ROAD_BOUNDARY)[0], lines[1:2])
+    before = len(ax.collections)
+    draw_prediction(ax, apart, threshold=0.5)
+    assert len(ax.collections) > before
 
 
 @pytest.mark.parametrize("queries", [0, 1])

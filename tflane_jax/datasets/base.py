@@ -48,6 +48,8 @@ class ExampleConfig:
             frame: 2 s at the 10 Hz of the built-in world and of Argoverse 2.
         tracks: instances K of traffic flow.
         elements: traffic lights and signs.
+        elements_of: lanes that they govern, the rows of `TrafficElements.lane`: merged centerlines, as TopoNet learns,
+            or lane segments, as LaneSegNet's map-element-bucket variant.
         bike_lanes: whether bicycle lanes are ground truth.
         sd_map: coarse map of the roads of the built-in world; None leaves it out.
         map_lines: lines of a vector map, the truth of MapTR and MapTRv2; None leaves them out.
@@ -68,6 +70,7 @@ class ExampleConfig:
     history_hz: float | None = None
     tracks: int = 96
     elements: int = 24
+    elements_of: Literal["centerlines", "segments"] = "centerlines"
     bike_lanes: Literal["include", "exclude"] = "include"
     sd_map: SdMapConfig | None = None
     map_lines: MapLinesConfig | None = None

@@ -122,8 +122,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     elements, elements_dropped = traffic_elements(
         log.map.elements,
         _attributes(log, moment.track_frame),
-        prepared,
-        lanes,
+        *((prepared.chain_of, lanes) if config.elements_of == "centerlines" else (prepared.segment_of, segments)),
         ego_from_global,
         config.range,
         capacity=config.elements,

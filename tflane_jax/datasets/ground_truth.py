@@ -7,13 +7,13 @@ docs/reference/openlane_v2_truth.md gives the rules and their sources.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from tflane_jax.datasets.prepared_map import MapLanes, PreparedMap
+from tflane_jax.datasets.prepared_map import MapLanes
 from tflane_jax.geometry import PerceptionRange, transform_points
 from tflane_jax.geometry.polylines import arc_length, clip_to_range, resample_lines, sample_at
 from tflane_jax.scene import LaneGraph, TrafficElements
@@ -151,7 +151,7 @@ def _position_along(line: np.ndarray, point: np.ndarray) -> float:
 def traffic_elements(
     elements: Sequence[MapElement],
     attribute: Int[np.ndarray, " m"],
-    prepared: PreparedMap,
+    number: Mapping[int, int],
     lanes: CroppedLanes,
     ego_from_global: Float[np.ndarray, "4 4"],
     range_: PerceptionRange,
@@ -159,15 +159,15 @@ def traffic_elements(
     capacity: int,
     seen: ElementViews | None = None,
 ) -> tuple[TrafficElements, int]:
-    """Return lights and signs with the centerlines that they govern, and how many exceeded the capacity.
+    """Return lights and signs with the lanes that they govern, and how many exceeded the capacity.
 
     Ground truth are the elements visible in the front image. Without an image, they are those in range and nearer than
     `ELEMENT_DISTANCE`. Of more than the capacity, the farthest are left out.
 
     Args:
         elements, attribute: the map's elements and the attribute of each at this moment.
-        prepared: the map.
-        lanes: lanes in range, cut from `prepared.centerlines`.
+        number: from segment id to the number of its lane: `PreparedMap.chain_of` or `PreparedMap.segment_of`.
+        lanes: lanes in range, of this flavour.
         ego_from_global: pose.
         range_: perception range, ego frame.
         capacity: elements in the result.
@@ -181,8 +181,8 @@ def traffic_elements(
     there = range_.contains(position) & (distance < ELEMENT_DISTANCE) if seen is None else seen.visible
     found = np.flatnonzero(there)
     kept = np.sort(found[np.argsort(distance[found], kind="stable")[:capacity]])
-    for row, number in enumerate(kept):
-        governed = [prepared.chain_of[s] for s in elements[number].lanes if s in prepared.chain_of]
+    for row, element in enumerate(kept):
+        governed = [number[s] for s in elements[element].lanes if s in number]
         out.lane[: len(lanes.lane), row] = np.isin(lanes.lane, governed)
     n = len(kept)
     out.position[:n] = position[kept]

@@ -65,6 +65,11 @@ class PreparedMap:
     samples: MapSamples
 
     @cached_property
+    def segment_of(self) -> dict[int, int]:
+        """From segment id to its number in `segments`."""
+        return {segment.id: i for i, segment in enumerate(self.segments.lanes)}
+
+    @cached_property
     def geometry(self) -> MapGeometry:
         """The lines of the map, for `map_lines`; made when first asked for."""
         rings = (self.crossings.line(i) for i in range(len(self.crossings.ends)))

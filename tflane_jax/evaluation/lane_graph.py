@@ -112,7 +112,9 @@ class LaneGraphMetrics:
             lanes = truth_from_example(example.lanes, true)
             self._centerlines.update(detections, lanes, frame_group, members.get("centerlines"))
         if prediction.segments is not None:
-            segments = segment_truth(example.segments, example.areas, true, None if true is None else example.lanes)
+            # Elements govern segments, or the centerlines on which segments lie.
+            own = true is None or len(true.lane) == len(example.segments.valid)
+            segments = segment_truth(example.segments, example.areas, true, None if own else example.lanes)
             frame = match_segments(detections_of_segments(prediction.segments, found), segments)
             self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
             self._devkit.add(frame)

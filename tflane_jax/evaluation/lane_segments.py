@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import expit
@@ -10,7 +12,15 @@ from tflane_jax.datasets.openlane_export import segments_on_lanes
 from tflane_jax.evaluation.centerlines import element_detections
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
 from tflane_jax.metrics.segment_matching import CROSSING, AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
-from tflane_jax.scene import Areas, ElementPrediction, LaneGraph, SegmentPrediction, TrafficElements
+from tflane_jax.scene import (
+    AreaPrediction,
+    Areas,
+    AreaType,
+    ElementPrediction,
+    LaneGraph,
+    SegmentPrediction,
+    TrafficElements,
+)
 
 SEGMENT_CLASSES = ("lane_segment", "ped_crossing")
 """Classes of LaneSegNet's queries."""
@@ -105,11 +115,11 @@ def segment_detections(
 
 
 def detections_of_segments(segments: SegmentPrediction, elements: ElementPrediction | None = None) -> SegmentDetections:
-    """Return the last decoder layer's segments of one example, see `segment_detections`."""
+    """Return the last decoder layer's segments of one example, and its areas, see `segment_detections`."""
     confidence = expit(np.asarray(segments.logits))
     edges, types = segments.successor_logits, (segments.left_type_logits, segments.right_type_logits)
     left_type, right_type = (None if logits is None else np.asarray(logits).argmax(-1) for logits in types)
-    return segment_detections(
+    detections = segment_detections(
         np.asarray(segments.points),
         np.asarray(segments.left),
         np.asarray(segments.right),
@@ -120,6 +130,15 @@ def detections_of_segments(segments: SegmentPrediction, elements: ElementPredict
         left_type=left_type,
         right_type=right_type,
     )
+    return detections if segments.areas is None else replace(detections, areas=area_detections(segments.areas))
+
+
+def area_detections(areas: AreaPrediction) -> AreaDetections:
+    """Return the last decoder layer's areas of one example, best score first, each query with its best class."""
+    confidence = expit(np.asarray(areas.logits))
+    order = np.argsort(-confidence.max(-1), kind="stable")
+    category = confidence.argmax(-1)[order] + int(AreaType.PEDESTRIAN_CROSSING)
+    return AreaDetections(np.asarray(areas.points)[order], category, confidence.max(-1)[order])
 
 
 def _element_truth(

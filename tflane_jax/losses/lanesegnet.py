@@ -8,7 +8,7 @@ directed. Weights and conventions: docs/reference/lanesegnet.md.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -19,13 +19,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.datasets.segment_targets import SegmentTargets
+from tflane_jax.losses.areas import AreaLossConfig, area_loss
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
     Terms,
+    edge_loss,
     focal,
     last_layer,
+    last_layers,
     matched,
     positives,
     quality_focal,
@@ -34,10 +37,17 @@ from tflane_jax.losses.common import (
 from tflane_jax.losses.costs import dice_cost, focal_cost, mask_cost, pairwise_l1
 from tflane_jax.losses.segment_masks import Raster, segment_masks
 from tflane_jax.losses.toponet import lane_quality
+from tflane_jax.losses.traffic_elements import (
+    ElementLossConfig,
+    assign_elements,
+    clear_padding,
+    element_losses,
+    true_elements,
+)
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
-from tflane_jax.models.segment_truth import LANE, ordered_targets, target_lanes, target_lines
-from tflane_jax.scene import Example, Prediction, SegmentPrediction
+from tflane_jax.models.segment_truth import LANE, governed_rows, ordered_targets, target_lanes, target_lines
+from tflane_jax.scene import ElementPrediction, Example, Prediction, SegmentPrediction
 
 
 @dataclass(frozen=True)
@@ -54,11 +64,13 @@ class LaneSegNetLossConfig(HostLossConfig):
         matcher: backend of `matching.match`.
         dice_cost: the dice cost takes the masks' "logits", as the published configuration does, or their
             "probabilities", as the dice loss does.
+        element_lane_weight: of the topology with traffic elements, a focal loss as that of the successors.
         successor_mean: the sum over matched pairs is divided by the number of "negatives", the pairs without an edge,
             as in the published code, or of all "pairs".
         raster: of the mask targets.
         class_target: of a query matched with a segment: "one", or "quality" (`segment_quality`).
         proposal_weight: of the heat map of proposals; their shapes have `points_weight`.
+        elements, areas: weights of traffic elements and of areas, where the model predicts them.
         cell_weight: see `HostLossConfig`.
     """
 
@@ -68,6 +80,7 @@ class LaneSegNetLossConfig(HostLossConfig):
     dice_weight: float = 3.0
     type_weight: float = 0.1
     successor_weight: float = 5.0
+    element_lane_weight: float = 5.0
     alpha: float = 0.25
     gamma: float = 2.0
     matcher: Literal["scipy", "jax"] = "jax"
@@ -76,6 +89,8 @@ class LaneSegNetLossConfig(HostLossConfig):
     raster: Raster = "cells"
     class_target: Literal["one", "quality"] = "one"
     proposal_weight: float = 1.5
+    elements: ElementLossConfig = ElementLossConfig()
+    areas: AreaLossConfig = AreaLossConfig()
 
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any
@@ -85,9 +100,17 @@ class LaneSegNetLossConfig(HostLossConfig):
         if segments is None or segments.mask_logits is None or segments.successor_logits is None:
             raise ValueError("LaneSegNet's loss needs predicted segments with masks and topology")
         bev_range, shape = host.encoder.bev_range, segments.mask_logits.shape[-2:]
-        targets = jax.vmap(partial(ordered_targets, center=host.center))(batch.segments, batch.areas)
+        classes = host.decoder.classes
+        targets = jax.vmap(partial(ordered_targets, center=host.center, classes=classes))(batch.segments, batch.areas)
         masks = jax.vmap(partial(target_masks, shape=shape, range_=bev_range, raster=self.raster))(targets)
-        loss, report = segment_loss(segments, targets, masks, self)
+        assignment = assign_segments(segments, targets, masks, self)
+        loss, report = segment_loss(segments, targets, masks, self, assignment)
+        if segments.areas is not None:
+            of_areas, terms = area_loss(segments.areas, batch.areas, self.areas, self.matcher)
+            loss, report = loss + of_areas, report | terms
+        if outputs.elements is not None:
+            of_elements, terms = self._element_loss(outputs.elements, last_layers(assignment, 1), batch)
+            loss, report = loss + of_elements, report | terms
 
         def denoising(found, _):
             return segment_denoising_losses(found, targets, masks, self)
@@ -106,6 +129,22 @@ class LaneSegNetLossConfig(HostLossConfig):
             loss += term
         return loss, report | more
 
+    def _element_loss(
+        self, prediction: ElementPrediction, segments: Assignment, batch: Example
+    ) -> tuple[Float[Array, ""], Report]:
+        """Return the loss of traffic elements and of their topology with the segments, and its terms."""
+        elements, size = true_elements(batch)
+        elements = clear_padding(elements)
+        found = assign_elements(prediction, elements, size, self.elements, self.matcher)
+        terms = element_losses(prediction, found, elements, size, self.elements)
+        rows = jax.vmap(partial(governed_rows, rows=segments.query.shape[-1]))(batch.segments, elements.lane)
+        edges = rows & elements.valid[:, None]
+        logits = jnp.asarray(prediction.lane_logits)
+        terms["element_lane"] = self.element_lane_weight * edge_loss(
+            logits, segments, last_layers(found, 1), edges, self.alpha, self.gamma
+        )
+        return total(terms), last_layer(terms) | {"matching/elements": matched(found)}
+
 
 def target_masks(targets: SegmentTargets, shape: tuple[int, int], range_: Any, raster: Raster) -> Float[Array, "n h w"]:
     """Return the masks of one example's targets, 0 for padding."""
@@ -118,6 +157,7 @@ def segment_loss(
     targets: SegmentTargets,
     masks: Float[Array, "b n h w"],
     config: LaneSegNetLossConfig,
+    assignment: Assignment | None = None,
 ) -> tuple[Float[Array, ""], Report]:
     """Return the loss of a batch and its terms.
 
@@ -126,12 +166,14 @@ def segment_loss(
         targets: ground truth, leading axis batch.
         masks: of the targets.
         config: weights.
+        assignment: of `assign_segments`, if known.
 
     Returns:
         The sum over layers of all weighted terms, and the terms of the last layer under `class`, `points`, `mask`,
         `dice`, `line_type`, `successor`; and `matching/segments`, the mean number of matched segments per example.
     """
-    assignment = assign_segments(prediction, targets, masks, config)
+    if assignment is None:
+        assignment = assign_segments(prediction, targets, masks, config)
     terms = segment_losses(prediction, assignment, targets, masks, config)
     return total(terms), last_layer(terms) | {"matching/segments": matched(assignment)}
 
@@ -143,7 +185,7 @@ def assign_segments(
     config: LaneSegNetLossConfig,
 ) -> Assignment:
     """Return the assignment (B, D, N) of a batch."""
-    layers = prediction.replace(successor_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
+    layers = replace(prediction, successor_logits=None, areas=None)
     each = jax.vmap(partial(matching_cost, config=config), in_axes=(0, None, None))
     cost = jax.vmap(each)(layers, targets, masks)
     return match(cost, targets.valid[:, None], config.matcher)
@@ -174,7 +216,7 @@ def segment_losses(
     config: LaneSegNetLossConfig,
 ) -> Terms:
     """Return the weighted losses of every layer of a batch; of the topology, those of the last layer."""
-    layers = prediction.replace(successor_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
+    layers = replace(prediction, successor_logits=None, areas=None)
     each = jax.vmap(partial(_layer_sums, config=config), in_axes=(0, 0, None, None))
     sums = jax.vmap(each)(layers, assignment, targets, masks)  # each (B, D)
     count = positives(assignment)

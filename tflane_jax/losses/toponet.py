@@ -16,7 +16,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_fit
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
@@ -33,7 +32,13 @@ from tflane_jax.losses.common import (
     total,
 )
 from tflane_jax.losses.costs import focal_cost, pairwise_l1
-from tflane_jax.losses.traffic_elements import ElementLossConfig, clear_padding, element_cost, element_terms
+from tflane_jax.losses.traffic_elements import (
+    ElementLossConfig,
+    assign_elements,
+    clear_padding,
+    element_losses,
+    true_elements,
+)
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.scene import (
@@ -98,14 +103,7 @@ def lane_graph_host_loss(
     Raises:
         UserError: elements are predicted, but the data have none.
     """
-    elements = sizes = None
-    if outputs.elements is not None:
-        if batch.traffic_elements is None or batch.cameras is None:
-            raise UserError(
-                "the model predicts traffic elements, and these data label none: choose data with front images and "
-                "traffic elements, or set task.model.elements to None"
-            )
-        elements, sizes = batch.traffic_elements, batch.cameras.size[:, 0]
+    elements, sizes = (None, None) if outputs.elements is None else true_elements(batch)
     loss, report = lane_graph_loss(outputs, batch.lanes, config, elements, sizes, control_points)
     further, more = auxiliary_losses(
         auxiliary,
@@ -160,9 +158,8 @@ def lane_graph_loss(
         if elements is None or size is None:
             raise ValueError("a loss of predicted traffic elements needs the true ones and the size of their images")
         elements = clear_padding(elements)
-        each = partial(element_cost, config=config.elements)
-        found = match(jax.vmap(each)(prediction.elements, elements, size), elements.valid[:, None], config.matcher)
-        terms |= element_losses(prediction.elements, found, elements, size, config)
+        found = assign_elements(prediction.elements, elements, size, config.elements, config.matcher)
+        terms |= element_losses(prediction.elements, found, elements, size, config.elements)
         terms["element_lane"] = element_lane_loss(prediction.elements, assignment, found, lanes, elements, config)
         report["matching/elements"] = matched(found)
     return total(terms), last_layer(terms) | report
@@ -220,27 +217,6 @@ def lane_denoising_losses(
     lanes = lanes.replace(points=jnp.where(lanes.valid[..., None, None], lanes.points, 0.0))  # pyright: ignore
     prediction, assignment, lanes = denoising_pairs(prediction, lanes, lanes.valid)
     return lane_losses(prediction, assignment, lanes, config, control_points)
-
-
-def element_losses(
-    prediction: ElementPrediction,
-    assignment: Assignment,
-    elements: TrafficElements,
-    size: Int[Array, "b 2"],
-    config: TopoNetLossConfig,
-) -> Terms:
-    """Return the weighted losses `element_class`, `element_box` and `element_iou` of every layer of a batch."""
-    weights = config.elements
-    # The topology may have fewer layers than the other leaves.
-    prediction = prediction.replace(lane_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
-    each = jax.vmap(partial(element_terms, config=weights), in_axes=(0, 0, None, None))
-    classes, boxes, apart = jax.vmap(each)(prediction, assignment, elements, size)  # each (B, D)
-    count = positives(assignment)
-    return {
-        "element_class": weights.class_weight * classes.sum(0) / count,
-        "element_box": weights.box_weight * boxes.sum(0) / count,
-        "element_iou": weights.iou_weight * apart.sum(0) / count,
-    }
 
 
 def element_lane_loss(

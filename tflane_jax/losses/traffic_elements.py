@@ -7,14 +7,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.errors import UserError
+from tflane_jax.losses.common import Terms, positives
 from tflane_jax.losses.costs import focal_cost, generalised_iou, pairwise_l1
-from tflane_jax.matching import Assignment
-from tflane_jax.scene import ElementPrediction, TrafficElements
+from tflane_jax.matching import Assignment, match
+from tflane_jax.scene import ElementPrediction, Example, TrafficElements
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,51 @@ def element_cost(
     cost_box = pairwise_l1(_fractions(prediction.box, size), _fractions(elements.box, size)[None])
     iou = generalised_iou(prediction.box[:, :, None], elements.box[None, None])
     return config.class_weight * cost_class + config.box_weight * cost_box - config.iou_weight * iou
+
+
+def true_elements(batch: Example) -> tuple[TrafficElements, Int[Array, "b 2"]]:
+    """Return the traffic elements of a batch, and width and height of the front images, pixels.
+
+    Raises UserError if the data have none.
+    """
+    if batch.traffic_elements is None or batch.cameras is None:
+        raise UserError(
+            "the model predicts traffic elements, and these data label none: choose data with front images and "
+            "traffic elements, or set task.model.elements to None"
+        )
+    return batch.traffic_elements, batch.cameras.size[:, 0]
+
+
+def assign_elements(
+    prediction: ElementPrediction,
+    elements: TrafficElements,
+    size: Int[Array, "b 2"],
+    weights: ElementLossConfig,
+    matcher: Literal["scipy", "jax"],
+) -> Assignment:
+    """Return the assignment (B, D, E) of a batch; `elements` without garbage in padding (`clear_padding`)."""
+    cost = jax.vmap(partial(element_cost, config=weights))(prediction, elements, size)
+    return match(cost, elements.valid[:, None], matcher)
+
+
+def element_losses(
+    prediction: ElementPrediction,
+    assignment: Assignment,
+    elements: TrafficElements,
+    size: Int[Array, "b 2"],
+    weights: ElementLossConfig,
+) -> Terms:
+    """Return the weighted losses `element_class`, `element_box` and `element_iou` of every layer of a batch."""
+    # The topology may have fewer layers than the other leaves.
+    prediction = prediction.replace(lane_logits=None)  # pyright: ignore[reportAttributeAccessIssue]
+    each = jax.vmap(partial(element_terms, config=weights), in_axes=(0, 0, None, None))
+    classes, boxes, apart = jax.vmap(each)(prediction, assignment, elements, size)  # each (B, D)
+    count = positives(assignment)
+    return {
+        "element_class": weights.class_weight * classes.sum(0) / count,
+        "element_box": weights.box_weight * boxes.sum(0) / count,
+        "element_iou": weights.iou_weight * apart.sum(0) / count,
+    }
 
 
 def element_terms(

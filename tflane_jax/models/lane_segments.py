@@ -21,8 +21,6 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 
-CLASSES = 2
-"""Lane segment, pedestrian crossing (`models.segment_targets`)."""
 LINE_TYPES = 3
 """As `scene.LineType`."""
 # Half the width of a lane, metres: where the boundaries of `offsets="lane"` start.
@@ -38,6 +36,7 @@ class SegmentDecoderConfig(LaneDecoderConfig):
             freely, as in LaneSegNet; "iterative": see `models.lane_decoder`.
         offsets: of the boundaries from the centerline. "ego": metres along x, y and z, as in LaneSegNet; "lane": along
             and across the centerline at each point, smooth along the lane, starting 1.75 m to either side.
+        classes: 2: lane segment and crossing; 1: lane segment, where areas have a decoder of their own.
         initial_score: initial probability of the classes; None: PyTorch's initial biases, as in LaneSegNet.
         edge_weight: not used, there is no scene graph.
         others: see `LaneDecoderConfig`; `sampling_points` is a multiple of 8 or less than 8, `heads` is even.
@@ -47,6 +46,7 @@ class SegmentDecoderConfig(LaneDecoderConfig):
     sampling_points: int = 32
     refine: Literal["point", "iterative"] = "point"  # pyright: ignore[reportIncompatibleVariableOverride]
     offsets: Literal["ego", "lane"] = "ego"
+    classes: Literal[1, 2] = 2
     initial_score: float | None = None
 
     def check(self) -> None:
@@ -112,7 +112,7 @@ class SegmentHeads(nn.Module):
         config, hidden, lines = self.config, (self.config.dim,) * 2, self.config.points * 3
         score = config.initial_score
         bias = None if score is None else math.log(score / (1.0 - score))
-        logits = Branch((*hidden, CLASSES), norm=True, bias=bias, name="class")(queries)
+        logits = Branch((*hidden, config.classes), norm=True, bias=bias, name="class")(queries)
         left_type, right_type = (
             Branch((*hidden, LINE_TYPES), norm=True, name=f"{side}_type")(queries) for side in ("left", "right")
         )

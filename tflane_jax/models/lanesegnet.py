@@ -2,12 +2,13 @@
 
 Images -> BEV features -> segment queries -> (priors) -> decoder layers -> centerlines, boundaries, line types, classes,
 masks -> topology of the last layer. The small version reads BEV evidence instead of images; decoder, heads and losses
-are the same. Source: docs/reference/lanesegnet.md.
+are the same. The map-element-bucket variant has decoders of their own for areas and traffic elements.
+Source: docs/reference/lanesegnet.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import flax.linen as nn
@@ -19,8 +20,11 @@ from jaxtyping import Array, Float
 from tflane_jax.datasets.segment_targets import Center
 from tflane_jax.errors import UserError
 from tflane_jax.layers.graph import RelationshipHead
+from tflane_jax.models.area_decoder import PAPER_AREA_DECODER, AreaDecoder, AreaDecoderConfig
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
+from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
+from tflane_jax.models.encoders import check_elements
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, lane_position
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
@@ -35,7 +39,7 @@ from tflane_jax.models.parameters import with_equal_heads
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.models.segment_truth import ordered_targets, target_lanes
-from tflane_jax.scene import LaneGraph, Prediction, SegmentPrediction
+from tflane_jax.scene import ElementPrediction, LaneGraph, Prediction, SegmentPrediction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,16 +52,20 @@ class LaneSegNetConfig(HostConfig):
         last_step: "twice": outside training, the last layer's change of the centerline is applied to its own result
             once more. The published code does so by mistake, and its weights reach their published numbers with it.
         center: the centerline that is learned, see `datasets.segment_targets`.
-        encoder, range, priors: see `HostConfig`. LaneSegNet predicts no traffic elements.
+        areas: decoder of crossings and road boundaries, as in the map-element-bucket variant; crossings are then no
+            class of the segments (`decoder.classes=1`). None: crossings are segments of the second class.
+        encoder, range, priors, elements: see `HostConfig`; elements need as many layers as the decoder.
     """
 
     decoder: SegmentDecoderConfig = SegmentDecoderConfig()
     denoising: DenoisingConfig | None = None
     last_step: Literal["once", "twice"] = "once"
     center: Center = "mean"
+    areas: AreaDecoderConfig | None = None
 
     truth: ClassVar[tuple[str, ...]] = ("segments", "areas")
     predicts: ClassVar[tuple[str, ...]] = ("segments",)
+    elements_of: ClassVar[Literal["lanes", "segments"]] = "segments"
 
     @property
     def query_dim(self) -> int:
@@ -71,20 +79,32 @@ class LaneSegNetConfig(HostConfig):
 
     @property
     def example_points(self) -> dict[str, int]:
-        """Segments are compared point by point; crossings have two sides."""
-        return {"segment_points": self.decoder.points, "area_points": 2 * self.decoder.points}
+        """Segments and areas are compared point by point; a crossing that is a segment has two sides."""
+        areas = 2 * self.decoder.points if self.areas is None else self.areas.points
+        return {"segment_points": self.decoder.points, "area_points": areas}
 
     def build(self) -> LaneSegNet:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        if self.elements is not None:
-            raise UserError("LaneSegNet predicts no traffic elements: set task.model.elements to None")
+        check_elements(self.encoder, self.decoder.layers, self.elements)
         self.decoder.check()
+        if (self.areas is None) != (self.decoder.classes == 2):
+            raise UserError(
+                "crossings are either the second class of the segments or areas with a decoder of their own: set "
+                "task.model.decoder.classes to 1 with task.model.areas, and to 2 without"
+            )
         return LaneSegNet(self)
 
 
 def paper_config() -> LaneSegNetConfig:
     """Return the published sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 queries of 10 points."""
     return LaneSegNetConfig(encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_SEGMENT_DECODER)
+
+
+def paper_bucket_config() -> LaneSegNetConfig:
+    """Return the sizes of the map-element-bucket variant: six encoder layers, areas and traffic elements."""
+    encoder = replace(PAPER_CAMERA_ENCODER, bev=replace(PAPER_CAMERA_ENCODER.bev, layers=6))
+    decoder = replace(PAPER_SEGMENT_DECODER, classes=1)
+    return LaneSegNetConfig(encoder=encoder, decoder=decoder, areas=PAPER_AREA_DECODER, elements=PAPER_ELEMENT_DECODER)
 
 
 class LaneSegNet(Host):
@@ -101,8 +121,10 @@ class LaneSegNet(Host):
         config, lanes = self.config, None
         taught = lane_auxiliary(config.decoder, config.denoising) and self.is_mutable_collection(AUXILIARY)
         if taught and example.segments is not None:
-            lanes = target_lanes(ordered_targets(example.segments, example.areas, config.center))
-        return self.decode(bev, tokens, lanes, deterministic=deterministic)
+            lanes = target_lanes(
+                ordered_targets(example.segments, example.areas, config.center, config.decoder.classes)
+            )
+        return self.decode(bev, tokens, lanes, elements, deterministic=deterministic)
 
     @nn.compact
     def decode(
@@ -110,6 +132,7 @@ class LaneSegNet(Host):
         bev: Float[Array, "h w e"],
         tokens: ByPrior | None = None,
         lanes: LaneGraph | None = None,
+        elements: ElementOutput | None = None,
         *,
         deterministic: bool = True,
     ) -> Prediction:
@@ -122,9 +145,16 @@ class LaneSegNet(Host):
             bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
             tokens: of the priors, by name.
             lanes: ground truth of denoising and proposals; not used otherwise.
+            elements: outputs of the traffic-element decoder, or None.
             deterministic: no dropout, and the form of the evaluation.
         """
-        return decode_lanes(self, self.config.decoder, bev, None, tokens or {}, lanes, deterministic)
+        config, spec = self.config, self.config.spec
+        found = decode_lanes(self, config.decoder, bev, elements, tokens or {}, lanes, deterministic)
+        if config.areas is None:
+            return found
+        assert found.segments is not None
+        areas = AreaDecoder(config.areas, spec.bev_range, spec.range, name="areas")(bev, deterministic=deterministic)
+        return replace(found, segments=replace(found.segments, areas=areas))
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
         """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
@@ -148,7 +178,11 @@ class LaneSegNet(Host):
             boundaries = [spec.bev_range.normalise(line) for line in (output.left, output.right)]
             around = lax.stop_gradient(regions(*boundaries, config))
         successor = RelationshipHead(config.relation, name="successor")(queries, queries)
-        return make_prediction(outputs, successor)
+        found = make_prediction(outputs, successor)
+        if elements is None:
+            return found
+        governed = RelationshipHead(config.relation, name="element_lane")(queries, elements.queries[-1])
+        return replace(found, elements=ElementPrediction(elements.box, elements.logits, governed[None]))
 
 
 def make_prediction(outputs: list[SegmentOutput], successor: Float[Array, "q q"]) -> Prediction:

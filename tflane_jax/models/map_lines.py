@@ -7,6 +7,7 @@ line. Every decoder layer moves all points; the class of a line comes from the m
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -19,10 +20,11 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
-from tflane_jax.models.lane_decoder import clipped
+from tflane_jax.models.lane_decoder import LaneDecoderLayer, clipped
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
 from tflane_jax.models.lane_queries import spread_lanes
 from tflane_jax.models.lane_segments import Branch
+from tflane_jax.models.prior import HostQueries
 from tflane_jax.scene import MapLines
 
 
@@ -37,7 +39,7 @@ class LineDecoderConfig:
         queries: lines I.
         points: points P of a line; the decoder has I P queries.
         coordinates: of a point, x and y, or x, y and z.
-        classes: of `scene.LineClass`, the first three or four.
+        classes: of `scene.LineClass`, the first three or four; two for areas (`models.area_decoder`).
         sampling_points: deformable sampling points per head.
         hidden: channels inside the feed-forward block.
         anchors: "linear": a point starts at the sigmoid of a linear function of its embedding, and its position
@@ -45,7 +47,8 @@ class LineDecoderConfig:
             over the range, and the position encoding follows them from layer to layer.
         bands: frequencies per coordinate of that encoding.
         output: "sigmoid" adds the change of a point to the logit of its reference, as in MapTR; "metric" adds it in
-            units of `metres` and clips at the border of the perception range, see `LaneDecoderConfig.output`.
+            units of `metres` and clips at the border of the perception range, see `LaneDecoderConfig.output`; "raw" is
+            a fault that published weights need, see `models.area_decoder`.
         metres: unit of change along x, y and z of output "metric".
         dropout: probability, for attention weights, hidden channels and every residual branch.
     """
@@ -56,12 +59,12 @@ class LineDecoderConfig:
     queries: int = 30
     points: int = 12
     coordinates: Literal[2, 3] = 2
-    classes: Literal[3, 4] = 3
+    classes: Literal[2, 3, 4] = 3
     sampling_points: int = 4
     hidden: int = 128
     anchors: Literal["linear", "spread"] = "linear"
     bands: int = 6
-    output: Literal["sigmoid", "metric"] = "sigmoid"
+    output: Literal["sigmoid", "metric", "raw"] = "sigmoid"
     metres: tuple[float, float, float] = (5.0, 5.0, 0.3)
     dropout: float = 0.0
 
@@ -128,7 +131,7 @@ class NoisedLines(nn.Module):
         keys = jax.random.split(self.make_rng("dropout"), copies)
         noised = jax.vmap(lambda key: noised_lanes(key, lines, config.queries, self.range, self.noise))(keys)
         # Away from 0 and 1, where the sigmoid of the points is flat.
-        border = 0.01 if config.output == "sigmoid" else 0.0
+        border = 0.0 if config.output == "metric" else 0.01
         reference = jnp.clip(self.range.normalise(noised[..., : config.coordinates]), border, 1.0 - border)
         learned = self.param("points", nn.initializers.normal(1.0), (config.points, 2 * config.dim))
         learned = jnp.broadcast_to(learned, (*reference.shape[:2], *learned.shape))
@@ -184,9 +187,44 @@ class LineHeads(nn.Module):
         classify = Branch((*hidden, config.classes), norm=True, bias=-math.log(99.0), name="class")
         logits = classify(queries.mean(1))
         change = Branch((*hidden, size), name="points")(queries)
-        if config.output == "sigmoid":
+        if config.output != "metric":
             unit = nn.sigmoid(change + inverse_sigmoid(reference))
         else:
             scale = jnp.asarray(config.metres[:size]) / jnp.asarray(self.range.size(size))
             unit = clipped(reference + change * scale[None, None], self.range, self.limits)
-        return LineOutput(self.range.denormalise(unit), unit, logits)
+        return LineOutput(self.range.denormalise(change if config.output == "raw" else unit), unit, logits)
+
+
+def decode_line_layers(
+    config: LineDecoderConfig,
+    start: PointQueries,
+    bev: Float[Array, "h w e"],
+    range_: PerceptionRange,
+    limits: PerceptionRange | None,
+    *,
+    deterministic: bool,
+    fuse: Callable[[int, HostQueries], Float[Array, "q c"]] | None = None,
+) -> list[LineOutput]:
+    """Return the outputs of all decoder layers; part of a compact module, with `layer_{i}` and `heads_{i}`.
+
+    Args:
+        config: sizes and forms.
+        start: queries and points before the first layer.
+        bev: BEV features.
+        range_, limits: of the heads, see `LineHeads`.
+        deterministic: no dropout.
+        fuse: layer and all I P queries -> the queries with priors; None for none.
+    """
+    content, position, reference = start
+    queries, outputs = content.reshape(-1, config.dim), []
+    for i in range(config.layers):
+        placed = point_position(config, i, position, reference).reshape(-1, config.dim)
+        if fuse is not None:
+            queries = fuse(i, HostQueries(queries, placed))
+        around = reference[..., :2].reshape(-1, 1, 2)
+        layer = LaneDecoderLayer(config, name=f"layer_{i}")
+        queries = layer(queries, placed, around, bev, None, deterministic=deterministic)
+        heads = LineHeads(config, range_, limits, name=f"heads_{i}")
+        outputs.append(heads(queries.reshape(content.shape), reference))
+        reference = lax.stop_gradient(outputs[-1].unit)
+    return outputs

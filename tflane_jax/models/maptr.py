@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
@@ -24,20 +23,17 @@ from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER
-from tflane_jax.models.lane_decoder import LaneDecoderLayer
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_groups
 from tflane_jax.models.map_lines import (
     PAPER_LINE_DECODER,
     LineDecoderConfig,
-    LineHeads,
     LineOutput,
     LineQueries,
     NoisedLines,
     PointQueries,
-    point_position,
+    decode_line_layers,
 )
 from tflane_jax.models.parameters import with_equal_heads
-from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.scene import LinePrediction, MapLines, Prediction
 
@@ -146,18 +142,16 @@ class MapTr(Host):
 
     def decode_queries(self, start: PointQueries, bev, elements, tokens, deterministic) -> Prediction:
         """Return the predictions of one set of queries."""
-        config, spec, (content, position, reference) = self.config.decoder, self.config.spec, start
-        shape = content.shape
-        queries, outputs = content.reshape(-1, config.dim), []
-        for i in range(config.layers):
-            placed = point_position(config, i, position, reference).reshape(-1, config.dim)
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed))
-            around = reference[..., :2].reshape(-1, 1, 2)
-            layer = LaneDecoderLayer(config, name=f"layer_{i}")
-            queries = layer(queries, placed, around, bev, None, deterministic=deterministic)
-            heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
-            outputs.append(heads(queries.reshape(shape), reference))
-            reference = lax.stop_gradient(outputs[-1].unit)
+        spec, priors = self.config.spec, self.priors.by_name
+        outputs = decode_line_layers(
+            self.config.decoder,
+            start,
+            bev,
+            spec.bev_range,
+            spec.range,
+            deterministic=deterministic,
+            fuse=lambda layer, queries: fuse_into_queries(priors, tokens, layer, queries),
+        )
         return make_prediction(outputs)
 
 

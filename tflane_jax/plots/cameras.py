@@ -20,8 +20,9 @@ from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.lines import valid_rows
 from tflane_jax.plots.map_lines import chosen_lines
-from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_segments, outline_of_sides
+from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_areas, chosen_segments
 from tflane_jax.scene import (
+    AreaType,
     CameraViews,
     ElementPrediction,
     Example,
@@ -230,15 +231,17 @@ def draw_projected_boundaries(
 
 
 def _draw_segments(ax: Axes, views: CameraViews, number: int, found: SegmentPrediction, threshold: float) -> None:
-    """Draw predicted segments: thin centerlines by direction, boundaries by type, outlines of crossings."""
-    lanes, crossings = chosen_segments(found, threshold)
+    """Draw predicted segments: thin centerlines by direction, boundaries by type, outlines of crossings, kerbs."""
+    lanes, _ = chosen_segments(found, threshold)
     left, right = np.asarray(found.left), np.asarray(found.right)
     draw_projected(ax, views, number, np.asarray(found.points)[lanes], width=0.8)
     for lines, types in zip((left, right), boundary_types(found, lanes), strict=True):
         draw_projected_boundaries(ax, views, number, lines[lanes], types)
-    rings = outline_of_sides(left[crossings], right[crossings])
+    rings, _ = chosen_areas(found, threshold, AreaType.PEDESTRIAN_CROSSING)
     closed = np.concatenate([rings, rings[:, :1]], 1)
     draw_projected(ax, views, number, closed, colour=style.CROSSING, width=1.5)
+    kerbs, _ = chosen_areas(found, threshold, AreaType.ROAD_BOUNDARY)
+    draw_projected(ax, views, number, kerbs, colour=style.ROAD_BOUNDARY, width=1.5)
 
 
 def _draw_by_class(

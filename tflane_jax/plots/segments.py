@@ -6,11 +6,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
 from tflane_jax.errors import UserError
 from tflane_jax.plots import style
 from tflane_jax.plots.lines import add_arrows, add_crossings, add_lines, add_links, faded, valid_rows
-from tflane_jax.scene import CenterlinePrediction, Example, LaneGraph, LinePrediction, LineType, SegmentPrediction
+from tflane_jax.scene import (
+    AreaType,
+    CenterlinePrediction,
+    Example,
+    LaneGraph,
+    LinePrediction,
+    LineType,
+    SegmentPrediction,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +56,23 @@ def chosen_segments(
     logits = np.asarray(prediction.logits)
     shown, crossing = np.asarray(prediction.scores) >= threshold, logits.argmax(-1) == 1
     return shown & ~crossing, shown & crossing
+
+
+def chosen_areas(
+    prediction: SegmentPrediction, threshold: float, kind: AreaType
+) -> tuple[Float[np.ndarray, "a p 3"], Float[np.ndarray, " a"]]:
+    """Return outlines and scores of the areas of a kind with a score of at least `threshold`.
+
+    Crossings are the outlines of segments of the second class, where areas have no queries of their own.
+    """
+    if prediction.areas is not None:
+        column = int(kind) - int(AreaType.PEDESTRIAN_CROSSING)
+        scores = expit(np.asarray(prediction.areas.logits, np.float64))[:, column]
+        shown = scores >= threshold
+        return np.asarray(prediction.areas.points)[shown], scores[shown]
+    crossings = chosen_segments(prediction, threshold)[1] & (kind == AreaType.PEDESTRIAN_CROSSING)
+    left, right = np.asarray(prediction.left)[crossings], np.asarray(prediction.right)[crossings]
+    return outline_of_sides(left, right), np.asarray(prediction.scores)[crossings]
 
 
 def boundary_types(prediction: SegmentPrediction, chosen: Bool[np.ndarray, " q"]) -> list[Int[np.ndarray, " n"]]:
@@ -112,12 +138,14 @@ def draw_boundaries(
 
 
 def draw_segment_prediction(ax: Axes, prediction: SegmentPrediction, *, threshold: float = 0.3) -> None:
-    """Draw segments and crossings with a score of at least `threshold`, opacity by score, and their topology."""
-    lanes, crossings = chosen_segments(prediction, threshold)
+    """Draw segments and areas with a score of at least `threshold`, opacity by score, and the topology."""
+    lanes, _ = chosen_segments(prediction, threshold)
     points, left, right, scores = (
         np.asarray(array) for array in (prediction.points, prediction.left, prediction.right, prediction.scores)
     )
-    add_crossings(ax, outline_of_sides(left[crossings], right[crossings]), scores[crossings], zorder=3.2)
+    add_crossings(ax, *chosen_areas(prediction, threshold, AreaType.PEDESTRIAN_CROSSING), zorder=3.2)
+    kerbs, sure = chosen_areas(prediction, threshold, AreaType.ROAD_BOUNDARY)
+    add_lines(ax, kerbs, faded(style.ROAD_BOUNDARY, sure), width=1.4, zorder=3.3)
     colours = faded(style.PREDICTION, scores[lanes])
     add_lines(ax, points[lanes], colours, width=0.7, alpha=0.8, zorder=3.5)
     add_arrows(ax, points[lanes], colours, zorder=3.6)

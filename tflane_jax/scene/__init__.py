@@ -15,6 +15,7 @@ from tflane_jax.scene.example import (
     stack_examples,
 )
 from tflane_jax.scene.prediction import (
+    AreaPrediction,
     CenterlinePrediction,
     CurvePrediction,
     ElementPrediction,
@@ -45,6 +46,7 @@ from tflane_jax.scene.views import (
 )
 
 __all__ = [
+    "AreaPrediction",
     "AreaType",
     "Areas",
     "BevChannel",

@@ -33,16 +33,30 @@ class CenterlinePrediction:
 
 
 @struct.dataclass
+class AreaPrediction:
+    """Pedestrian crossings and road boundaries predicted by Q queries of their own.
+
+    Attributes:
+        points: (Q, P, 3) metres, ego frame; a ring repeats its first point at the end.
+        logits: (Q, 2) class logits (sigmoid): pedestrian crossing, road boundary, as `AreaType` orders them.
+    """
+
+    points: Float[Array, "*layers q p 3"]
+    logits: Float[Array, "*layers q 2"]
+
+
+@struct.dataclass
 class SegmentPrediction:
     """Lane segments predicted by Q queries (OpenLane-V2 `lane_segment`, LaneSegNet).
 
     Attributes:
         points: (Q, P, 3) centerline, metres, ego frame, in driving direction.
         left, right: (Q, P, 3) boundaries in driving direction, metres.
-        logits: (Q, C) class logits (sigmoid): lane segment, then pedestrian crossing.
+        logits: (Q, C) class logits (sigmoid): lane segment, then pedestrian crossing, unless `areas` has these.
         left_type_logits, right_type_logits: (Q, T) by `LineType`; None where types are not predicted.
         mask_logits: (Q, H, W) lane area on the BEV grid, row 0 at the smallest y; None without a mask head.
         successor_logits: (Q, Q) [i, j]: segment j continues segment i; None for a model without topology.
+        areas: crossings and road boundaries of queries of their own; None where crossings are segments.
     """
 
     points: Float[Array, "*layers q p 3"]
@@ -53,6 +67,7 @@ class SegmentPrediction:
     right_type_logits: Float[Array, "*layers q t"] | None = None
     mask_logits: Float[Array, "*layers q h w"] | None = None
     successor_logits: Float[Array, "*layers q q"] | None = None
+    areas: AreaPrediction | None = None
 
     @property
     def scores(self) -> Float[Array, "*layers q"]:

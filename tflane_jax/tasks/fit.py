@@ -29,9 +29,20 @@ def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> Non
     _check_ranges(model, config)
     _check_points(model, config)
     _check_traffic(model, config, example)
+    _check_elements(model, example)
     encoder, cameras = model.encoder, example.cameras
     if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
         check_capacity(encoder.bev, cameras)
+
+
+def _check_elements(model: HostConfig, example: Example) -> None:
+    elements, lanes = example.traffic_elements, getattr(example, model.elements_of)
+    if model.elements is not None and elements is not None and len(elements.lane) != len(lanes.valid):
+        wanted = "segments" if model.elements_of == "segments" else "centerlines"
+        raise UserError(
+            f"traffic elements of these data do not govern {wanted}, which this model learns: set "
+            f"data.example.elements_of={wanted} (built-in world), or the flavour of OpenLane-V2 (data.flavour)"
+        )
 
 
 def reads_traffic(model: HostConfig) -> bool:

@@ -1,0 +1,42 @@
+"""LaneSegNet's map-element-bucket variant at its size: segments, areas and traffic elements, on OpenLane-V2 subset A.
+
+    tflane summary --config tf_lane/lanesegnet_bucket_r50 --no-compile          # needs no data
+    tflane train --config tf_lane/lanesegnet_bucket_r50 --data.root PATH
+
+Six encoder layers, images times 0.33, no photometric distortion. Crossings are areas, no segments. `:published_fault`
+predicts areas as the published code does, without the reference that its decoder refines.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
+from tflane_jax.datasets.view_images import LANESEGNET_BUCKET
+from tflane_jax.models.area_decoder import PAPER_AREA_DECODER
+from tflane_jax.models.lanesegnet import LaneSegNetConfig, paper_bucket_config
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+
+def get_config() -> RunConfig:
+    """Return the paper's configuration."""
+    return _bucket(paper_bucket_config())
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the variant of the published area head."""
+    model = paper_bucket_config()
+    return {"published_fault": _bucket(replace(model, areas=replace(PAPER_AREA_DECODER, output="raw")))}
+
+
+def _bucket(model: LaneSegNetConfig) -> RunConfig:
+    """Return LaneSegNet's configuration with another model, and the labels and images that it takes."""
+    config = load_config(str(Path(__file__).with_name("lanesegnet_r50.py")))
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.data, OpenLaneV2Data)
+    # Attention to as many cells as one camera sees, as in camera/toponet_r50.
+    bev = replace(model.encoder.bev, capacity=config.task.model.encoder.bev.capacity)
+    model = replace(model, encoder=replace(model.encoder, bev=bev))
+    example = replace(config.data.example, crossings="ring")
+    data = replace(config.data, image=LANESEGNET_BUCKET, example=example, augmentation=None)
+    training = replace(config.training, best_metric="all/OLUS")
+    return replace(config, task=replace(config.task, model=model), data=data, training=training)

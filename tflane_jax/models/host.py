@@ -73,7 +73,7 @@ class HostConfig:
 
     @property
     def example_points(self) -> dict[str, int]:
-        """Settings of `ExampleConfig` that the truth of this host's loss must have, such as "map_lines.points"."""
+        """Settings of `ExampleConfig` that the truth of this host's loss must have."""
         return {}
 
     @property

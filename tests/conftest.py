@@ -19,11 +19,15 @@ import jax  # noqa: E402
 from tflane_jax.training.runtime import configure_jax  # noqa: E402
 
 configure_jax(keep_programs=False)
-# Programs that several tests make anew, such as a model's initialisation, are compiled once. Every process has a folder
-# of its own: JAX writes these files without a lock.
-_programs = tempfile.mkdtemp(prefix="tflane_tests_")
-atexit.register(shutil.rmtree, _programs, ignore_errors=True)
-os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs  # of commands that tests start
+# Programs that several tests make anew, such as a model's initialisation, are compiled once, in a folder that the
+# workers of a session and the commands that tests start share. JAX writes its files without a lock, and compiles anew
+# where it finds half of one.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    _programs = os.environ["JAX_COMPILATION_CACHE_DIR"]
+else:
+    _programs = tempfile.mkdtemp(prefix="tflane_tests_")
+    atexit.register(shutil.rmtree, _programs, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _programs
 jax.config.update("jax_compilation_cache_dir", _programs)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 # Tracing makes millions of objects and hardly any garbage: collecting at the default rate costs a tenth of the time.

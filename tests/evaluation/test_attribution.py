@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
+from tests.models.cases import BASELINE, SEGMENTS, WITH_TRAFFIC, make_example, make_segment_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.attribution import (
@@ -27,7 +27,8 @@ from tflane_jax.evaluation.attribution import (
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups
 from tflane_jax.evaluation.predict import predict_batch
 from tflane_jax.geometry import BevGrid
-from tflane_jax.scene import CenterlinePrediction, Prediction, stack_examples
+from tflane_jax.models.host import HostConfig
+from tflane_jax.scene import CenterlinePrediction, Prediction, SegmentPrediction, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 TASK = LaneGraphTask(WITH_TRAFFIC)
@@ -40,14 +41,19 @@ class Follower:
     """Predicts the first true lane with the score 0.5 + 0.05 for each road user, 1 m off without road user `leader`."""
 
     leader: int
+    model: HostConfig = WITH_TRAFFIC
     streams: bool = False
 
     def predict(self, params, example):
         there = example.traffic_flow.valid.any(-1)
         moved = jnp.where(there[self.leader], 0.0, params)
-        points = (example.lanes.points[:1] + moved).astype(jnp.float32)
         score = 0.5 + 0.05 * there.sum()
-        return Prediction(centerlines=CenterlinePrediction(points, jnp.log(score / (1 - score))[None, None]))
+        logit = jnp.log(score / (1 - score))
+        if self.model.predicts == ("segments",):  # a crossing has the higher score, and is no lane
+            points = (example.segments.points[:1] + moved).astype(jnp.float32)
+            return Prediction(segments=SegmentPrediction(points, points, points, jnp.stack([logit, 9.0])[None]))
+        points = (example.lanes.points[:1] + moved).astype(jnp.float32)
+        return Prediction(centerlines=CenterlinePrediction(points, logit[None, None]))
 
 
 def line(y, reverse=False):
@@ -105,13 +111,14 @@ def test_only_the_tracks_change():
         without_tracks(example.replace(traffic_flow=None), absent)
 
 
-def test_scores_without_road_users():
-    example = make_example(instances=3)
-    lanes, absent = valid_lanes(example)[:1], each_alone(np.array([0, 1, 7]), TRACKS)
-    scores = scores_without(Follower(1), jnp.asarray(1.5), example, lanes, absent, batch_size=2)
+@pytest.mark.parametrize("model", [WITH_TRAFFIC, SEGMENTS], ids=["centerlines", "segments"])
+def test_scores_without_road_users(model):
+    example, follower = make_segment_example(instances=3), Follower(1, model)
+    lanes, absent = valid_lanes(follower, example)[:1], each_alone(np.array([0, 1, 7]), TRACKS)
+    scores = scores_without(follower, jnp.asarray(1.5), example, lanes, absent, batch_size=2)
     # 1.5 m along x, y and z is more than 2 m; track 7 is padding.
     np.testing.assert_allclose(scores[:, 0], [0.6, 0.6 / 3, 0.65], rtol=1e-5)
-    answers = predict_without(Follower(1), jnp.asarray(1.5), example, absent)
+    answers = predict_without(follower, jnp.asarray(1.5), example, absent)
     np.testing.assert_allclose(answers[1].points, lanes + 1.5, rtol=1e-6)
 
 
@@ -165,7 +172,7 @@ def test_attention_is_a_distribution_over_the_road_users():
         assert effect.driven.shape == effect.without.shape == (count,)
     assert [len(effect.road_user) for effect in effects][2] == 0
     example, absent = make_example(0), each_alone(effects[0].road_user, TRACKS)
-    alone = scores_without(TASK, params, example, valid_lanes(example)[[1]], absent, batch_size=3)
+    alone = scores_without(TASK, params, example, valid_lanes(TASK, example)[[1]], absent, batch_size=3)
     np.testing.assert_allclose(effects[0].without, alone[:, 0])
 
 

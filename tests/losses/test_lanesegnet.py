@@ -134,6 +134,45 @@ def test_the_order_of_queries_and_targets_does_not_matter():
             np.testing.assert_allclose(terms[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+def mirrored(lines, grid):
+    """Left becomes right: y changes its sign, and rows of the grid their order."""
+    return lines * np.array([1.0, -1.0, 1.0], np.float32), grid[..., ::-1, :]
+
+
+def turned(lines, grid):
+    """A quarter turn to the left: the grid, seen from above with x to the right and y up, turns with the lanes."""
+    return np.stack([-lines[..., 1], lines[..., 0], lines[..., 2]], -1), np.flip(grid.swapaxes(-1, -2), -1)
+
+
+def shifted(lines, grid):
+    """Elsewhere; the grid goes along."""
+    return lines + np.array([7.5, -3.25, 0.5], np.float32), grid
+
+
+@pytest.mark.parametrize("motion", [mirrored, turned, shifted])
+@pytest.mark.parametrize("class_target", ["one", "quality"])
+def test_a_mirrored_or_moved_scene_has_the_same_loss(motion, class_target):
+    prediction, targets, masks = jax.tree.map(np.asarray, make_case(4))
+    config = LaneSegNetLossConfig(class_target=class_target)
+
+    def move(scene, grid):
+        sides = {name: motion(getattr(scene, name), grid)[0] for name in ("points", "left", "right")}
+        if motion is mirrored:
+            sides |= {"left": sides["right"], "right": sides["left"]}
+            kinds = "left_type", "right_type"
+            if isinstance(scene, SegmentPrediction):
+                kinds = "left_type_logits", "right_type_logits"
+            sides |= dict(zip(kinds, (getattr(scene, kind) for kind in kinds[::-1]), strict=True))
+        return scene.replace(**sides), motion(scene.points, grid)[1]
+
+    moved, grid = move(prediction, prediction.mask_logits)
+    loss, report = jitted(prediction, targets, masks, config)
+    other, terms = jitted(moved.replace(mask_logits=grid), *move(targets, masks), config)
+    np.testing.assert_allclose(other, loss, rtol=1e-5)
+    for name, value in report.items():
+        np.testing.assert_allclose(terms[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
+
+
 @pytest.mark.parametrize("class_target", ["one", "quality"])
 @pytest.mark.parametrize("counts", [(0, 0), (1, 0), (4, 1)])
 def test_any_number_of_targets_has_a_finite_gradient(counts, class_target):

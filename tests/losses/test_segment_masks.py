@@ -64,6 +64,28 @@ def test_published_raster_is_that_of_opencv():
     assert not np.array_equal(found, np.asarray(segment_masks(left, right, (100, 200), grid.range)))
 
 
+@pytest.mark.parametrize("motion", ["mirrored", "turned", "shifted"])
+def test_masks_move_with_their_segments(motion):
+    left, right = make_boundaries(2, 12)
+    shape, box = (10, 20), RANGE
+    mask = np.asarray(segment_masks(left, right, shape, box))
+    if motion == "mirrored":
+        moved = [line * np.array([1.0, -1.0, 1.0], np.float32) for line in (right, left)]
+        expected = mask[:, ::-1]
+    elif motion == "turned":
+        moved = [np.stack([-line[..., 1], line[..., 0], line[..., 2]], -1) for line in (left, right)]
+        shape, box = (20, 10), PerceptionRange(RANGE.y, RANGE.x, RANGE.z)
+        expected = np.flip(mask.swapaxes(1, 2), 2)
+    else:  # by three columns and one row: cells are 1 m wide
+        moved = [line + np.array([3.0, 1.0, 0.0], np.float32) for line in (left, right)]
+        expected = np.pad(mask[:, :-1, :-3], ((0, 0), (1, 0), (3, 0)))
+    found = np.array(segment_masks(*moved, shape, box))
+    if motion == "shifted":  # what comes in over the border was not on the grid before
+        found[:, :1], found[:, :, :3] = False, False
+    assert expected.any()
+    np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize("raster", ["cells", "published"])
 @pytest.mark.parametrize("count", [0, 1])
 def test_sizes_0_and_1_and_segments_without_area(raster, count):

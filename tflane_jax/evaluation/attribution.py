@@ -25,7 +25,7 @@ from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.frechet import pair_frechet
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.parameters import Params, split_statistics
-from tflane_jax.scene import CenterlinePrediction, Example, Prediction, TrafficFlow
+from tflane_jax.scene import CenterlinePrediction, Example, LaneGraph, Prediction, TrafficFlow
 
 
 class HostPredictor(Predictor, Protocol):
@@ -42,7 +42,7 @@ class LaneGain(NamedTuple):
 
     Attributes:
         example: index of the example.
-        lane: index among the example's valid lanes.
+        lane: index among the example's `valid_lanes`.
         query: of the predicted lane that has the score.
         score: with the example's traffic flow.
         without: of the same model without any traffic flow.
@@ -84,7 +84,7 @@ def lanes_by_gain(
     examples: Example,
     ground: PerceptionRange,
     *,
-    baseline: tuple[Predictor, Params] | None = None,
+    baseline: tuple[HostPredictor, Params] | None = None,
     group: str = "hidden+traffic",
     batch_size: int = 16,
 ) -> list[LaneGain]:
@@ -94,7 +94,7 @@ def lanes_by_gain(
     trained without lacks. With a baseline, a lane gains only what both lack.
 
     Args:
-        task, params: a model of centerlines without memory.
+        task, params: a model of centerlines or lane segments without memory.
         examples: stacked, with BEV evidence and traffic flow.
         ground: the range that the evidence covers.
         baseline: task and parameters of a model that was trained without traffic flow.
@@ -107,11 +107,11 @@ def lanes_by_gain(
     gains = []
     for i, (found, without, other) in enumerate(zip(own, none, others, strict=True)):
         example: Example = _row(examples, i)
-        lanes = valid_lanes(example)
+        truth, lanes = _truth(task, example), valid_lanes(task, example)
         score, query = lane_scores(found, lanes)
         less = lane_scores(without, lanes)[0]
         trained_without = np.full(len(lanes), np.nan) if other is None else lane_scores(other, lanes)[0]
-        members = lane_groups(example.lanes, np.asarray(example.bev), _flow(example), ground)[group]
+        members = lane_groups(truth, np.asarray(example.bev), _flow(example), ground)[group]
         columns = np.arange(len(lanes)), query, score, less, trained_without
         gains += [LaneGain(i, *row) for row in zip(*(column[members].tolist() for column in columns), strict=True)]
     return sorted(gains, key=lambda lane: -lane.gain)
@@ -134,7 +134,7 @@ def road_user_effects(
     for lane, attention in zip(lanes, weights, strict=True):
         example: Example = _row(examples, lane.example)
         tokens, flow = prior.observe(example, None)[0], _flow(example)
-        users, points = tokens.index[tokens.valid], valid_lanes(example)[[lane.lane]]
+        users, points = tokens.index[tokens.valid], valid_lanes(task, example)[[lane.lane]]
         absent = each_alone(users, len(flow.valid))
         without = scores_without(task, params, example, points, absent, batch_size=batch_size)[:, 0]
         driven = driven_by_each(points, flow, users)[:, 0]
@@ -214,7 +214,7 @@ def one_after_another(road_users: Int[np.ndarray, " n"], tracks: int) -> Bool[np
 
 
 def scores_without(
-    task: Predictor,
+    task: HostPredictor,
     params: Params,
     example: Example,
     lanes: Float[np.ndarray, "g n 3"],
@@ -225,7 +225,7 @@ def scores_without(
     """Return the score of each lane (see `lane_scores`) when some of the tracks are taken away.
 
     Args:
-        task, params: a model of centerlines without memory.
+        task, params: a model of centerlines or lane segments without memory.
         example: one frame.
         lanes: metres, ego frame.
         absent: n sets of the K tracks of the example's traffic flow.
@@ -236,7 +236,7 @@ def scores_without(
 
 
 def fading_scores(
-    task: Predictor,
+    task: HostPredictor,
     params: Params,
     examples: Example,
     lane: LaneGain,
@@ -248,7 +248,7 @@ def fading_scores(
     """Return the score of a lane while road users are taken away one after another: after 0, 1, ..., `length` of them.
 
     Args:
-        task, params: a model of centerlines without memory.
+        task, params: a model of centerlines or lane segments without memory.
         examples: stacked.
         lane: of one of the examples.
         road_users: tracks in the order in which they go. If they are fewer than `length`, the last score is repeated.
@@ -257,13 +257,13 @@ def fading_scores(
     """
     example: Example = _row(examples, lane.example)
     absent = one_after_another(road_users[:length], len(_flow(example).valid))
-    points = valid_lanes(example)[[lane.lane]]
+    points = valid_lanes(task, example)[[lane.lane]]
     scores = scores_without(task, params, example, points, absent, batch_size=batch_size)[:, 0]
     return np.pad(scores, (0, length + 1 - len(scores)), mode="edge")
 
 
 def predict_without(
-    task: Predictor, params: Params, example: Example, absent: Bool[np.ndarray, "n k"], *, batch_size: int = 16
+    task: HostPredictor, params: Params, example: Example, absent: Bool[np.ndarray, "n k"], *, batch_size: int = 16
 ) -> list[CenterlinePrediction]:
     """Return the predictions for one example when each of n sets of tracks is taken away; see `scores_without`."""
     return list(_frames(task, params, without_tracks(example, absent), batch_size))
@@ -287,9 +287,18 @@ def driven_by_each(
     return np.array([driven_fraction(lanes, track)[0] for track in tracks]).reshape(len(road_users), len(lanes))
 
 
-def valid_lanes(example: Example) -> Float[np.ndarray, "g n 3"]:
-    """Return the points of the valid true lanes of one example, metres."""
-    return np.asarray(example.lanes.points)[np.asarray(example.lanes.valid)]
+def valid_lanes(task: HostPredictor, example: Example) -> Float[np.ndarray, "g n 3"]:
+    """Return the points of the valid true lanes of one example, metres: lane segments if the model predicts them."""
+    lanes = _truth(task, example)
+    return np.asarray(lanes.points)[np.asarray(lanes.valid)]
+
+
+def _truth(task: HostPredictor, example: Example) -> LaneGraph:
+    return example.segments if _of_segments(task) else example.lanes
+
+
+def _of_segments(task: HostPredictor) -> bool:
+    return "segments" in task.model.predicts
 
 
 def _flow(example: Example) -> TrafficFlow:
@@ -298,11 +307,15 @@ def _flow(example: Example) -> TrafficFlow:
     return example.traffic_flow
 
 
-def _frames(task: Predictor, params: Params, examples: Any, batch_size: int) -> Iterator[CenterlinePrediction]:
-    """Yield the predicted centerlines of each example."""
+def _frames(task: HostPredictor, params: Params, examples: Any, batch_size: int) -> Iterator[CenterlinePrediction]:
+    """Yield the predicted lanes of each example, those of lane segments by their centerlines and first class."""
     for indices, answer in predictions(task, params, examples, batch_size):
         for i in range(len(indices)):
-            yield _row(answer.centerlines, i)
+            lanes = _row(answer, i)
+            if _of_segments(task):
+                yield CenterlinePrediction(lanes.segments.points, lanes.segments.logits[:, :1])
+            else:
+                yield lanes.centerlines
 
 
 def _row(stacked: Any, index: int) -> Any:

@@ -29,6 +29,7 @@ from tflane_jax.datasets.nuscenes_log import (
     scene_tracks,
 )
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
+from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
 from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
 from tflane_jax.datasets.openlane_example import camera_views
@@ -68,7 +69,7 @@ class NuScenesConfig:
     frame: ReferenceFrame = "ego"
     least_visibility: Visibility = "v0-40"
     image: ImageConfig | None = None
-    example: ExampleConfig = ExampleConfig()
+    example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
 
 
@@ -188,7 +189,7 @@ class NuScenesData:
     frame: ReferenceFrame = "ego"
     least_visibility: Visibility = "v0-40"
     image: ImageConfig | None = None
-    example: ExampleConfig = ExampleConfig()
+    example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> NuScenesConfig:
@@ -216,7 +217,9 @@ def check_nuscenes(root: Path) -> FolderCheck:
     rows: dict[str, dict[str, int | str]] = {}
     for name, scene in sorted(tables.scenes().items()):
         location = tables.location(scene)
-        row = rows.setdefault(location, _map_counts(tables, location, faults))
+        if location not in rows:
+            rows[location] = _map_counts(tables, location, faults)
+        row = rows[location]
         try:
             frames = scene_frames(tables, scene)
             tracks = scene_tracks(tables, frames)

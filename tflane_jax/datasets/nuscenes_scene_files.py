@@ -68,11 +68,11 @@ def read_scene_file(path: Path) -> Log:
 def _content(path: Path) -> dict[str, Any]:
     """Return the checked arrays of a file: numbers are finite, and sizes fit."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             content = {key: file[key] for key in file.files}
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, zipfile.BadZipFile, EOFError, zlib.error, AttributeError) as error:
+    except (ValueError, TypeError, zipfile.BadZipFile, EOFError, zlib.error) as error:
         raise UserError(f"{path} is no npz file of plain arrays ({error})") from None
     where = str(path)
     for key in _TEXTS:

@@ -9,8 +9,9 @@ from tests.shared import shared_path
 from tflane_jax.datasets.argoverse2_log import CATEGORIES, load_log
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example, traffic_flow
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.scene import AreaType, RoadUser
+from tflane_jax.scene import AreaType, LineClass, RoadUser
 
 pytest.importorskip("pyarrow")
 
@@ -148,3 +149,26 @@ def test_real_traffic_keeps_to_the_lanes(name):
             agree.append(bool(((heading @ step[k]) / np.linalg.norm(step[k]) > 0.9).any()))
     assert len(agree) > 5
     assert np.mean(agree) > 0.85
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    # By class: dividers, crossings, boundaries, centerlines, summed over the 32 key frames in MapTR's patch.
+    [(FLAT, (64, 43, 102, 211)), (FORKED, (178, 47, 94, 466))],
+)
+def test_real_map_lines(name, counts):
+    config = MapLinesConfig(lines=32, centerlines="include")
+    example = ExampleConfig(range=PerceptionRange((-30.0, 30.0), (-15.0, 15.0)), map_lines=config, sensor=None)
+    found = [make_example(real_log(name, "traffic"), i, example).map_lines for i in range(32)]
+    total = sum(np.bincount(lines.category[lines.valid], minlength=4) for lines in found)
+    assert tuple(total.tolist()) == counts
+    for lines in found:
+        points, category = lines.points[lines.valid], lines.category[lines.valid]
+        assert example.range.contains(points.round(4)).all()
+        assert lines.closed[lines.valid][category == LineClass.CROSSING].all()
+        assert np.abs(points[..., 2]).max() < 2.0
+        # Dividers lie between boundaries: none of them touches a boundary.
+        dividers, boundaries = (points[category == kind][..., :2] for kind in (LineClass.DIVIDER, LineClass.BOUNDARY))
+        gap = np.linalg.norm(dividers[:, :, None, None] - boundaries[None, None], axis=-1).min((1, 2, 3))
+        assert (gap > 0.5).all()

@@ -8,8 +8,9 @@ import shapely
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.datasets import prepared_map
-from tflane_jax.datasets.areas import BOUNDARY_MARGIN, clip_ring, crop_areas, crossing_sides
+from tflane_jax.datasets.areas import crop_areas, crossing_sides
 from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
+from tflane_jax.datasets.map_geometry import BOUNDARY_MARGIN, clip_ring
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, invert_pose, yaw_pose

@@ -263,4 +263,15 @@ def test_recall_is_the_ratio_of_counts_by_scene():
         assert sum(ratio.numerator) / max(sum(ratio.denominator), 1) == pytest.approx(scores[group]["recall"])
     assert ratios["all/recall"].denominator == (12, 12, 6)  # two lanes a frame, at three thresholds
     assert 0 < scores["all"]["recall"] < 1
-    assert measured(("lines",)).ratios() == {}
+
+
+def test_recall_of_lines_is_the_ratio_of_counts_by_scene():
+    metrics = measured(("lines",), 0.4)
+    scores, ratios = metrics.compute(), metrics.ratios()
+    assert (
+        set(ratios)
+        == {f"{group}/recall" for group in scores}
+        == {f"lines{x}/recall" for x in ("", " occluded", " clear")}
+    )
+    assert ratios["lines/recall"].denominator == (30, 15)  # five lines a frame, at three thresholds
+    assert scores["lines"]["recall"] == pytest.approx(sum(ratios["lines/recall"].numerator) / 45)

@@ -28,6 +28,10 @@ TOTALS = [
     if expected[KEYS[sampling]] is not None and not (expected["tie_sensitive"] and sampling == "as_given")
 ]
 
+OVERLAP_CASES = [
+    case for case, expected in expected_cases("maptr").items() if expected["iou"] and not expected["tie_sensitive"]
+]
+
 
 def evaluate(frames, sampling: Sampling = "maptr"):
     metrics = VectorMapMetrics(sampling)
@@ -59,6 +63,20 @@ def test_golden_totals(case, sampling):
             check(f"AP_{name}@{threshold}", "AP_per_threshold_class", t, c)
     for t, threshold in enumerate(MAP_THRESHOLDS):
         check(f"mAP@{threshold}", "eval_map_mean_over_classes_with_gt", t)
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("case", OVERLAP_CASES)
+def test_golden_overlap(case):
+    expected = expected_cases("maptr")[case]
+    official, metrics = expected["iou"], VectorMapMetrics(measure="iou")
+    for detections, truth, _ in load_maps(case):
+        metrics.update(detections, truth)
+    result = metrics.compute()
+    assert result["mAP"] == pytest.approx(official["mAP"], abs=1e-6)
+    for c, name in enumerate(CLASSES):
+        ours = [result[f"AP_{name}@{t}"] for t in metrics.thresholds]
+        assert ours == pytest.approx([row[c] for row in official["AP_per_threshold_class"]], abs=1e-6)
 
 
 @pytest.mark.golden
@@ -186,7 +204,7 @@ def test_empty_input():
         ({"points": [np.array([[0, np.inf], [0, 1]])]}, "detections: line 0 has a coordinate that is not finite"),
         ({"scores": np.array([0.1, 0.2])}, r"detections: scores has shape \(2,\), expected \(1,\)"),
         ({"scores": np.array([np.nan])}, "detections: scores holds a number that is not finite"),
-        ({"classes": np.array([3])}, "detections: classes must lie between 0 and 2"),
+        ({"classes": np.array([4])}, "detections: classes must lie between 0 and 3"),
     ],
 )
 def test_arrays_that_do_not_fit(changes, message):

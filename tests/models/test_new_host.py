@@ -14,6 +14,8 @@ from tests.models.toy_host import ToyHostConfig, ToyHostLossConfig
 from tests.parameters import random_params
 from tflane_jax.config import RunConfig, WorldData, apply_overrides
 from tflane_jax.config_io import from_json, to_json, to_text
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.priors import PriorsConfig
@@ -50,8 +52,13 @@ def test_it_is_evaluated_by_its_own_protocol(params):
     data = stack_examples([labelled(i) for i in range(3)])
     found = TASK.evaluate(params, data, EvaluationConfig(batch_size=2))
     assert "MapTR" in found.protocol
-    assert set(found.groups) == {"lines"}
-    assert set(found.scores()) - {"lines/lines", "lines/frames"} <= TASK.score_names(WorldData(), EvaluationConfig())
+    assert {name.partition(" ")[0] for name in found.groups} == {"lines"}
+    assert {"lines occluded", "lines hidden+traffic"} <= set(found.groups)
+    example = ExampleConfig(map_lines=MapLinesConfig(centerlines="include"))
+    assert set(found.scores()) <= TASK.score_names(WorldData(example=example), EvaluationConfig())
+    derived = TASK.evaluate(params, data.replace(map_lines=None), EvaluationConfig(batch_size=2))
+    assert set(derived.scores()) <= TASK.score_names(WorldData(), EvaluationConfig())
+    assert set(derived.groups) == {"lines"}
     assert {"map_lines", "segments", "areas", "traffic_flow"} <= set(TASK.parts)
 
 

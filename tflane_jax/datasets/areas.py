@@ -12,14 +12,12 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.datasets.map_geometry import BOUNDARY_MARGIN, clip_ring, shrunken
 from tflane_jax.datasets.prepared_map import PreparedMap
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import clip_to_range, resample, resample_lines
 from tflane_jax.scene import Areas, AreaType
-
-# Metres. MapTR cuts road boundaries this far inside the range; figures of OpenLane-V2 agree with it.
-BOUNDARY_MARGIN = 0.2
 
 
 def crop_areas(
@@ -44,8 +42,7 @@ def crop_areas(
     # A ring that meets the range crosses its border or lies inside it; no crossing is large enough to surround it.
     rings = [outlines.line(i) for i in outlines.near(range_)]
     rings = [ring for ring in rings if clip_to_range(ring, range_)]
-    low, high = BOUNDARY_MARGIN, -BOUNDARY_MARGIN
-    inner = PerceptionRange((range_.x[0] + low, range_.x[1] + high), (range_.y[0] + low, range_.y[1] + high), range_.z)
+    inner = shrunken(range_, BOUNDARY_MARGIN)
     lines = prepared.boundaries.moved(ego_from_global)
     boundaries = [piece for i in lines.near(inner) for piece in clip_ring(lines.line(i), inner)]
     found = rings + boundaries
@@ -94,12 +91,3 @@ def crossing_sides(outline: Float[np.ndarray, "n 3"], points: int) -> Float[np.n
     if not -45.0 <= np.rad2deg(np.arctan2(step[1], step[0])) <= 135.0:
         first, second = second, first
     return np.concatenate([resample(first, points // 2), resample(second, points // 2)])
-
-
-def clip_ring(line: np.ndarray, range_: PerceptionRange) -> list[np.ndarray]:
-    """Cut a line at the range. The pieces of a closed ring are joined again where its first point lies in the range."""
-    pieces = clip_to_range(line, range_)
-    closed = np.array_equal(line[0], line[-1])
-    if closed and len(pieces) > 1 and all(np.array_equal(p, line[0]) for p in (pieces[0][0], pieces[-1][-1])):
-        pieces = [np.concatenate([pieces[-1], pieces[0][1:]]), *pieces[1:-1]]
-    return pieces

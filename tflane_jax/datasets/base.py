@@ -7,6 +7,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -47,6 +48,7 @@ class ExampleConfig:
         elements: traffic lights and signs.
         bike_lanes: whether bicycle lanes are ground truth.
         sd_map: coarse map of the roads of the built-in world; None leaves it out.
+        map_lines: lines of a vector map, the truth of MapTR and MapTRv2; None leaves them out.
     """
 
     range: PerceptionRange = PerceptionRange()
@@ -66,6 +68,7 @@ class ExampleConfig:
     elements: int = 24
     bike_lanes: Literal["include", "exclude"] = "include"
     sd_map: SdMapConfig | None = None
+    map_lines: MapLinesConfig | None = None
 
     @property
     def ground(self) -> PerceptionRange:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from tflane_jax.datasets.areas import crop_areas
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
+from tflane_jax.datasets.map_lines import crop_map_lines
 from tflane_jax.datasets.marker_observations import marker_observations
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
@@ -112,6 +113,12 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         points=config.area_points,
         crossings=config.crossings,
     )
+    wanted = config.map_lines
+    map_lines, map_lines_dropped = (
+        (None, 0)
+        if wanted is None
+        else crop_map_lines(prepared.geometry, ego_from_global, config.range, wanted, boxes=boxes, buildings=buildings)
+    )
     elements, elements_dropped = traffic_elements(
         log.map.elements,
         _attributes(log, moment.track_frame),
@@ -132,7 +139,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         areas=areas_dropped,
         elements=elements_dropped,
         tracks=tracks_dropped,
-        **{"sd_map.lines": lines_dropped},
+        **{"sd_map.lines": lines_dropped, "map_lines.lines": map_lines_dropped},
     )
     previous = log.keyframes[keyframe - 1] if keyframe > 0 else moment
     return Example(
@@ -165,6 +172,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         previous_from_ego=relative_pose(previous.global_from_ego, moment.global_from_ego).astype(np.float32),
         has_previous=np.asarray(keyframe > 0),
         cameras=None if rig is None else render_cameras(log, keyframe, rig),
+        map_lines=map_lines,
     )
 
 

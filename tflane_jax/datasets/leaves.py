@@ -40,7 +40,7 @@ IMAGE_PARTS = {"lines": LaneLines}
 
 
 def example_leaves(example: Example | RoadImage) -> dict[str, np.ndarray]:
-    """Return the example's arrays by name in the order of the fields; a part that is None has no entry."""
+    """Return the example's arrays by name in the order of the fields; what is None has no entry."""
     parts = IMAGE_PARTS if isinstance(example, RoadImage) else PARTS
     leaves = {}
     for field in fields(example):
@@ -49,7 +49,8 @@ def example_leaves(example: Example | RoadImage) -> dict[str, np.ndarray]:
             continue
         if field.name in parts:
             for inner in fields(parts[field.name]):
-                leaves[f"{field.name}.{inner.name}"] = np.asarray(getattr(value, inner.name))
+                if (leaf := getattr(value, inner.name)) is not None:
+                    leaves[f"{field.name}.{inner.name}"] = np.asarray(leaf)
         else:
             leaves[field.name] = np.asarray(value)
     return leaves

@@ -6,7 +6,7 @@
 | | | before for markers |
 | `segments` (with `elements`) | LaneSegNet; in `all` also the devkit's | the same (`segments all` and so on beside |
 | | | centerlines) |
-| `lines` | MapTR | lines |
+| `lines` | MapTR | lines, and those of `map_metrics` |
 """
 
 from __future__ import annotations
@@ -17,26 +17,30 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Bool
-from scipy.special import expit
 
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
 from tflane_jax.evaluation.interventions import with_traffic
-from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups
+from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups, line_groups
 from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_truth
+from tflane_jax.evaluation.map_metrics import LineLabel, MapLineMetrics
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
 from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
-from tflane_jax.evaluation.vector_maps import map_detections, map_lines, map_truth
+from tflane_jax.evaluation.vector_maps import measured_lines
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth, VectorMapMetrics
+from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, Measure
 from tflane_jax.models.parameters import Params
-from tflane_jax.scene import Example, LinePrediction, Prediction
+from tflane_jax.scene import Example, MapLines, Prediction
+
+# Both kinds of protocols, for lanes and for lines, have three thresholds.
+_THRESHOLDS = len(LANE_THRESHOLDS)
+assert len(MAP_THRESHOLDS) == _THRESHOLDS
 
 Members = Mapping[str, Bool[np.ndarray, " g"]]
 """For each group of lanes, which of the valid true lanes belong to it."""
@@ -50,6 +54,7 @@ class LaneGraphMetrics:
         frame_groups, lane_groups: names of the groups of frames and of further groups of lanes, see
             `GroupedCenterlineMetrics`.
         parts: predicted parts that are measured as long as no frame was seen.
+        map_measures, line_labels: of the lines of vector maps, see `MapLineMetrics`.
     """
 
     def __init__(
@@ -58,6 +63,8 @@ class LaneGraphMetrics:
         frame_groups: Sequence[str] = (),
         parts: Sequence[str] = ("centerlines",),
         lane_groups: Sequence[str] = (),
+        map_measures: Sequence[Measure] = ("chamfer",),
+        line_labels: Sequence[LineLabel] = (),
     ) -> None:
         self._centerlines = GroupedCenterlineMetrics(
             versions=versions, frame_groups=frame_groups, lane_groups=lane_groups
@@ -65,7 +72,7 @@ class LaneGraphMetrics:
         self._continues: list[bool] = []  # whether a frame belongs to the scene of the frame before
         self._segments = GroupedSegmentMetrics(frame_groups=frame_groups, lane_groups=lane_groups)
         self._devkit = LaneSegmentMetrics("OpenLane-V2")
-        self._lines = VectorMapMetrics()
+        self._lines = MapLineMetrics(map_measures, line_labels, lane_groups if line_labels else ())
         self._measured = tuple(parts)
 
     @property
@@ -86,8 +93,8 @@ class LaneGraphMetrics:
             prediction: the last decoder layer's prediction for this example.
             example: ground truth of all predicted parts. Traffic elements are measured if both have them.
             frame_group: the group that this frame belongs to.
-            members: by "centerlines" and "segments": for each of `lane_groups`, which of the valid true lanes belong to
-                it.
+            members: by "centerlines", "segments" and "lines": for each of `lane_groups`, which of the valid true lanes
+                (of the measured true lines) belong to it.
 
         Raises:
             ValueError: no protocol measures any predicted part.
@@ -110,7 +117,7 @@ class LaneGraphMetrics:
             self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
             self._devkit.add(frame)
         if prediction.lines is not None:
-            self._lines.update(_lines(prediction.lines), _true_lines(example))
+            self._lines.update(prediction.lines, example, members.get("lines"))
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return metrics by name, for every group of every protocol that applies."""
@@ -122,21 +129,23 @@ class LaneGraphMetrics:
             segments["all"] |= _of_devkit(self._devkit.compute())
             groups |= {self._prefix + group: values for group, values in segments.items()}
         if "lines" in self._measured:
-            groups["lines"] = self._lines.compute()
+            groups |= self._lines.compute()
         return groups
 
     def ratios(self) -> dict[str, SceneRatio]:
-        """Return the recall of every group of lanes as hits and lanes of each scene."""
+        """Return the recall of every group of lanes or lines as hits and lanes of each scene."""
         if not self._continues:
             return {}
         recalled = self._centerlines.recalled() if "centerlines" in self._measured else {}
         if "segments" in self._measured:
             recalled |= {self._prefix + group: counts for group, counts in self._segments.recalled().items()}
+        if "lines" in self._measured:
+            recalled |= self._lines.recalled()
         scene = np.cumsum(~np.array([True, *self._continues[1:]]))
         ratios = {}
         for group, counts in recalled.items():
             lanes, hits = (np.bincount(scene, column).astype(int).tolist() for column in counts.T)
-            ratios[f"{group}/recall"] = SceneRatio(tuple(hits), tuple(len(LANE_THRESHOLDS) * n for n in lanes))
+            ratios[f"{group}/recall"] = SceneRatio(tuple(hits), tuple(_THRESHOLDS * n for n in lanes))
         return ratios
 
     @property
@@ -158,21 +167,10 @@ def _of_devkit(values: Mapping[str, float]) -> dict[str, float]:
     return {theirs: values[name] for name, theirs in names.items() if name in values}
 
 
-def _lines(lines: LinePrediction) -> MapDetections:
-    """Return the lines whose most likely class is measured by MapTR's metric."""
-    confidence = expit(np.asarray(lines.logits))
-    classes = confidence.argmax(-1)
-    return map_detections(np.asarray(lines.points), classes, confidence.max(-1), classes < len(CLASSES))
-
-
-def _true_lines(example: Example) -> MapTruth:
-    """Return the labelled map lines; without labels, those derived from lane segments and areas."""
-    lines = example.map_lines
-    if lines is None:
-        return map_truth(example.segments, example.areas)
-    return map_lines(
-        lines.points, lines.category, np.asarray(lines.valid) & (np.asarray(lines.category) < len(CLASSES))
-    )
+def line_labels(lines: MapLines | None) -> tuple[LineLabel, ...]:
+    """Return what labelled lines tell beside their shapes."""
+    known = () if lines is None else (("visibility", lines.visibility), ("identity", lines.identity))
+    return tuple(name for name, values in known if values is not None)  # pyright: ignore[reportReturnType]
 
 
 def evaluate_lanes(
@@ -186,7 +184,8 @@ def evaluate_lanes(
     """Return the filled accumulator of a dataset.
 
     Frames of examples with markers are grouped by marker visibility as well, see `Sightings`. Lanes of examples with
-    BEV evidence and traffic flow are grouped by both, see `evaluation.lane_groups`, whatever traffic the model sees.
+    BEV evidence and traffic flow are grouped by both, see `evaluation.lane_groups`, whatever traffic the model sees;
+    so are labelled lines of a vector map.
 
     Args:
         task: a model that predicts lanes of any kind.
@@ -212,6 +211,8 @@ def evaluate_lanes(
                 config.versions,
                 () if batch.markers is None else sightings.groups,
                 lane_groups=LANE_GROUPS if _members(batch, answer, 0, ground) else (),
+                map_measures=config.map_measures,
+                line_labels=line_labels(batch.map_lines),
             )
         for row in range(len(indices)):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
@@ -228,11 +229,15 @@ def _members(batch: Example, answer: Prediction, row: int, ground: PerceptionRan
         return {}
     bev, flow = jax.tree.map(lambda leaf: np.asarray(leaf[row]), (batch.bev, batch.traffic_flow))
     true = {"centerlines": batch.lanes, "segments": batch.segments}
-    return {
+    members: dict[str, Members] = {
         part: lane_groups(jax.tree.map(lambda leaf: leaf[row], lanes), bev, flow, ground)
         for part, lanes in true.items()
         if getattr(answer, part) is not None
     }
+    if answer.lines is not None and batch.map_lines is not None:
+        found, lines = jax.tree.map(lambda leaf: np.asarray(leaf[row]), (answer.lines, batch.map_lines))
+        members["lines"] = line_groups(lines.replace(valid=measured_lines(lines, found)), bev, flow, ground)
+    return members
 
 
 def _labels(batch: Example) -> Example:

@@ -20,19 +20,29 @@ over `SAMPLES` points, equally spaced along the lane.
 
 Lanes with some traffic, but along less than half of their length, are in none of the first four groups. Lanes of the
 control may have traffic in the lane beside them, which tells of them too; `hidden-neighbours`, a part of it, has none
-there either, and few lanes. Traffic is the history of the example before any selection: its valid, not occluded frames,
+there either, and few lanes.
+
+Lines of a vector map have the same groups (`line_groups`). A line is shown by evidence on itself, a crossing by its
+stripes, a centerline by paint or edges within `HALF_LANE` more. Traffic along a line passes within `HALF_LANE` more and
+in either direction, because vehicles drive beside dividers and boundaries; a line without traffic has none in the lanes
+on both sides of it, within `NEARBY_LINE`, and of `hidden-neighbours` none within twice that.
+
+Traffic is the history of the example before any selection: its valid, not occluded frames,
 and straight lines between successive ones. Pedestrians do not count.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import maximum_filter
 
 from tflane_jax.geometry import BevGrid, PerceptionRange, resample_lines
-from tflane_jax.scene import BevChannel, LaneGraph, RoadUser, TrafficFlow
+from tflane_jax.scene import BevChannel, LaneGraph, LineClass, MapLines, RoadUser, TrafficFlow
 
+_EDGES = (BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE)
 LANE_GROUPS = ("hidden+traffic", "hidden-traffic", "visible+traffic", "visible-traffic", "hidden-neighbours")
 SAMPLES = 25
 EVIDENCE = 64  # of 255
@@ -41,6 +51,7 @@ BESIDE = 1.5  # metres
 HEADING = np.radians(30.0)
 NEARBY, NEXT_LANE = 2.5, 5.0  # metres; lanes are 3 to 3.75 m wide
 HALF = 0.5
+HALF_LANE, NEARBY_LINE = 1.25, 3.5  # metres
 
 
 def lane_groups(
@@ -56,9 +67,27 @@ def lane_groups(
     center, left, right = (np.asarray(x)[valid] for x in (lanes.points, lanes.left, lanes.right))
     hidden = shown_fraction(left, right, bev, ground) < HALF
     driven, distance = driven_fraction(center, flow)
-    traffic, none = driven >= HALF, distance > NEARBY
-    remote = hidden & (distance > NEXT_LANE)
-    groups = hidden & traffic, hidden & none, ~hidden & traffic, ~hidden & none, remote
+    return _groups(hidden, driven >= HALF, distance > NEARBY, distance > NEXT_LANE)
+
+
+def line_groups(
+    lines: MapLines, bev: UInt8[np.ndarray, "h w c"], flow: TrafficFlow, ground: PerceptionRange
+) -> dict[str, Bool[np.ndarray, " g"]]:
+    """Return for each of `LANE_GROUPS` which of the G valid lines of a vector map, in their order, belong to it."""
+    valid = np.asarray(lines.valid)
+    points, category = np.asarray(lines.points)[valid], np.asarray(lines.category)[valid]
+    shown = np.zeros(len(points))
+    for kind in LineClass:
+        mine = category == kind
+        channels = (BevChannel.CROSSING,) if kind == LineClass.CROSSING else _EDGES
+        tolerance = TOLERANCE + (HALF_LANE if kind == LineClass.CENTERLINE else 0.0)
+        shown[mine] = shown_fraction(points[mine], points[mine], bev, ground, channels=channels, tolerance=tolerance)
+    driven, distance = driven_fraction(points, flow, beside=BESIDE + HALF_LANE, directions="both")
+    return _groups(shown < HALF, driven >= HALF, distance > NEARBY_LINE, distance > 2.0 * NEARBY_LINE)
+
+
+def _groups(hidden: np.ndarray, traffic: np.ndarray, none: np.ndarray, remote: np.ndarray) -> dict[str, np.ndarray]:
+    groups = hidden & traffic, hidden & none, ~hidden & traffic, ~hidden & none, hidden & remote
     return dict(zip(LANE_GROUPS, groups, strict=True))
 
 
@@ -67,6 +96,9 @@ def shown_fraction(
     right: Float[np.ndarray, "g n 3"],
     bev: UInt8[np.ndarray, "h w c"],
     ground: PerceptionRange,
+    *,
+    channels: tuple[BevChannel, ...] = _EDGES,
+    tolerance: float = TOLERANCE,
 ) -> Float[np.ndarray, " g"]:
     """Return the fraction of each lane's length at which the raster shows its left or right boundary.
 
@@ -74,10 +106,12 @@ def shown_fraction(
         left, right: boundaries in driving direction, metres, ego frame.
         bev: evidence in the channels of `BevChannel`; it must cover `ground`.
         ground: the range that `bev` covers; nothing is shown outside.
+        channels: of the evidence that counts.
+        tolerance: distance of the evidence, metres.
     """
     grid = BevGrid(ground, *bev.shape[:2])
-    reach = [2 * round(TOLERANCE / size) + 1 for size in reversed(grid.cell)]  # cells along y and x
-    evidence = np.asarray(bev)[..., [BevChannel.LANE_PAINT, BevChannel.ROAD_EDGE]].max(-1)
+    reach = [2 * round(tolerance / size) + 1 for size in reversed(grid.cell)]  # cells along y and x
+    evidence = np.asarray(bev)[..., list(channels)].max(-1)
     shown = maximum_filter(evidence, reach, mode="constant") >= EVIDENCE
     found = np.zeros((len(left), SAMPLES), bool)
     for line in (left, right):
@@ -89,13 +123,19 @@ def shown_fraction(
 
 
 def driven_fraction(
-    points: Float[np.ndarray, "g n 3"], flow: TrafficFlow
+    points: Float[np.ndarray, "g n 3"],
+    flow: TrafficFlow,
+    *,
+    beside: float = BESIDE,
+    directions: Literal["same", "both"] = "same",
 ) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
     """Return the fraction of each lane's length that vehicles drove along, and the least distance of any vehicle.
 
     Args:
         points: centerlines in driving direction, metres, ego frame.
         flow: tracks; padding may hold anything.
+        beside: distance at which a vehicle drives along a point, metres.
+        directions: of travel that count: that of the line, or both.
 
     Returns:
         Fractions, and distances in metres between vehicle centers and the sampled points of the lane; inf without
@@ -109,9 +149,10 @@ def driven_fraction(
     length = step_x**2 + step_y**2
     along = np.clip((x * step_x + y * step_y) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
     distance = np.sqrt((x - along * step_x) ** 2 + (y - along * step_y) ** 2)
-    lane, sample, piece = np.nonzero(distance <= BESIDE)
+    lane, sample, piece = np.nonzero(distance <= beside)
     heading = yaw[piece] + along[lane, sample, piece] * turn[piece]
-    aligned = np.abs(_wrapped(heading - direction[lane, sample])) <= HEADING
+    turned = np.abs(_wrapped(heading - direction[lane, sample]))
+    aligned = (np.minimum(turned, np.pi - turned) if directions == "both" else turned) <= HEADING
     driven = np.zeros(line.shape[:2], bool)
     driven[lane[aligned], sample[aligned]] = True
     return driven.mean(-1), distance.min((1, 2), initial=np.inf)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from tflane_jax.metrics.topology import Version
+from tflane_jax.metrics.vector_map import Measure
 
 Traffic = Literal["own", "none", "other-scene"]
 """Traffic flow at inference: that of the frame, none, or that of a frame of another scene."""
@@ -22,12 +23,15 @@ class EvaluationConfig:
         versions: versions of OpenLane-V2's metrics. Columns of the first one have no version in their names; the others
             add columns for metrics that differ, such as "OLS_v1.0".
         traffic: traffic flow that the model sees: that of the frame, none, or that of a frame of another scene.
+        map_measures: of the lines of vector maps: MapTR's AP by "chamfer" distance, always measured; "iou" adds its
+            optional AP by overlap as the group "lines IoU" (slow, needs shapely).
     """
 
     batch_size: int = 16
     pictures: int = 4
     versions: tuple[Version, ...] = ("v2.1",)
     traffic: Traffic = "own"
+    map_measures: tuple[Measure, ...] = ("chamfer",)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Evaluation:
 
     protocol: str
     groups: Mapping[str, Mapping[str, float]]
-    counts: tuple[str, ...] = ("frames", "lanes")
+    counts: tuple[str, ...] = ("frames", "lanes", "lines")
     ratios: Mapping[str, SceneRatio] = field(default_factory=dict)
 
     def scores(self) -> dict[str, float]:

@@ -1,13 +1,14 @@
-"""Examples and predictions as inputs of MapTR's metric: divider, crossing, boundary (host, numpy, one frame)."""
+"""Examples and predictions as inputs of MapTR's metric (host, numpy, one frame)."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import expit
 
 from tflane_jax.datasets.identities import line_distances
 from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
-from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
+from tflane_jax.scene import Areas, AreaType, LaneGraph, LinePrediction, LineType, MapLines
 
 _DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "ped_crossing", "boundary"))
 # Neighbouring segments both contain the line between them: lines closer than this along all points are one, metres.
@@ -57,7 +58,7 @@ def map_lines(
 
     Args:
         points: metres; closed lines repeat their first vertex.
-        classes: index into `metrics.vector_map.CLASSES`.
+        classes: index into `metrics.vector_map.LINE_CLASSES`.
         valid: padding is False.
     """
     kept = np.asarray(valid)
@@ -74,7 +75,7 @@ def map_detections(
 
     Args:
         points: metres.
-        classes: index into `metrics.vector_map.CLASSES`.
+        classes: index into `metrics.vector_map.LINE_CLASSES`.
         scores: confidence, 0 to 1.
         valid: detections to keep; None keeps all.
     """
@@ -82,3 +83,28 @@ def map_detections(
     if valid is not None:
         order = order[np.asarray(valid)[order]]
     return MapDetections(np.asarray(points)[order][..., :2], np.asarray(classes)[order], np.asarray(scores)[order])
+
+
+def truth_of_lines(lines: MapLines, found: LinePrediction) -> MapTruth:
+    """Return the labelled lines of the classes that a model predicts."""
+    kept = measured_lines(lines, found)
+    visibility, identity = (
+        None if known is None else np.asarray(known)[kept] for known in (lines.visibility, lines.identity)
+    )
+    return MapTruth(np.asarray(lines.points)[kept][..., :2], np.asarray(lines.category)[kept], visibility, identity)
+
+
+def measured_lines(lines: MapLines, found: LinePrediction) -> Bool[np.ndarray, " l"]:
+    """Return which labelled lines are valid and of a class that a model predicts: MapTR predicts no centerlines."""
+    return np.asarray(lines.valid) & (np.asarray(lines.category) < found.logits.shape[-1])
+
+
+def detections_of_lines(lines: LinePrediction) -> MapDetections:
+    """Return the last decoder layer's lines of one example: as in MapTR, the Q best of its Q x C pairs of query, class.
+
+    A query may therefore be two lines of different classes.
+    """
+    confidence = expit(np.asarray(lines.logits, np.float64))
+    queries, classes = confidence.shape
+    best = np.argsort(-confidence, axis=None, kind="stable")[:queries]
+    return map_detections(np.asarray(lines.points)[best // classes], best % classes, confidence.ravel()[best])

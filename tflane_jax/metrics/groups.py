@@ -23,7 +23,21 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.metrics.frames import LaneTruth
+from tflane_jax.metrics.frames import Lines
+
+
+class TrueLanes(Protocol):
+    """True lanes of one frame, or lines of a map in their place."""
+
+    @property
+    def points(self) -> Lines:
+        """Polylines, metres."""
+        ...
+
+    @property
+    def visibility(self) -> Any:
+        """Fraction of each in direct line of sight; None if it is not known."""
+        ...
 
 
 class Matched(Protocol):
@@ -78,7 +92,7 @@ class Partition(Protocol):
         """What it adds to the name of the protocol."""
         ...
 
-    def members(self, group: str, truth: LaneTruth) -> Bool[np.ndarray, " g"]:
+    def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
         """Return which of the true lanes belong to a group; raise UserError if the truth does not tell."""
         ...
 
@@ -95,7 +109,7 @@ class ByOcclusion:
         """What it adds to the name of the protocol."""
         return f", occluded: visibility < {self.below:g}"
 
-    def members(self, group: str, truth: LaneTruth) -> Bool[np.ndarray, " g"]:
+    def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
         """Return which of the true lanes belong to a group; raise UserError if their visibility is not known."""
         if truth.visibility is None:
             raise UserError("the truth has no visibility of its lanes: report the group 'all' only")
@@ -131,7 +145,7 @@ class ByDistance:
         """Names of the groups, nearest first."""
         return tuple(self._ranges)
 
-    def members(self, group: str, truth: LaneTruth) -> Bool[np.ndarray, " g"]:
+    def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
         """Return which of the true lanes belong to a group."""
         low, high = self._ranges[group]
         distance = np.array([np.linalg.norm(np.asarray(line)[:, :2], axis=-1).min() for line in truth.points])
@@ -178,7 +192,7 @@ class GroupedMetrics(Generic[FrameT]):
     def add(
         self,
         frame: FrameT,
-        truth: LaneTruth,
+        truth: TrueLanes,
         frame_group: str | None = None,
         members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:

@@ -124,24 +124,40 @@ class MapLines:
         category: (L,) `LineClass`.
         closed: (L,) the line is a ring; its start and direction are arbitrary.
         valid: (L,).
+        visibility: (L,) fraction of the line in direct line of sight, 0 to 1; None if the source cannot tell.
+        identity: (L,) number of the line in its map, the same in every frame of a scene, for dividers, crossings and
+            boundaries; pieces of one line share it. Paths of centerlines change with the range and have none. None if
+            the source cannot tell.
     """
 
     points: Float[Array, "l p 3"]
     category: Int[Array, " l"]
     closed: Bool[Array, " l"]
     valid: Bool[Array, " l"]
+    visibility: Float[Array, " l"] | None = None
+    identity: Int[Array, " l"] | None = None
 
     @classmethod
     def empty(cls, capacity: int, points: int) -> MapLines:
         """Return a map of `capacity` invalid lines of `points` points."""
-        flag = np.zeros(capacity, bool)
-        return cls(np.zeros((capacity, points, 3), np.float32), np.zeros(capacity, np.int32), flag, flag.copy())
+        label, flag = np.zeros(capacity, np.int32), np.zeros(capacity, bool)
+        return cls(
+            points=np.zeros((capacity, points, 3), np.float32),
+            category=label,
+            closed=flag,
+            valid=flag.copy(),
+            visibility=np.zeros(capacity, np.float32),
+            identity=label.copy(),
+        )
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""
         l, p = self.points.shape[:2]
         chex.assert_shape(self.points, (l, p, 3))
         chex.assert_shape([self.category, self.closed, self.valid], (l,))
+        for known in (self.visibility, self.identity):
+            if known is not None:
+                chex.assert_shape(known, (l,))
 
 
 @struct.dataclass

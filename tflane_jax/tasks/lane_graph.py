@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -24,10 +25,8 @@ from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import traffic_interventions
-from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, Sightings, evaluate_lanes
-from tflane_jax.evaluation.lane_groups import LANE_GROUPS
+from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
-from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.losses.common import HostLossConfig
@@ -41,6 +40,7 @@ from tflane_jax.models.parameters import Params, joined_statistics, split_statis
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of
+from tflane_jax.tasks import lane_scores
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
@@ -65,47 +65,9 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     clip: int = 1
     empty_frames: Literal["keep", "skip"] = "keep"
 
-    columns: ClassVar[tuple[str, ...]] = (
-        "lanes of",
-        "seed",
-        "OLS",
-        "DET_l",
-        "DET_t",
-        "TOP_ll",
-        "TOP_lt",
-        "mAP",
-        "AP_ls",
-        "AP_ped",
-        "TOP_lsls",
-        "AE_type",
-        "AE_dist",
-        "OLUS",
-        "DET_a",
-        "TOP_lste",
-        "recall",
-        "AP_l",
-        "DET_l@1.0",
-        "DET_l@2.0",
-        "DET_l@3.0",
-        "lanes",
-        "frames",
-    )
-    compared: ClassVar[tuple[str, ...]] = (
-        "all/OLS",
-        "all/DET_t",
-        "all/TOP_lt",
-        "all/mAP",
-        "all/AP_ped",
-        "all/AE_type",
-        "all/AE_dist",
-        *(
-            f"{group}/{name}"
-            for name in ("DET_l", "TOP_ll", "AP_ls", "TOP_lsls", "recall")
-            for group in ("all", "occluded", "clear", *Sightings.groups)
-        ),
-        *(f"{group}/{name}" for name in ("recall", "AP_l") for group in (*LANE_GROUPS[:2], LANE_GROUPS[-1])),
-    )
-    errors: ClassVar[tuple[str, ...]] = ("all/AE_type", "all/AE_dist")
+    columns: ClassVar[tuple[str, ...]] = lane_scores.COLUMNS
+    compared: ClassVar[tuple[str, ...]] = lane_scores.COMPARED
+    errors: ClassVar[tuple[str, ...]] = lane_scores.ERRORS
 
     # -----------------------------------------------------------------------------------------------------------------
     # Learning
@@ -224,8 +186,10 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         """Raise UserError if ranges or points of model and data differ, or a camera sees more cells than `capacity`."""
         example = data.source("train").example
         self._check_ranges(example)
+        if "lines" in self.model.predicts and "map_lines" in self.model.truth and example.map_lines is None:
+            raise UserError("this model learns the lines of a vector map: set data.example.map_lines")
         for name, points in self.model.example_points.items():
-            if (found := getattr(example, name)) != points:
+            if (found := attrgetter(name)(example)) != points:
                 raise UserError(
                     f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
                     f"(task.model.decoder.points), not {found}: change either"
@@ -271,22 +235,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
         """Return the names of the host's metrics by group, with those of traffic elements if it predicts them."""
-        marked = data.source("val").example.markers is not None
-        groups = Sightings.groups if marked else ()
-        of_lanes = () if self._ground is None else LANE_GROUPS
-        metrics = LaneGraphMetrics(config.versions, groups, self.model.predicts, of_lanes)
-        names = set(Evaluation("", metrics.compute()).scores())
-        if "segments" in self.model.predicts:  # without matched pairs, there are no errors
-            names |= {f"{group}/{name}" for group in metrics.compute() for name in ("AE_type", "AE_dist")}
-        if self.model.elements is not None:
-            attributes = ["DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
-            if "centerlines" in self.model.predicts:
-                scores = ["OLS", "TOP_lt", *attributes]
-                scores += [f"{name}_{version}" for version in config.versions[1:] for name in ("OLS", "TOP_lt")]
-                names |= {f"{group}/{name}" for group in ("all", *groups) for name in scores}
-            else:
-                names |= {f"all/{name}" for name in ("OLUS", "TOP_lste", *attributes)}
-        return names
+        example: ExampleConfig = data.source("val").example
+        return lane_scores.score_names(self.model, example, config, grouped=self._ground is not None)
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:
         """Return the function that draws a few validation examples from above and in their camera images."""

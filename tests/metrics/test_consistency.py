@@ -1,0 +1,80 @@
+"""C-mAP on sequences worked out by hand."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.metrics import MapDetections, MapTruth
+from tflane_jax.metrics.consistency import MapConsistency
+from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, match_map
+
+
+def line(x):
+    return np.array([(x, 0.0), (x, 10.0)])
+
+
+def run(frames, classes=0):
+    """Return C-mAP numbers of frames: true lines (x, number), and detections (x, score, identity)."""
+    metrics = MapConsistency()
+    for frame in frames:
+        if frame is None:
+            metrics.start()
+            continue
+        true, found = frame
+        matched = match_map(
+            MapDetections(
+                [line(x) for x, *_ in found], np.full(len(found), classes), np.array([s for _, s, _ in found])
+            ),
+            MapTruth([line(x) for x, _ in true], np.full(len(true), classes)),
+        )
+        metrics.add(matched, np.array([i for *_, i in found], int), np.array([n for _, n in true], int))
+    return metrics.compute()
+
+
+ROAD = [(0, 7), (5, 8)]
+
+
+def test_lines_found_again_as_themselves_count():
+    found = [(0, 0.9, 1), (5, 0.8, 2)]
+    assert run([(ROAD, found), (ROAD[::-1], found[::-1])])["C-AP_divider"] == 1.0
+    assert run([(ROAD, found)])["C-mAP"] == pytest.approx(1 / 3)
+
+
+def test_another_identity_is_false_until_the_first_one_is_back():
+    first, other = (ROAD[:1], [(0, 0.9, 1)]), (ROAD[:1], [(0, 0.9, 5)])
+    # Sorted by score, which ties: frame by frame. Hits are true, false, true of three lines.
+    assert run([first, other, first])["C-AP_divider"] == pytest.approx((1 + 2 / 3) / 3)
+    assert run([first, other, other])["C-AP_divider"] == pytest.approx(1 / 3)
+    # In another scene the line is another one.
+    assert run([first, None, other])["C-AP_divider"] == 1.0
+
+
+def test_swapped_identities_are_both_false():
+    swapped = (ROAD, [(0, 0.9, 2), (5, 0.8, 1)])
+    assert run([(ROAD, [(0, 0.9, 1), (5, 0.8, 2)]), swapped])["C-AP_divider"] == pytest.approx((1 + 2 / 3) / 4)
+
+
+def test_each_threshold_remembers_its_own_first_match():
+    # 1.2 m aside under identity 1, then exact under identity 2: wrong only at 1.5 m, where the first match was.
+    result = run([(ROAD[:1], [(1.2, 0.9, 1)]), (ROAD[:1], [(0, 0.8, 2)])])
+    assert MAP_THRESHOLDS == (0.5, 1.0, 1.5)
+    assert result["C-AP_divider"] == pytest.approx(np.mean([0.25, 0.25, 0.5]))
+
+
+def test_pieces_of_one_line_may_be_found_under_several_identities():
+    pieces = [(0, 7), (5, 7)]
+    found = [(0, 0.9, 1), (5, 0.8, 2)]
+    assert run([(pieces, found), (pieces, found)])["C-AP_divider"] == 1.0
+
+
+def test_one_identity_for_two_lines_is_no_error():
+    assert run([(ROAD, [(0, 0.9, 1), (5, 0.8, 1)])])["C-AP_divider"] == 1.0
+
+
+def test_centerlines_take_no_part():
+    assert run([(ROAD, [(0, 0.9, 1)])], classes=3) == {
+        "C-mAP": 0.0,
+        "C-AP_divider": 0.0,
+        "C-AP_ped_crossing": 0.0,
+        "C-AP_boundary": 0.0,
+    }
+    assert run([])["C-mAP"] == 0.0

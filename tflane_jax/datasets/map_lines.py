@@ -1,0 +1,70 @@
+"""Lines of a vector map (MapTR's ground truth) from a map and an ego pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.datasets.map_geometry import MapGeometry
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.scene import LineClass, MapLines
+from tflane_jax.world.bev.line_of_sight import hidden_points
+
+# Points on each line at which distance and line of sight are measured.
+_SIGHT_SAMPLES = 101
+
+
+@dataclass(frozen=True)
+class MapLinesConfig:
+    """Which lines of a vector map are ground truth; they are cut at `ExampleConfig.range`.
+
+    Attributes:
+        lines, points: lines of an example, and points on each, equally spaced.
+        centerlines: "include" adds MapTRv2's fourth class to dividers, crossings and boundaries: every path through
+            the lane graph inside the range.
+    """
+
+    lines: int = 64
+    points: int = 20
+    centerlines: Literal["exclude", "include"] = "exclude"
+
+
+def crop_map_lines(
+    geometry: MapGeometry,
+    ego_from_global: Float[np.ndarray, "4 4"],
+    range_: PerceptionRange,
+    config: MapLinesConfig,
+    *,
+    boxes: Float[np.ndarray, "k 7"],
+    buildings: Float[np.ndarray, "b 5"],
+) -> tuple[MapLines, int]:
+    """Return the lines near the vehicle, ego frame, and how many of them (the farthest) exceeded the capacity.
+
+    Args:
+        geometry, ego_from_global, range_: map, pose, and perception range in the ego frame.
+        config: classes and sizes.
+        boxes, buildings: obstacles to the line of sight (see `hidden_points`), ego frame.
+    """
+    pieces = geometry.cut(ego_from_global, range_, centerlines=config.centerlines == "include")
+    # Of the many points, not of the vertices: a straight line has only its ends.
+    dense = resample_lines([piece.points for piece in pieces], _SIGHT_SAMPLES)[..., :2]
+    distance = np.linalg.norm(dense, axis=-1).min(1)
+    kept = np.sort(np.argsort(distance, kind="stable")[: config.lines])
+    dropped, pieces, n = len(pieces) - len(kept), [pieces[i] for i in kept], len(kept)
+    lines = MapLines.empty(config.lines, config.points)
+    if n:
+        hidden = hidden_points(dense[kept].reshape(-1, 2), boxes, buildings).reshape(n, -1)
+        lines.points[:n] = resample_lines([piece.points for piece in pieces], config.points)
+        lines.category[:n] = [piece.category for piece in pieces]
+        lines.closed[:n] = [piece.closed for piece in pieces]
+        lines.valid[:n] = True
+        assert lines.visibility is not None
+        lines.visibility[:n] = 1.0 - hidden.mean(-1)
+        assert lines.identity is not None
+        # Numbers of a class are told apart by their remainder.
+        lines.identity[:n] = [0 if p.number is None else len(LineClass) * p.number + p.category for p in pieces]
+    return lines, dropped

@@ -1,0 +1,109 @@
+"""MapTR's metrics of one model's lines: Chamfer AP with groups of lines, AP by overlap, consistency over sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from tflane_jax.evaluation.line_tracks import LineTracks
+from tflane_jax.evaluation.vector_maps import detections_of_lines, map_truth, truth_of_lines
+from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
+from tflane_jax.metrics.groups import BY_OCCLUSION
+from tflane_jax.metrics.vector_map import GroupedMapMetrics, MatchedMap, Measure, VectorMapMetrics, match_map
+from tflane_jax.scene import Example, LinePrediction
+
+LineLabel = Literal["visibility", "identity"]
+"""What the labels of lines tell beside their shapes and classes."""
+
+
+class MapLineMetrics:
+    """Accumulator over frames, those of a scene in succession.
+
+    | group | numbers |
+    |---|---|
+    | `lines` | Chamfer AP of all lines; `C-mAP` if lines have identities |
+    | `lines occluded`, `lines clear` | Chamfer AP by visibility, if it is labelled |
+    | `lines hidden+traffic` ... | Chamfer AP of the further groups |
+    | `lines IoU` | AP by overlap of buffers, if asked for |
+
+    Args:
+        measures: "chamfer", always measured, and "iou".
+        labels: what the labels of lines tell.
+        groups: names of further groups of lines, see `evaluation.lane_groups`.
+    """
+
+    def __init__(
+        self,
+        measures: Collection[Measure] = ("chamfer",),
+        labels: Collection[LineLabel] = (),
+        groups: Sequence[str] = (),
+    ) -> None:
+        partition = BY_OCCLUSION.names if "visibility" in labels else ()
+        self._chamfer = GroupedMapMetrics(("all", *partition), lane_groups=groups)
+        self._overlap = VectorMapMetrics(measure="iou") if "iou" in measures else None
+        self._consistency = MapConsistency() if "identity" in labels else None
+        self._tracks = LineTracks()
+
+    @property
+    def protocol(self) -> str:
+        """Names and versions."""
+        measured = (self._chamfer, self._overlap, self._consistency)
+        return "; ".join(metrics.protocol for metrics in measured if metrics is not None)
+
+    def update(
+        self, lines: LinePrediction, example: Example, members: Mapping[str, Bool[np.ndarray, " g"]] | None = None
+    ) -> None:
+        """Add one frame.
+
+        Args:
+            lines: the last decoder layer's prediction.
+            example: with labelled lines; without, they are derived from its lane segments and areas.
+            members: for each of the further groups, which of the measured true lines belong to it.
+        """
+        detections = detections_of_lines(lines)
+        truth = map_truth(example.segments, example.areas)
+        if example.map_lines is not None:
+            truth = truth_of_lines(example.map_lines, lines)
+        frame = match_map(detections, truth, nearest="all")
+        self._chamfer.add(frame, truth, None, members)
+        if self._overlap is not None:
+            self._overlap.update(detections, truth)
+        if self._consistency is not None and truth.identity is not None:
+            points = np.asarray(detections.points)
+            self._track(self._consistency, frame, points, np.asarray(truth.identity), example)
+
+    def _track(
+        self,
+        consistency: MapConsistency,
+        frame: MatchedMap,
+        points: np.ndarray,
+        lines: Int[np.ndarray, " g"],
+        example: Example,
+    ) -> None:
+        if not example.has_previous:
+            consistency.start()
+            self._tracks.start()
+        confident = frame.scores > CONFIDENT
+        kept = frame.detections(confident)
+        identities = self._tracks.step(points[confident], kept.classes, np.asarray(example.previous_from_ego))
+        consistency.add(kept, identities, lines)
+
+    def compute(self) -> dict[str, dict[str, float]]:
+        """Return metrics by name, for every group."""
+        groups = {_name(group): values for group, values in self._chamfer.compute().items()}
+        if self._consistency is not None:
+            groups["lines"] |= self._consistency.compute()
+        if self._overlap is not None:
+            groups["lines IoU"] = self._overlap.compute()
+        return groups
+
+    def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:
+        """Return by group, for every frame: true lines, and hits summed over the thresholds."""
+        return {_name(group): counts for group, counts in self._chamfer.recalled().items()}
+
+
+def _name(group: str) -> str:
+    return "lines" if group == "all" else f"lines {group}"

@@ -1,0 +1,81 @@
+"""C-mAP: MapTR's metric over sequences, where a line must be found again as the same line.
+
+After MapTracker (Chen et al., ECCV 2024): confident detections get identities over time, and a true positive whose line
+was first matched under another identity counts as false. What that definition leaves open is decided so:
+
+- only detections above `CONFIDENT` take part at all, so that C-mAP is bounded by the AP of these;
+- a line is "first matched" at each Chamfer threshold on its own, in the first frame of its scene in which it is a true
+  positive there. If several pieces of one line are matched in that frame, the identities of all of them are its own;
+- an inconsistent match does not change the identity of the line: a detector that swaps two identities for good stays
+  wrong until the end of the scene;
+- an identity may belong to several lines (two lines found as one is not an error of consistency);
+- centerlines are left out: MapTR's centerlines are paths through the part of the lane graph in range, which are other
+  paths in the next frame.
+
+Where identities of detections come from is the caller's, see `evaluation.line_tracks`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int
+
+from tflane_jax.metrics.matching import average_precision_area, pooled
+from tflane_jax.metrics.vector_map import CLASSES, MAP_THRESHOLDS, MatchedMap
+
+CONFIDENT = 0.4
+
+
+class MapConsistency:
+    """Accumulator of C-mAP; the frames of a scene come in succession."""
+
+    def __init__(self) -> None:
+        self._truths = np.zeros(len(CLASSES), np.int64)
+        self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, consistent hits
+        # Of every threshold, by number of a true line: identities in the first frame that matches it.
+        self._first: list[dict[int, set[int]]] = [{} for _ in MAP_THRESHOLDS]
+
+    @property
+    def protocol(self) -> str:
+        """Name and version, the title of every table of these numbers."""
+        return f"C-mAP v1 (above {CONFIDENT:g})"
+
+    def start(self) -> None:
+        """Start the next scene."""
+        self._first = [{} for _ in MAP_THRESHOLDS]
+
+    def add(self, frame: MatchedMap, identities: Int[np.ndarray, " p"], lines: Int[np.ndarray, " g"]) -> None:
+        """Add the next frame of the scene.
+
+        Args:
+            frame: matching results of the confident detections.
+            identities: of these detections.
+            lines: numbers of the true lines, the same in every frame of the scene.
+        """
+        consistent = np.zeros(frame.hits.shape, bool)
+        for row, hits, first in zip(consistent, frame.hits, self._first, strict=True):
+            new: dict[int, set[int]] = {}
+            for p in np.flatnonzero(hits).tolist():
+                line, identity = int(lines[frame.nearest[p]]), int(identities[p])
+                if line not in first:
+                    new.setdefault(line, set()).add(identity)
+                row[p] = line not in first or identity in first[line]
+            first |= new
+        measured = frame.classes < len(CLASSES)
+        self._truths += frame.truths[: len(CLASSES)]
+        self._detections.append((frame.scores[measured], frame.classes[measured], consistent[:, measured]))
+
+    def compute(self) -> dict[str, float]:
+        """Return `C-mAP`, the mean over classes of `C-AP_divider` ..., each the mean over MapTR's thresholds."""
+        scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
+        precision = {
+            f"C-AP_{name}": np.mean(
+                [
+                    average_precision_area(scores[classes == c], row[classes == c], int(self._truths[c]))
+                    for row in hits.astype(bool)
+                ]
+            )
+            for c, name in enumerate(CLASSES)
+        }
+        means = {"C-mAP": np.mean(list(precision.values()))} | precision
+        return {name: float(value) for name, value in means.items()}

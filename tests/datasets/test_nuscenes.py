@@ -10,6 +10,7 @@ import pytest
 from tests.datasets.nuscenes_small import DRIVEN, EAST, NORTH, PITCH, START, K, tables, write_nuscenes
 from tflane_jax.cli import main
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesData, NuScenesDataset
 from tflane_jax.datasets.nuscenes_can_bus import can_bus
 from tflane_jax.datasets.nuscenes_log import road_user, scene_frames, scene_tracks
@@ -17,8 +18,8 @@ from tflane_jax.datasets.nuscenes_tables import read_tables
 from tflane_jax.datasets.sources import load, named_source
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import PerceptionRange, project, transform_points
-from tflane_jax.scene import AreaType, RoadUser
+from tflane_jax.geometry import PerceptionRange, project
+from tflane_jax.scene import AreaType, LineClass, RoadUser
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
 pytest.importorskip("shapely")
@@ -274,13 +275,35 @@ def test_can_bus_without_messages(tmp_path):
         can_bus(tmp_path, "scene-0001", START * 1000, np.zeros(3), np.array(EAST))
 
 
-def test_patches_of_maptr_are_cut_with_the_house_frame(root):
-    """A divider through MapTR's 30 m x 60 m patch around the lidar, by hand and from the example's frame."""
-    dataset = opened(root, frame="lidar")
-    log = dataset.log("scene-0061")
+def test_lines_are_cut_by_maptrs_rules(root):
+    """In the patch around the lidar at sample 1, (400, 1105.94) northward: 60 m along the road, 30 m across."""
     patch = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
-    ego_from_global = np.linalg.inv(log.keyframes[0].global_from_ego)
-    divider = transform_points(ego_from_global, log.map.dividers[0])
-    maptr = np.stack([-divider[:, 1], divider[:, 0]], -1)  # x right, y forward
-    np.testing.assert_allclose(maptr, [[5.25, -10.94], [5.25, 29.06]], atol=1e-9)
-    assert patch.contains(divider).all()
+    example = replace(SIZES, range=patch, map_lines=MapLinesConfig(lines=10, centerlines="include"))
+    lines = NuScenesDataset(NuScenesConfig(root, frame="lidar", example=example)).example(1).map_lines
+    found = {kind: lines.points[lines.valid & (lines.category == kind)][..., :2] for kind in LineClass}
+    assert {kind.name: len(one) for kind, one in found.items()} == {
+        "DIVIDER": 2,
+        "CROSSING": 1,
+        "BOUNDARY": 1,
+        "CENTERLINE": 1,
+    }
+    start, end = 1090 - 1105.94, 1130 - 1105.94
+    # Every record is a divider of its own, whatever the sides of lanes are.
+    dividers = found[LineClass.DIVIDER]
+    np.testing.assert_allclose(sorted(dividers[:, 0, 1]), [-5.25, -1.75], atol=1e-3)
+    np.testing.assert_allclose(dividers[:, [0, -1], 0], [[start, end]] * 2, atol=1e-3)
+    (crossing,) = found[LineClass.CROSSING]
+    np.testing.assert_array_equal(crossing[0], crossing[-1])
+    np.testing.assert_allclose(np.ptp(crossing, axis=0), [3.0, 8.0], atol=0.6)
+    # The road ahead leaves the patch: its border is cut 0.2 m inside, and the patch's own border is no boundary. From
+    # left to right: 13.05 m beside the road segment's near edge, around two lanes of 7 m by 40 m, 9.55 m.
+    (boundary,) = found[LineClass.BOUNDARY]
+    ends = boundary[[0, -1]][np.argsort(-boundary[[0, -1], 1])]
+    np.testing.assert_allclose(ends, [[end, 14.8], [end, -14.8]], atol=1e-3)
+    length = np.linalg.norm(np.diff(boundary, axis=0), axis=-1).sum()
+    assert length == pytest.approx(13.05 + 40 + 7 + 40 + 9.55, abs=6.0)  # 20 points cut the corners
+    # One path through the lane graph: the lane and its connector, on the circle of 10 m around (390, 1130), up to the
+    # patch's border 5.94 m north of its centre.
+    (path,) = found[LineClass.CENTERLINE]
+    np.testing.assert_allclose(path[0], [start, 0.0], atol=1e-3)
+    np.testing.assert_allclose(path[-1], [30.0, 10 - np.sqrt(100 - 5.94**2)], atol=2e-2)

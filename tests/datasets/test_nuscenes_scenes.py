@@ -10,11 +10,12 @@ from tests.datasets.test_sources import chosen
 from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.datasets.base import ExampleConfig
-from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.examples import make_example, traffic_flow
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES, SceneFileConfig, SceneFileData, SceneFileDataset
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.scene import LineType, RoadUser
 
 SCENES = ("0061", "0655", "0757", "0796", "1077", "1094", "1100")
@@ -237,6 +238,16 @@ def test_real_tracks_are_the_vehicles_and_people(number):
     # The same in complex numbers: (p - ego) turned back by the vehicle's heading.
     relative = (position - ego[:, None])[..., :2] @ [1.0, 1j] * heading.conj()[:, None]
     np.testing.assert_allclose((tracks.position[..., :2] @ [1.0, 1j])[boxes], relative[boxes], atol=1e-6)
+
+
+@pytest.mark.golden
+def test_a_measured_history():
+    """Counted apart from this reader: all objects within 30 m by 15 m of key frame 20 of scene-0061, furniture too."""
+    everything = dict.fromkeys(("vehicle", "human", "movable_object"), RoadUser.CAR)
+    log = read_scene_file(shared_path("data/nuscenes_scenes/scene-0061.npz"), categories=everything)
+    flow, dropped = traffic_flow(log, 20, history=20, capacity=250)
+    inside = (flow.valid & PerceptionRange((-30, 30), (-15, 15)).contains(flow.position)).sum(-1)
+    assert ([(inside >= least).sum() for least in (1, 5, 10)], dropped) == ([64, 63, 48], 0)
 
 
 @pytest.mark.golden

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,12 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
-from tflane_jax.datasets.nuscenes_log import empty_tracks, road_user
+from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user
 from tflane_jax.datasets.nuscenes_map import flat
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
 from tflane_jax.geometry import invert_pose, transform_points, yaw_pose
-from tflane_jax.scene import LineType
+from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
 
 # Metres. Ends of lanes that continue one another coincide to rounding; the next nearest are metres apart.
@@ -39,8 +40,12 @@ _TEXTS = ("instance_token", "category", "map_token", "map_type")
 _BOUNDARY = "boundary_"  # tokens of the pieces of the drivable area's border start with this
 
 
-def read_scene_file(path: Path) -> Log:
+def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = CATEGORIES) -> Log:
     """Read one scene; every key frame becomes an example.
+
+    Args:
+        path: of the file.
+        categories: road user of each category, None to leave it out, see `road_user`.
 
     Raises UserError, which names file and key, for a file that is missing or damaged, or that holds numbers that are
     not finite or arrays that do not fit each other.
@@ -51,7 +56,7 @@ def read_scene_file(path: Path) -> Log:
     x, y, _ = content["ego_position"].T
     pose = yaw_pose(x, y, content["ego_yaw"])
     times = np.arange(len(pose), dtype=np.int64) * period_ns
-    tracks = _tracks(content, pose, path)
+    tracks = _tracks(content, pose, categories, path)
     return Log(
         name=name,
         source="nuscenes-scenes",
@@ -117,8 +122,13 @@ def _meta(text: np.ndarray, where: str) -> tuple[str, int]:
     return name, round(1e9 / rate)
 
 
-def _tracks(content: dict[str, Any], pose: Float[np.ndarray, "f 4 4"], path: Path) -> Tracks:
-    users = [road_user(str(name), f"{path}: category") for name in content["category"]]
+def _tracks(
+    content: dict[str, Any],
+    pose: Float[np.ndarray, "f 4 4"],
+    categories: Mapping[str, RoadUser | None],
+    path: Path,
+) -> Tracks:
+    users = [road_user(str(name), f"{path}: category", categories) for name in content["category"]]
     kept = [i for i, user in enumerate(users) if user is not None]
     valid = content["valid"][:, kept]
     tracks = empty_tracks(*valid.shape, uuid=content["instance_token"][kept])

@@ -233,6 +233,14 @@ def city():
     return content
 
 
+def other_city():
+    """Return the map of scene-0103: one lane."""
+    content = empty_city()
+    content["lane_connector"] = [{"token": "east", "polygon_token": None}]
+    content["arcline_path_3"] = {"east": [straight([40.0, 60.0, 0.0], 30.0)]}
+    return content
+
+
 def empty_city():
     """Return a map without any lane."""
     return _MapWriter().content
@@ -245,7 +253,7 @@ def write_nuscenes(root, content=None, maps=None):
     folder.mkdir(exist_ok=True)
     for name, rows in (content or tables()).items():
         (folder / f"{name}.json").write_text(json.dumps(rows))
-    standard = {"singapore-onenorth": city(), "boston-seaport": empty_city()}
+    standard = {"singapore-onenorth": city(), "boston-seaport": other_city()}
     for name, one in (standard if maps is None else maps).items():
         (root / "maps" / "expansion" / f"{name}.json").write_text(json.dumps(one))
     return root

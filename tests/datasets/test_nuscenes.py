@@ -7,7 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.datasets.nuscenes_small import DRIVEN, EAST, NORTH, PITCH, START, K, tables, write_nuscenes
+from tests.datasets.nuscenes_small import (
+    DRIVEN,
+    EAST,
+    NORTH,
+    PITCH,
+    START,
+    K,
+    empty_city,
+    other_city,
+    tables,
+    write_nuscenes,
+)
 from tflane_jax.cli import main
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
@@ -186,6 +197,21 @@ def test_missing_and_strange_images_are_named(root):
         opened(write_nuscenes(root, content), image=small).example(1)
     with pytest.raises(UserError, match=r"nuScenes has real cameras: set example\.cameras=None"):
         NuScenesDataset(NuScenesConfig(root, example=replace(SIZES, cameras=CameraRigConfig())))
+
+
+def test_false_places_are_errors(root):
+    """Else examples would hold no lane, or images of another place, and no one would know."""
+    write_nuscenes(root, maps={"singapore-onenorth": other_city()})
+    with pytest.raises(UserError, match="scene-0061 on the map of singapore-onenorth: the vehicle never comes within"):
+        opened(root).example(0)
+    write_nuscenes(root, maps={"singapore-onenorth": empty_city()})
+    with pytest.raises(UserError, match="the map is empty or of another place"):
+        opened(root).example(0)
+    content = tables()
+    content["ego_pose"][4]["translation"] = [400.0, 1130.0, 0.0]
+    dataset = opened(write_nuscenes(root, content), image=ImageConfig())
+    with pytest.raises(UserError, match="row data-a1-CAM_FRONT-40000: its ego_pose is 25 m from that of the lidar"):
+        dataset.example(1)
 
 
 def test_splits_of_a_run(root):

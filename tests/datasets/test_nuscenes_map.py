@@ -97,6 +97,8 @@ def test_polygons_that_cross_themselves_are_no_road(file):
     content["polygon"][2]["exterior_node_tokens"][:2] = content["polygon"][2]["exterior_node_tokens"][1::-1]
     (outer,) = read(file, content).around(PATH, 50.0).road_boundaries
     assert signed_area(outer) == pytest.approx(-7 * 40)
+    content["polygon"][3]["exterior_node_tokens"][:2] = content["polygon"][3]["exterior_node_tokens"][1::-1]
+    assert read(file, content).around(PATH, 50.0).crossings == ()
 
 
 def edit(*keys, value):
@@ -123,6 +125,7 @@ def edit(*keys, value):
             if layer not in ("version", "canvas_edge")
         ),
         (edit("node", 3, "x", value=float("nan")), r"node holds nan at \[3, 0\]"),
+        (edit("node", 3, "y", value="1130.0"), "node is of type list, expected numbers"),
         (edit("node", 3, "y", value="far"), "node is of type list, expected numbers"),
         (edit("node", 3, "y", value=...), "node n3 lacks the entry 'y'"),
         (edit("node", 3, "token", value="n2"), "node: the token 'n2' is no text, or two rows have it"),
@@ -156,6 +159,12 @@ def test_damage_is_named_with_layer_and_token(file, damage, message):
 def test_a_missing_map_is_named(tmp_path):
     with pytest.raises(UserError, match=r"download nuScenes' map expansion, version 1\.3"):
         read_expansion(tmp_path / "boston-seaport.json")
+
+
+def test_a_lane_is_not_its_own_successor(file):
+    content = city()
+    content["connectivity"]["north"]["outgoing"] = ["north", "turn"]
+    assert [lane.successors for lane in read(file, content).lanes.values()] == [(1,), ()]
 
 
 def test_a_lane_of_one_point_is_no_lane(file):

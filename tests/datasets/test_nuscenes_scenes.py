@@ -115,6 +115,13 @@ DAMAGE = {
     "no frames": (changed(valid=np.zeros((0, 2), bool)), r"valid has type bool and shape \(0, 2\)"),
     "valid as numbers": (changed(valid=np.ones((3, 2))), "valid has type float64"),
     "text as numbers": (changed(category=np.array([1, 2])), "category must be a list of texts"),
+    "vehicle that jumps": (
+        changed(ego_position=np.array([[10, 20, 0], [10, 90, 0], [10, 20, 0]], float)),
+        r"ego_position\[1\]: the vehicle is 70 m from its place 0.5 s before",
+    ),
+    "poses of another place": (changed(ego_position=np.full((3, 3), 5e3)), "the vehicle never comes within 200 m"),
+    "box far away": (changed(position=np.full((3, 2, 3), 5e3)), r"position\[0, 0\]: the box is 7\d\d\d m from"),
+    "digits as texts": (changed(yaw=np.array([["1", "2"]] * 3)), "yaw is of type ndarray, expected numbers"),
     "texts as numbers": (changed(yaw=np.array([["a", "b"]] * 3)), "yaw is of type ndarray, expected numbers"),
     "other number of categories": (changed(category=np.array(["vehicle.car"])), "category has 1 entries, expected 2"),
     "track twice": (changed(instance_token=np.array(["car", "car"])), "instance_token names a track twice"),
@@ -156,15 +163,17 @@ def test_what_is_no_scene_file_is_named(tmp_path):
         find_scene_files(tmp_path / "none")
 
 
-def test_a_scene_without_lanes_or_traffic_is_empty(tmp_path):
+def test_a_scene_without_traffic_is_empty_and_one_without_lanes_an_error(tmp_path):
     scene = content()
-    scene |= {key: scene[key][:0] for key in ("map_token", "map_type", "polyline", "polygon")}
-    scene |= {f"{key}_len": np.zeros(0, int) for key in ("polyline", "polygon")}
     scene["valid"][:] = False
     log = read_scene_file(write(tmp_path / "scene.npz", scene))
     example = make_example(log, 2, ExampleConfig(lanes=4, segments=4, areas=4, tracks=2))
-    assert not example.lanes.valid.any()
+    assert example.lanes.valid.any()
     assert not example.traffic_flow.valid.any()
+    scene |= {key: scene[key][:0] for key in ("map_token", "map_type", "polyline", "polygon")}
+    scene |= {f"{key}_len": np.zeros(0, int) for key in ("polyline", "polygon")}
+    with pytest.raises(UserError, match="the map is empty or of another place"):
+        read_scene_file(write(tmp_path / "scene.npz", scene))
 
 
 def test_scenes_are_chosen_by_name_or_official_split(tmp_path):

@@ -138,6 +138,15 @@ DAMAGE = {
     "zero quaternion": (change("ego_pose", 0, rotation=ZERO), r"row pose-a0-LIDAR_TOP-0: rotation .* no unit quater"),
     "quaternion of three": (change("ego_pose", 0, rotation=[1, 0, 0]), r"rotation has shape \(3,\), expected \(4,\)"),
     "pose as text": (change("ego_pose", 0, translation="here"), "translation is of type str, expected numbers"),
+    "digits as text": (change("ego_pose", 0, translation=["1", "2", "3"]), "translation is of type list, expected num"),
+    "vehicle that jumps": (
+        change("ego_pose", 3, translation=[400.0, 6105.0, 0.0]),
+        r"sample\.json: row sample-a1: the vehicle is 5005 m from its place 0.5 s before",
+    ),
+    "box far away": (
+        change("sample_annotation", 1, translation=[397.0, 6110.0, 1.0]),
+        r"sample_annotation\.json: row car-0: the box is 5010 m from the vehicle",
+    ),
     "NaN in a box": (
         change("sample_annotation", 1, translation=[0.0, NAN, 0.0]),
         r"sample_annotation\.json: row car-0: translation holds nan",

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,6 +34,7 @@ from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
 from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
 from tflane_jax.datasets.openlane_example import camera_views
+from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
@@ -214,37 +216,51 @@ def check_nuscenes(root: Path) -> FolderCheck:
     """
     tables = read_tables(find_tables(root))
     faults: list[str] = []
-    rows: dict[str, dict[str, int | str]] = {}
+    maps: dict[str, MapExpansion | None] = {}
+    counts: dict[str, Counter[str]] = {}
     for name, scene in sorted(tables.scenes().items()):
         location = tables.location(scene)
-        if location not in rows:
-            rows[location] = _map_counts(tables, location, faults)
-        row = rows[location]
+        if location not in maps:
+            maps[location] = _checked_map(map_path(tables, location), faults)
+        count = counts.setdefault(location, Counter())
+        count["scenes"] += 1
         try:
             frames = scene_frames(tables, scene)
             tracks = scene_tracks(tables, frames)
+            _check_scene_place(maps[location], frames, f"{name} on the map of {location}")
         except UserError as error:
             faults.append(f"{name}: {error}")
             continue
         absent = missing_images(tables, frames.samples)
         if absent:
             faults.append(f"{name}: {len(absent)} images are missing (first {absent[0]})")
-        counts = {"scenes": 1, "key frames": tracks.frames, "road users": len(tracks.uuid)}
-        counts |= {"boxes": int(tracks.valid.sum()), "missing images": len(absent)}
-        row.update({key: row[key] + count for key, count in counts.items()})  # pyright: ignore[reportOperatorIssue]
-    return FolderCheck(f"nuScenes, {tables.folder.name}", list(rows.values()), faults)
+        count.update({"key frames": tracks.frames, "road users": len(tracks.uuid)})
+        count.update({"boxes": int(tracks.valid.sum()), "missing images": len(absent)})
+    rows = [_row(location, counts[location], maps[location]) for location in counts]
+    return FolderCheck(f"nuScenes, {tables.folder.name}", rows, faults)
 
 
-def _map_counts(tables: Tables, location: str, faults: list[str]) -> dict[str, int | str]:
-    row: dict[str, int | str] = {"location": location, "scenes": 0, "key frames": 0, "road users": 0, "boxes": 0}
-    row |= {"missing images": 0, "lanes": 0, "without arcline": 0, "dividers": 0, "crossings": 0}
+def _checked_map(path: Path, faults: list[str]) -> MapExpansion | None:
     try:
-        found = read_expansion(map_path(tables, location))
+        return read_expansion(path)
     except UserError as error:
         faults.append(str(error))
-        return row
-    row |= {"lanes": len(found.lanes), "without arcline": len(found.without_line)}
-    return row | {"dividers": len(found.dividers), "crossings": len(found.crossings)}
+        return None
+
+
+def _check_scene_place(expansion: MapExpansion | None, frames: SceneFrames, where: str) -> None:
+    if expansion is not None:
+        path = frames.global_from_frame[:, :2, 3]
+        check_place([lane.centerline for lane in expansion.lanes_near(path, FAR).values()], path, where)
+
+
+def _row(location: str, count: Counter[str], expansion: MapExpansion | None) -> dict[str, int | str]:
+    names = ("scenes", "key frames", "road users", "boxes", "missing images")
+    found: dict[str, int | str] = {"location": location, **{name: count[name] for name in names}}
+    if expansion is None:
+        return found | dict.fromkeys(("lanes", "without arcline", "dividers", "crossings"), 0)
+    found |= {"lanes": len(expansion.lanes), "without arcline": len(expansion.without_line)}
+    return found | {"dividers": len(expansion.dividers), "crossings": len(expansion.crossings)}
 
 
 def _choose(choice: Choice) -> NuScenesConfig:

@@ -18,6 +18,8 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
 from tflane_jax.geometry import relative_pose
 
+# Metres that the vehicle drives at most between a camera's exposure and the lidar's sweep.
+_DRIVEN = 5.0
 CAMERAS = SUBSETS["B"].cameras
 """The order of MapTR and of OpenLane-V2's subset B; the first is the front camera."""
 
@@ -62,6 +64,10 @@ def _camera(
         raise UserError(f"{where} is no camera matrix (positive focal lengths, last row 0 0 1)")
     global_from_camera = tables.ego_pose(sample, name) @ tables.calibration(sample, name)
     pose = relative_pose(global_from_ego, global_from_camera)
+    driven = float(np.linalg.norm(tables.ego_pose(sample, name)[:2, 3] - global_from_ego[:2, 3]))
+    if driven > _DRIVEN:
+        where = tables.where("sample_data", row["token"])
+        raise UserError(f"{where}: its ego_pose is {driven:.0f} m from that of the lidar's sweep")
     return FrameCamera(
         name=name,
         image=tables.root / row["filename"],

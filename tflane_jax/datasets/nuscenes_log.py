@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.nuscenes_tables import Row, Tables, poses_of, vectors
+from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.scene import RoadUser
@@ -93,14 +94,16 @@ def scene_frames(tables: Tables, scene: Row, frame: ReferenceFrame = "ego") -> S
     """Return the key frames of a scene.
 
     Raises:
-        UserError: the chain of samples is broken, or a sample has no lidar frame or no proper pose.
+        UserError: the chain of samples is broken, the vehicle jumps, or a sample has no lidar frame or no proper pose.
     """
     samples = tables.samples(scene)
     ego = np.stack([tables.ego_pose(sample) for sample in samples])
+    times = np.array([sample["timestamp"] for sample in samples], np.int64) * 1000
+    check_motion(ego[:, :2, 3], times, [tables.where("sample", sample["token"]) for sample in samples])
     lidar = np.stack([tables.calibration(sample) for sample in samples]) if frame == "lidar" else None
     return SceneFrames(
         samples=tuple(samples),
-        timestamps_ns=np.array([sample["timestamp"] for sample in samples], np.int64) * 1000,
+        timestamps_ns=times,
         global_from_ego=ego,
         global_from_frame=level_poses(ego, lidar),
     )
@@ -124,8 +127,11 @@ def scene_log(
         least_visibility: boxes of a lower level count as occluded, as those without lidar and radar points always do.
 
     Raises:
-        UserError: a box is malformed, has an unknown category, or is a second one of its instance in a sample.
+        UserError: a box is malformed, far from the vehicle, has an unknown category, or is a second one of its instance
+            in a sample; or the vehicle never comes near a lane of the map.
     """
+    lanes = [lane.centerline for lane in vector_map.segments.values()]
+    check_place(lanes, frames.global_from_frame[:, :2, 3], f"{scene['name']} on the map of {tables.location(scene)}")
     tracks = scene_tracks(tables, frames, categories, least_visibility)
     return Log(
         name=scene["name"],
@@ -170,6 +176,7 @@ def scene_tracks(
     tracks.category[:] = [_category(tables, rows[i], categories) for i in first]
     global_from_ego, frame_from_ego = frames.global_from_ego[f], frames.frame_from_ego[f]
     ego_centre = transform_points(invert_pose(global_from_ego), pose[:, None, :3, 3])
+    check_distance(ego_centre[:, 0], where)
     tracks.position[f, k] = transform_points(frame_from_ego, ego_centre)[:, 0]
     yaw = pose_yaw(pose) - pose_yaw(global_from_ego) + pose_yaw(frame_from_ego)
     tracks.yaw[f, k] = (yaw + np.pi) % (2 * np.pi) - np.pi

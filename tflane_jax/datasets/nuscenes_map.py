@@ -76,6 +76,11 @@ class MapExpansion:
     roads: tuple[Polygon, ...]
     without_line: tuple[str, ...]
 
+    def lanes_near(self, path: Float[np.ndarray, "f 2"], reach: float) -> dict[int, ExpansionLane]:
+        """Return the lanes whose bounding box comes within `reach` metres of a path."""
+        chosen = _near([lane.centerline for lane in self.lanes.values()], path, reach)
+        return {number: lane for (number, lane), near in zip(self.lanes.items(), chosen, strict=True) if near}
+
     def around(self, path: Float[np.ndarray, "f 2"], reach: float) -> VectorMap:
         """Return the part of the map whose elements come near a path, each element whole; all heights are 0.
 
@@ -83,13 +88,12 @@ class MapExpansion:
             path: positions, global metres.
             reach: greatest distance of an element's bounding box from a position, metres.
         """
-        chosen = _near([lane.centerline for lane in self.lanes.values()], path, reach)
-        kept = {number: lane for (number, lane), near in zip(self.lanes.items(), chosen, strict=True) if near}
+        kept = self.lanes_near(path, reach)
         outlines = {n: LaneOutline(x.centerline, None if x.polygon is None else x.polygon[0]) for n, x in kept.items()}
         sides = boundaries(outlines, {number: lane.successors for number, lane in kept.items()})
         return VectorMap(
             segments={number: _segment(number, lane, *sides[number]) for number, lane in kept.items()},
-            crossings=tuple(flat(polygon[0]) for polygon in _nearby(self.crossings, path, reach)),
+            crossings=tuple(flat(one[0]) for one in _nearby(self.crossings, path, reach) if _shape(one).is_valid),
             road_boundaries=tuple(flat(ring) for ring in union_rings(list(_nearby(self.roads, path, reach)))),
             dividers=tuple(flat(line) for line in _chosen(self.dividers, _near(self.dividers, path, reach))),
         )
@@ -183,14 +187,14 @@ class _MapFile:
         )
 
     def _successors(self, number: Mapping[str, int]) -> dict[int, set[int]]:
-        """Return the successors of each lane, from both ends of a connection, without lanes that the file lacks."""
+        """Return the successors of each lane, from both ends of a connection, without itself and lanes of no record."""
         after: dict[int, set[int]] = {i: set() for i in number.values()}
         for token, row in self._dict("connectivity").items():
             where = self._where("connectivity", token)
             outgoing, incoming = (items(row, name, where) for name in ("outgoing", "incoming"))
             pairs = [*((token, other) for other in outgoing), *((other, token) for other in incoming)]
             for first, second in pairs:
-                if first in number and second in number:
+                if first in number and second in number and first != second:
                     after[number[first]].add(number[second])
         return after
 
@@ -255,12 +259,12 @@ def union_rings(polygons: Sequence[Polygon]) -> list[np.ndarray]:
 
     Polygons that cross themselves are left out, as there. Raises UserError if shapely is not installed.
     """
-    try:
-        import shapely
-        from shapely.geometry.polygon import orient
-    except ImportError as error:
-        raise UserError("reading nuScenes maps needs shapely: pip install 'tflane_jax[data]'") from error
-    parts = [shapely.Polygon(polygon[0], polygon[1:]) for polygon in polygons]
+    parts = [_shape(polygon) for polygon in polygons]
+    if not parts:
+        return []
+    import shapely
+    from shapely.geometry.polygon import orient
+
     union = shapely.union_all([part for part in parts if part.is_valid])
     rings = []
     for part in shapely.get_parts(union):
@@ -268,6 +272,15 @@ def union_rings(polygons: Sequence[Polygon]) -> list[np.ndarray]:
             turned = orient(part, -1.0)
             rings += [np.asarray(ring.coords)[:, :2] for ring in (turned.exterior, *turned.interiors)]
     return rings
+
+
+def _shape(polygon: Polygon) -> Any:
+    """Return a polygon of shapely; raises UserError if shapely is not installed."""
+    try:
+        import shapely
+    except ImportError as error:
+        raise UserError("reading nuScenes maps needs shapely: pip install 'tflane_jax[data]'") from error
+    return shapely.Polygon(polygon[0], polygon[1:])
 
 
 def _segment(number: int, lane: ExpansionLane, left: np.ndarray, right: np.ndarray) -> LaneSegment:

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user
 from tflane_jax.datasets.nuscenes_map import flat
+from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
 from tflane_jax.geometry import invert_pose, transform_points, yaw_pose
@@ -56,11 +57,15 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
     x, y, _ = content["ego_position"].T
     pose = yaw_pose(x, y, content["ego_yaw"])
     times = np.arange(len(pose), dtype=np.int64) * period_ns
+    check_motion(content["ego_position"][:, :2], times, [f"{path}: ego_position[{i}]" for i in range(len(pose))])
+    vector_map = _vector_map(content, path)
+    lanes = [lane.centerline for lane in vector_map.segments.values()]
+    check_place(lanes, content["ego_position"][:, :2], str(path))
     tracks = _tracks(content, pose, categories, path)
     return Log(
         name=name,
         source="nuscenes-scenes",
-        map=_vector_map(content, path),
+        map=vector_map,
         timestamps_ns=times,
         global_from_ego=pose,
         tracks=tracks,
@@ -137,6 +142,8 @@ def _tracks(
     tracks.category[:] = [users[i] for i in kept]
     position = transform_points(invert_pose(pose), content["position"][:, kept])
     yaw = content["yaw"][:, kept] - content["ego_yaw"][:, None]
+    seen = np.argwhere(valid)
+    check_distance(position[valid], [f"{path}: position[{f}, {kept[k]}]" for f, k in seen])
     tracks.position[:] = np.where(valid[..., None], position, 0.0)
     tracks.yaw[:] = np.where(valid, (yaw + np.pi) % (2 * np.pi) - np.pi, 0.0)
     return tracks

@@ -20,12 +20,15 @@ from tests.datasets.nuscenes_small import (
     write_nuscenes,
 )
 from tflane_jax.cli import main
+from tflane_jax.config import RunConfig, SceneFileData, apply_overrides
+from tflane_jax.config_io import from_json, to_json
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesData, NuScenesDataset
 from tflane_jax.datasets.nuscenes_can_bus import can_bus
 from tflane_jax.datasets.nuscenes_log import road_user, scene_frames, scene_tracks
 from tflane_jax.datasets.nuscenes_tables import read_tables
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.sources import load, named_source
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
@@ -229,6 +232,15 @@ def test_splits_of_a_run(root):
     file = root / "splits.json"
     file.write_text(json.dumps({"test": ["scene-0061", "scene-0103"]}))
     assert len(opened(root, split="test", splits=file)) == 6
+
+
+def test_a_configuration_is_saved_and_changed(root):
+    config = RunConfig(data=NuScenesData(root, frame="lidar", splits=root / "s.json", augmentation=PhotometricConfig()))
+    assert from_json(RunConfig, json.loads(json.dumps(to_json(config)))) == config
+    changed = apply_overrides(config, ["--data.least-visibility", "v40-60", "--data.version", "v1.0-mini"])
+    assert (changed.data.least_visibility, changed.data.source("val").version) == ("v40-60", "v1.0-mini")
+    scenes = RunConfig(data=SceneFileData(root, ("a", "b"), ("c",), ("c",)))
+    assert from_json(RunConfig, json.loads(json.dumps(to_json(scenes)))) == scenes
 
 
 def test_check_counts_and_lists_every_fault(root, capsys):

@@ -34,6 +34,7 @@ from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
 from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
 from tflane_jax.datasets.openlane_example import camera_views
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
@@ -180,6 +181,7 @@ class NuScenesData:
         root: folder of the data set.
         train, val, test: which official split serves as each; the official test split has no annotations.
         version, splits, frame, least_visibility, image, example, loading: see `NuScenesConfig`.
+        augmentation: of the colours of training images, or None.
     """
 
     root: Path
@@ -193,6 +195,7 @@ class NuScenesData:
     image: ImageConfig | None = None
     example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
+    augmentation: PhotometricConfig | None = None
 
     def source(self, split: Split) -> NuScenesConfig:
         """Return the dataset of a split."""

@@ -113,7 +113,7 @@ def scene_log(
     tables: Tables,
     scene: Row,
     frames: SceneFrames,
-    vector_map: VectorMap,
+    vector_map: VectorMap | None,
     *,
     categories: Mapping[str, RoadUser | None] = CATEGORIES,
     least_visibility: Visibility = "v0-40",
@@ -122,7 +122,7 @@ def scene_log(
 
     Args:
         tables, scene, frames: see `scene_frames`.
-        vector_map: around the scene, global metres.
+        vector_map: around the scene, global metres; None leaves it empty.
         categories: road user of each category, None to leave it out, see `road_user`.
         least_visibility: boxes of a lower level count as occluded, as those without lidar and radar points always do.
 
@@ -130,13 +130,15 @@ def scene_log(
         UserError: a box is malformed, far from the vehicle, has an unknown category, or is a second one of its instance
             in a sample; or the vehicle never comes near a lane of the map.
     """
-    lanes = [lane.centerline for lane in vector_map.segments.values()]
-    check_place(lanes, frames.global_from_frame[:, :2, 3], f"{scene['name']} on the map of {tables.location(scene)}")
+    if vector_map is not None:
+        lanes = [lane.centerline for lane in vector_map.segments.values()]
+        where = f"{scene['name']} on the map of {tables.location(scene)}"
+        check_place(lanes, frames.global_from_frame[:, :2, 3], where)
     tracks = scene_tracks(tables, frames, categories, least_visibility)
     return Log(
         name=scene["name"],
         source="nuscenes",
-        map=vector_map,
+        map=VectorMap({}) if vector_map is None else vector_map,
         timestamps_ns=frames.timestamps_ns,
         global_from_ego=frames.global_from_frame,
         tracks=tracks,

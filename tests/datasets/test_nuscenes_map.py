@@ -139,7 +139,7 @@ def edit(*keys, value):
         (edit("road_divider", 0, "line_token", value=None), "road_divider middle: the line None is not in the file"),
         (edit("ped_crossing", 0, "polygon_token", value=3), "ped_crossing zebra: the polygon 3 is not in the file"),
         (edit("lane_connector", 0, "token", value="north"), "north is both a lane and a lane_connector"),
-        (edit("lane", 0, "left_lane_divider_segments", 0, "segment_type", value="BLUE"), "unknown segment_type 'BLUE'"),
+        (edit("lane", 0, "left_lane_divider_segments", 0, "segment_type", value=3), "segment_type is 3, expected text"),
         (edit("arcline_path_3", value=[]), "arcline_path_3 is of type list, expected a mapping from lanes"),
         (edit("arcline_path_3", "north", 0, "shape", value="LLL"), r"arcline_path_3 north\[0\]\.shape is 'LLL'"),
         (edit("connectivity", "turn", "incoming", value=...), "connectivity turn lacks the entry 'incoming'"),

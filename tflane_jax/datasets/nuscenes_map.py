@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +77,27 @@ class MapExpansion:
     roads: tuple[Polygon, ...]
     without_line: tuple[str, ...]
 
+    @cached_property
+    def _boxes(self) -> Mapping[str, Float[np.ndarray, "n 2 2"]]:
+        """Bounding boxes of all elements, because every scene asks which are near."""
+        return {
+            "lanes": _bounds([lane.centerline for lane in self.lanes.values()]),
+            "dividers": _bounds(self.dividers),
+            "crossings": _bounds([polygon[0] for polygon in self.crossings]),
+            "roads": _bounds([polygon[0] for polygon in self.roads]),
+        }
+
+    def _near(self, name: str, path: np.ndarray, reach: float) -> list[Any]:
+        """Return the elements whose bounding box comes within `reach` of a path."""
+        low, high = self._boxes[name][:, None, 0], self._boxes[name][:, None, 1]
+        outside = np.maximum(np.maximum(low - path, path - high), 0.0)
+        near = (np.linalg.norm(outside, axis=-1) <= reach).any(-1)
+        elements = self.lanes.items() if name == "lanes" else getattr(self, name)
+        return [element for element, close in zip(elements, near, strict=True) if close]
+
     def lanes_near(self, path: Float[np.ndarray, "f 2"], reach: float) -> dict[int, ExpansionLane]:
         """Return the lanes whose bounding box comes within `reach` metres of a path."""
-        chosen = _near([lane.centerline for lane in self.lanes.values()], path, reach)
-        return {number: lane for (number, lane), near in zip(self.lanes.items(), chosen, strict=True) if near}
+        return dict(self._near("lanes", path, reach))
 
     def around(self, path: Float[np.ndarray, "f 2"], reach: float) -> VectorMap:
         """Return the part of the map whose elements come near a path, each element whole; all heights are 0.
@@ -93,9 +111,9 @@ class MapExpansion:
         sides = boundaries(outlines, {number: lane.successors for number, lane in kept.items()})
         return VectorMap(
             segments={number: _segment(number, lane, *sides[number]) for number, lane in kept.items()},
-            crossings=tuple(flat(one[0]) for one in _nearby(self.crossings, path, reach) if _shape(one).is_valid),
-            road_boundaries=tuple(flat(ring) for ring in union_rings(list(_nearby(self.roads, path, reach)))),
-            dividers=tuple(flat(line) for line in _chosen(self.dividers, _near(self.dividers, path, reach))),
+            crossings=tuple(flat(one[0]) for one in self._near("crossings", path, reach) if _shape(one).is_valid),
+            road_boundaries=tuple(flat(ring) for ring in union_rings(self._near("roads", path, reach))),
+            dividers=tuple(flat(line) for line in self._near("dividers", path, reach)),
         )
 
 
@@ -307,28 +325,14 @@ def _marking(row: Mapping[str, Any], name: str, where: str) -> LineType:
 
 
 def _line_type(mark: Any, where: str) -> LineType:
-    words = mark.split("_") if isinstance(mark, str) else []
-    if words and words[0] == "NIL":
-        return LineType.NONE
+    if not isinstance(mark, str):
+        raise UserError(f"{where}: segment_type is {mark!r:.40}, expected text")
+    words = mark.split("_")
     if "DASHED" in words:
         return LineType.DASHED
-    if "SOLID" in words or "ZIGZAG" in words:
-        return LineType.SOLID
-    raise UserError(f"{where}: unknown segment_type {mark!r:.40}")
+    return LineType.SOLID if "SOLID" in words or "ZIGZAG" in words else LineType.NONE
 
 
-def _near(lines: Sequence[np.ndarray], path: np.ndarray, reach: float) -> np.ndarray:
-    """Return which lines have a bounding box within `reach` of a position."""
-    if not lines:
-        return np.zeros(0, bool)
-    low, high = (np.array([bound(line, axis=0) for line in lines]) for bound in (np.min, np.max))
-    outside = np.maximum(np.maximum(low[:, None] - path, path - high[:, None]), 0.0)
-    return (np.linalg.norm(outside, axis=-1) <= reach).any(-1)
-
-
-def _chosen(lines: Sequence[Any], chosen: np.ndarray) -> Iterator[Any]:
-    return (line for line, near in zip(lines, chosen, strict=True) if near)
-
-
-def _nearby(polygons: Sequence[Polygon], path: np.ndarray, reach: float) -> Iterator[Polygon]:
-    return _chosen(polygons, _near([polygon[0] for polygon in polygons], path, reach))
+def _bounds(lines: Sequence[np.ndarray]) -> Float[np.ndarray, "n 2 2"]:
+    """Return the lowest and highest x and y of each line."""
+    return np.array([[line.min(0), line.max(0)] for line in lines]).reshape(-1, 2, 2)

@@ -7,79 +7,19 @@ import shutil
 import numpy as np
 import pytest
 
+from tests.datasets.small_argoverse2 import FRAMES, MS, POSE, box, write, write_log
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
 from tflane_jax.datasets.argoverse2_map import line_type
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LineType, RoadUser
 
-pa = pytest.importorskip("pyarrow")
 feather = pytest.importorskip("pyarrow.feather")
-
-FRAMES = 6
-POSE = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tx_m": 0.0, "ty_m": 0.0, "tz_m": 0.0}
-
-
-def write(path, rows, columns=None):
-    columns = columns or list(rows[0])
-    feather.write_feather(pa.table({c: [row[c] for row in rows] for c in columns}), str(path))
-
-
-def box(frame, uuid, category, x, *, points=9):
-    return {
-        "timestamp_ns": 1000 + 100 * frame,
-        "track_uuid": uuid,
-        "category": category,
-        "length_m": 4.0,
-        "width_m": 2.0,
-        "height_m": 1.5,
-        **POSE,
-        "tx_m": x,
-        "qw": 0.0,
-        "qz": 1.0,
-        "num_interior_pts": points,
-    }
-
-
-def points(*xy):
-    return [{"x": float(x), "y": float(y), "z": 0.5} for x, y in xy]
-
-
-LANE = {
-    "id": 5,
-    "is_intersection": False,
-    "lane_type": "BIKE",
-    "left_lane_boundary": points((0, 2), (40, 2)),
-    "left_lane_mark_type": "DASHED_WHITE",
-    "right_lane_boundary": points((0, -2), (20, -2), (40, -2)),
-    "right_lane_mark_type": "NONE",
-    "successors": [6],
-    "predecessors": [],
-    "left_neighbor_id": None,
-    "right_neighbor_id": None,
-}
-MAP = {
-    "lane_segments": {"5": LANE},
-    "pedestrian_crossings": {"1": {"id": 1, "edge1": points((0, 0), (0, 5)), "edge2": points((3, 0), (3, 5))}},
-    "drivable_areas": {
-        "1": {"id": 1, "area_boundary": points((0, -9), (20, -9), (20, 9), (0, 9))},
-        "2": {"id": 2, "area_boundary": points((20, -9), (40, -9), (40, 9), (20, 9))},
-    },
-}
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Write a log of six frames: a car throughout, a walker in frame 1, a bollard."""
-    folder = tmp_path / "sensor" / "val" / "log-a"
-    (folder / "map").mkdir(parents=True)
-    boxes = [box(f, "car", "REGULAR_VEHICLE", 10.0 + f, points=f) for f in range(FRAMES)]
-    boxes += [box(1, "walker", "PEDESTRIAN", 3.0), box(2, "post", "BOLLARD", 4.0)]
-    write(folder / ANNOTATIONS, boxes)
-    poses = [{"timestamp_ns": t, **POSE, "tx_m": t / 100} for t in (990, *range(1000, 1600, 100), 1590)]
-    write(folder / POSES, poses)
-    (folder / "map" / "log_map_archive_log-a____PIT_city_1.json").write_text(json.dumps(MAP))
-    return folder
+    return write_log(tmp_path / "sensor" / "val" / "log-a")
 
 
 def test_reads_tracks_poses_and_map(folder):
@@ -109,17 +49,17 @@ def test_reads_tracks_poses_and_map(folder):
 def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, tmp_path):
     openlane = tmp_path / "openlane"
     (openlane / "OpenLane-V2").mkdir(parents=True)
-    frames = {"train": {}, "val": {"10003": ["1590.json", "990.json"], "10004": ["7.json"]}}
+    frames = {"train": {}, "val": {"10003": [f"{1590 * MS}.json", f"{990 * MS}.json"], "10004": ["7.json"]}}
     (openlane / "OpenLane-V2" / "data_dict_subset_A.json").write_text(json.dumps(frames))
     logs = openlane / "subset_A_segment_to_av2_log.json"
     logs.write_text(json.dumps({"val": {"10003": "log-a", "10004": "log-b"}}))
     moments = load_log(folder, openlane=openlane).keyframes
-    assert [(k.timestamp_ns, k.track_frame) for k in moments] == [(990, 0), (1590, 5)]
+    assert [(k.timestamp_ns, k.track_frame) for k in moments] == [(990 * MS, 0), (1590 * MS, 5)]
     assert [k.global_from_ego[0, 3] for k in moments] == [9.9, 15.9]
     # A log that the split files do not hold falls back to every fifth annotated frame.
     other = folder.with_name("log-c")
     shutil.copytree(folder, other)
-    assert [k.timestamp_ns for k in load_log(other, openlane=openlane).keyframes] == [1000, 1500]
+    assert [k.timestamp_ns for k in load_log(other, openlane=openlane).keyframes] == [1000 * MS, 1500 * MS]
     with pytest.raises(UserError, match="split files"):
         load_log(folder, openlane=tmp_path)
 
@@ -133,7 +73,7 @@ def test_dataset_orders_logs_by_name_and_survives_pickling(folder):
     dataset = Argoverse2Dataset(Argoverse2Config(root))
     assert len(dataset) == 4
     assert [dataset.info(i).scene for i in range(4)] == ["another"] * 2 + ["log-a"] * 2
-    assert dataset.info(3).timestamp_ns == 1500
+    assert dataset.info(3).timestamp_ns == 1500 * MS
     example = pickle.loads(pickle.dumps(dataset)).example(3)
     example.validate()
     np.testing.assert_array_equal(example.bev, dataset.example(3).bev)
@@ -188,8 +128,8 @@ def other_poses(folder):
         (lambda f: (f / ANNOTATIONS).unlink(), r"annotations\.feather is missing: download"),
         (lambda f: (f / POSES).unlink(), r"city_SE3_egovehicle\.feather is missing: download"),
         (missing_map, r"map holds no log_map_archive"),
-        (broken_map, "not valid json"),
-        (other_map, "not an Argoverse 2 vector map"),
+        (broken_map, "is no JSON file"),
+        (other_map, "lacks the entry 'lane_segments'"),
         (cut_annotations, "not a readable feather file"),
         (wrong_columns, "lacks the column"),
         (no_boxes, "holds no annotated frame"),

@@ -54,6 +54,18 @@ def test_truth_of_other_points_is_named(model, setting):
         task.check(WorldData(example=ExampleConfig(**{setting: 7})), EXAMPLES)
 
 
+def test_a_model_of_traffic_flow_needs_data_with_it():
+    without = EXAMPLES.replace(traffic_flow=None)
+    LaneGraphTask(BASELINE).check(WorldData(), without)
+    task = LaneGraphTask(replace(TopoNetConfig(), priors=WITH_TRAFFIC.priors))
+    task.check(WorldData(), EXAMPLES)
+    with pytest.raises(UserError, match=r"data have none: .*data\.tracks"):
+        task.check(WorldData(), without)
+    limit_instances(task, 0).check(WorldData(), without)  # the matched control reads none
+    with pytest.raises(UserError, match=r"reads 20 past frames .*hold 6 \(data\.example\.history\)"):
+        task.check(WorldData(example=ExampleConfig(history=6)), EXAMPLES)
+
+
 def test_truth_beyond_the_bev_features_is_named():
     data = WorldData(example=ExampleConfig(range=WIDE))
     with pytest.raises(UserError, match=r"data\.example\.range.*BEV features"):

@@ -80,7 +80,10 @@ def check(options: argparse.Namespace) -> int:
     if source.check is None:
         names = ", ".join(one.name for one in sources.SOURCES if one.check is not None)
         raise UserError(f"--format {source.name} is not read from a folder: choose one of {names}")
-    found = source.check(Path(options.root))
+    tracks = {} if options.tracks is None else {"tracks": options.tracks}
+    if tracks and not source.tracks:
+        raise UserError("--tracks belongs to --format openlane-v2: other datasets hold their tracks themselves")
+    found = source.check(Path(options.root), **tracks)
     print(format_table(found.rows, title=f"{options.root}: {found.format}"))
     if found.faults:
         print(f"\n{len(found.faults)} faults:", *(f"  - {fault}" for fault in found.faults[:_PRINTED_FAULTS]), sep="\n")

@@ -1,27 +1,60 @@
-"""`tflane data export`: writes a dataset with cameras in OpenLane-V2's layout."""
+"""`tflane data export`: writes a dataset with cameras in OpenLane-V2's layout, and its tracks as Argoverse 2 logs."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.argoverse2_export import export_tracks
+from tflane_jax.datasets.base import DrivenDataset, Split
 from tflane_jax.datasets.openlane_check import check_openlane_v2
-from tflane_jax.datasets.openlane_export import export_openlane_v2
+from tflane_jax.datasets.openlane_export import export_openlane_v2, time_offset
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
+from tflane_jax.scene.logs import Log
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Write the splits, check the written files, and print their counts."""
     config = apply_overrides(load_config(options.config), overrides)
-    splits = dict.fromkeys(options.splits)
-    datasets = {split: sources.open_dataset(chosen_source(config, options, split)) for split in splits}
+    chosen = {split: chosen_source(config, options, split) for split in dict.fromkeys(options.splits)}
+    tracks: Path | None = options.tracks
+    driven = {} if tracks is None else _driven(chosen)
+    datasets = {split: sources.open_dataset(source) for split, source in chosen.items()}
     out = export_openlane_v2(datasets, options.out, images=options.images)
-    found = check_openlane_v2(out, progress=False)
+    if tracks is not None:
+        export_tracks(_drives(driven), tracks, partial(time_offset, "A"))
+    found = check_openlane_v2(out, tracks, progress=False)
     print(format_table(found.rows, title=f"{out}: OpenLane-V2, subset {found.subset}"))
     if found.faults:
         raise UserError(f"what was written to {out} has faults: {found.faults[0]}")
     return 0
+
+
+def _driven(chosen: Mapping[Split, Any]) -> dict[Split, DrivenDataset]:
+    """Return the datasets that hold the logs of the splits; raise UserError where tracks cannot be written."""
+    driven = {}
+    for split, source in chosen.items():
+        dataset = sources.make_dataset(source)
+        if not isinstance(dataset, DrivenDataset):
+            raise UserError(f"--tracks: {sources.source_name(source)} has no logs whose tracks could be written")
+        cameras = dataset.example(0).cameras  # pyright: ignore[reportAttributeAccessIssue]
+        if cameras is not None and len(cameras.valid) != 7:
+            raise UserError(
+                "--tracks writes Argoverse 2 logs, which belong to subset A with seven cameras; this dataset has "
+                f"{len(cameras.valid)}: choose a ring of seven, data.example.cameras.ring"
+            )
+        driven[split] = dataset
+    return driven
+
+
+def _drives(driven: Mapping[Split, DrivenDataset]) -> Iterator[tuple[Split, Log]]:
+    for split, dataset in driven.items():
+        for log in dataset.drives():
+            yield split, log

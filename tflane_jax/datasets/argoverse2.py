@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
+from tflane_jax.scene.logs import Log
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,10 @@ class Argoverse2Dataset:
         log, number = self._frames[index]
         keyframe = log.keyframes[number]
         return FrameInfo(log.source, log.name, keyframe.timestamp_ns, keyframe.global_from_ego)
+
+    def drives(self) -> Iterator[Log]:
+        """Yield the logs."""
+        yield from self.logs
 
 
 @dataclass(frozen=True)

@@ -17,21 +17,28 @@ import numpy as np
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
 from tflane_jax.errors import UserError
+from tflane_jax.files.feather_table import Kind, read_columns
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
 from tflane_jax.scene import RoadUser
-from tflane_jax.scene.logs import KeyFrame, Log, Tracks
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 
 ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
-_POSE_COLUMNS = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_BOX_COLUMNS = (
-    *_POSE_COLUMNS,
-    "track_uuid",
-    "category",
-    "length_m",
-    "width_m",
-    "height_m",
-    "num_interior_pts",
-)
+_QUATERNION, _SIZE = ("qw", "qx", "qy", "qz"), ("length_m", "width_m", "height_m")
+_POSE_COLUMNS: Mapping[str, Kind] = {
+    "timestamp_ns": "integer",
+    **dict.fromkeys((*_QUATERNION, "tx_m", "ty_m", "tz_m"), "number"),
+}
+_BOX_COLUMNS: Mapping[str, Kind] = {
+    **_POSE_COLUMNS,
+    "track_uuid": "text",
+    "category": "text",
+    **dict.fromkeys(_SIZE, "number"),
+    "num_interior_pts": "integer",
+}
+# Metres per second, metres, and deviation of a quaternion's norm from 1.
+_FASTEST, _JITTER, _UNIT = 70.0, 0.5, 1e-2
+# Metres from the vehicle to the nearest lane. Parking lots and driveways are not on the map; another city is farther.
+_FAR = 200.0
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
 
@@ -66,8 +73,10 @@ CATEGORIES: Mapping[str, RoadUser | None] = {
     "MOBILE_PEDESTRIAN_CROSSING_SIGN": None,
     "MESSAGE_BOARD_TRAILER": None,
     "TRAFFIC_LIGHT_TRAILER": None,
+    "EGO_VEHICLE": None,
 }
-"""Road user of each Argoverse 2 category; None is street furniture, which has tracks but is no traffic."""
+"""Road user of each Argoverse 2 category; None is no traffic: street furniture, and the vehicle itself, which the tools
+of Argoverse write as a track."""
 
 Keyframes = Literal["openlane_v2", "annotations"]
 
@@ -78,6 +87,7 @@ def load_log(
     keyframes: Keyframes = "openlane_v2",
     openlane: Path | None = None,
     categories: Mapping[str, RoadUser | None] = CATEGORIES,
+    with_map: bool = True,
 ) -> Log:
     """Read one log folder.
 
@@ -87,13 +97,14 @@ def load_log(
         openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps (of the front camera). Without
             it, or for a log that is not in them, "openlane_v2" takes every fifth annotated frame.
         categories: road user of each category, None to leave it out.
+        with_map: False leaves the map empty, for tracks alone.
 
     Raises:
         UserError: a file is missing or unreadable, lacks a column, or holds no frame.
     """
     folder = Path(folder)
     pose_times, poses = read_poses(folder)
-    boxes = read_table(folder / ANNOTATIONS, _BOX_COLUMNS)
+    boxes = _read_boxes(folder / ANNOTATIONS)
     times = np.unique(boxes["timestamp_ns"])
     if len(times) == 0:
         raise UserError(
@@ -104,12 +115,17 @@ def load_log(
     if keyframes == "openlane_v2" and openlane is not None:
         moments = openlane_timestamps(openlane).get(folder.name, moments)
     nearest = np.abs(moments[:, None] - times).argmin(-1)
+    at_frames = _poses_at(times, pose_times, poses, folder)
+    city = VectorMap({})
+    if with_map:
+        city = read_map(folder / "map")
+        _check_place(folder, city, at_frames)
     return Log(
         name=folder.name,
         source="argoverse2",
-        map=read_map(folder / "map"),
+        map=city,
         timestamps_ns=times,
-        global_from_ego=_poses_at(times, pose_times, poses, folder),
+        global_from_ego=at_frames,
         tracks=tracks,
         actors=tracks,
         keyframes=tuple(
@@ -120,35 +136,62 @@ def load_log(
     )
 
 
-def read_table(path: Path, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Read columns of a feather file; raise UserError naming the file and what it lacks."""
-    try:
-        import pyarrow
-        from pyarrow import feather
-    except ImportError as error:
-        raise UserError("reading Argoverse 2 needs pyarrow: pip install 'tflane_jax[data]'") from error
-    if not path.is_file():
-        raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
-    try:
-        table = feather.read_table(path)
-    except (pyarrow.ArrowException, OSError) as error:
-        raise UserError(f"{path} is not a readable feather file ({error}): download it again") from error
-    missing = [c for c in columns if c not in table.column_names]
-    if missing:
-        raise UserError(f"{path} lacks the column(s) {', '.join(missing)}: it is no Argoverse 2 sensor-dataset file")
-    return {c: table[c].to_numpy() for c in columns}
+def _check_place(folder: Path, city: VectorMap, poses: np.ndarray) -> None:
+    """Raise UserError if the vehicle is not where the map is."""
+    lanes = np.concatenate([lane.centerline[:, :2] for lane in city.segments.values()])
+    metres = float(np.linalg.norm(poses[:, None, :2, 3] - lanes, axis=-1).min())
+    if metres > _FAR:
+        raise UserError(
+            f"{folder}: the vehicle is never nearer than {metres:.0f} m to a lane of its map: poses and map are not of "
+            "the same log; download both again"
+        )
 
 
 def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4)."""
-    table = read_table(folder / POSES, _POSE_COLUMNS)
+    """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4).
+
+    Raises UserError for a damaged file, two poses of one time, or a vehicle that jumps.
+    """
+    path = folder / POSES
+    table = read_columns(path, _POSE_COLUMNS)
     order = np.argsort(table["timestamp_ns"], kind="stable")
-    return table["timestamp_ns"][order], _pose_of(table)[order]
+    times, poses = table["timestamp_ns"][order], _pose_of(path, table)[order]
+    if (same := np.diff(times) == 0).any():
+        raise UserError(f"{path} has two poses at {times[same.argmax()]}: download it again")
+    metres, seconds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1), np.diff(times) / 1e9
+    if (jumps := metres > _FASTEST * seconds + _JITTER).any():
+        i = int(jumps.argmax())
+        raise UserError(
+            f"{path}: at {times[i + 1]} the vehicle is {metres[i]:.0f} m from where it was {seconds[i]:.2g} s before: "
+            "download it again"
+        )
+    return times, poses
 
 
-def _pose_of(table: dict[str, np.ndarray]) -> np.ndarray:
-    quaternion = np.stack([table[c] for c in ("qw", "qx", "qy", "qz")], -1)
+def _pose_of(path: Path, table: dict[str, np.ndarray]) -> np.ndarray:
+    quaternion = np.stack([table[c] for c in _QUATERNION], -1)
+    if (odd := np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) > _UNIT).any():
+        row = int(odd.argmax())
+        raise UserError(
+            f"{path}: qw, qx, qy, qz of row {row} are {quaternion[row].tolist()}, no unit quaternion: download it again"
+        )
     return pose_matrix(matrix_from_quaternion(quaternion), np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1))
+
+
+def _read_boxes(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of the boxes; raise UserError for boxes that cannot be."""
+    boxes = read_columns(path, _BOX_COLUMNS)
+    for name in _SIZE:
+        if (flat := boxes[name] <= 0.0).any():
+            row = int(flat.argmax())
+            raise UserError(f"{path}: column {name} holds {boxes[name][row]:g} in row {row}: a box has an extent")
+    keys, count = np.unique(
+        np.stack([boxes["timestamp_ns"].astype(str), boxes["track_uuid"]], -1), axis=0, return_counts=True
+    )
+    if (count > 1).any():
+        time, track = keys[(count > 1).argmax()]
+        raise UserError(f"{path} has track {track} twice at {time}: download it again")
+    return boxes
 
 
 def _poses_at(times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, folder: Path) -> np.ndarray:
@@ -168,7 +211,7 @@ def _poses_at(times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, fold
 def _tracks(
     boxes: dict[str, Any], times: np.ndarray, categories: Mapping[str, RoadUser | None], folder: Path
 ) -> Tracks:
-    names, category_row = np.unique(boxes["category"].astype(str), return_inverse=True)
+    names, category_row = np.unique(boxes["category"], return_inverse=True)
     unknown = [n for n in names if n not in categories]
     if unknown:
         raise UserError(
@@ -177,9 +220,9 @@ def _tracks(
         )
     traffic = np.isin(category_row, [i for i, n in enumerate(names) if categories[n] is not None])
     boxes = {name: column[traffic] for name, column in boxes.items()}
-    uuid, first, k = np.unique(boxes["track_uuid"].astype(str), return_index=True, return_inverse=True)
+    uuid, first, k = np.unique(boxes["track_uuid"], return_index=True, return_inverse=True)
     f = np.searchsorted(times, boxes["timestamp_ns"])
-    pose, shape = _pose_of(boxes), (len(times), len(uuid))
+    pose, shape = _pose_of(folder / ANNOTATIONS, boxes), (len(times), len(uuid))
     tracks = Tracks(
         position=np.zeros((*shape, 3)),
         yaw=np.zeros(shape),
@@ -201,18 +244,15 @@ def check_log(folder: Path) -> list[str]:
     folder, lacking = Path(folder), []
     if not folder.is_dir():
         return [f"{folder} is no folder"]
-    for name, columns in ((ANNOTATIONS, _BOX_COLUMNS), (POSES, _POSE_COLUMNS)):
+    parts = (
+        lambda: _read_boxes(folder / ANNOTATIONS),
+        lambda: read_poses(folder),
+        lambda: read_map(folder / "map"),
+        lambda: lacking or load_log(folder),
+    )
+    for read in parts:
         try:
-            read_table(folder / name, columns)
-        except UserError as error:
-            lacking.append(str(error))
-    try:
-        read_map(folder / "map")
-    except UserError as error:
-        lacking.append(str(error))
-    if not lacking:
-        try:
-            load_log(folder)
+            read()
         except UserError as error:
             lacking.append(str(error))
     return lacking

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 
+_AREAS = ("pedestrian_crossings", "drivable_areas")
+_LARGEST_ID = 2**63 - 1
 MAP_PATTERN = "log_map_archive_*.json"
 # Argoverse 2's own API makes centerlines of ten points.
 _CENTERLINE_POINTS = 10
@@ -23,16 +26,29 @@ def read_map(folder: Path) -> VectorMap:
     path = find_map(folder)
     if path is None:
         raise UserError(f"{folder} holds no {MAP_PATTERN}: download the log's map folder")
-    try:
-        archive = json.loads(path.read_text())
-        segments = {s.id: s for s in map(_lane_segment, archive["lane_segments"].values())}
-        crossings = tuple(_crossing(c) for c in archive["pedestrian_crossings"].values())
-        areas = [_points(a["area_boundary"]) for a in archive["drivable_areas"].values()]
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not valid json ({error}): download it again") from error
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise UserError(f"{path} is not an Argoverse 2 vector map ({error!r}): download it again") from error
-    return VectorMap(segments=segments, crossings=crossings, road_boundaries=_boundaries(areas))
+    archive, where = load_json(path), str(path)
+    lanes, crossings, areas = (member(archive, name, where) for name in ("lane_segments", *_AREAS))
+    segments = [_lane_segment(lane, f"{where}: lane_segments.{key}") for key, lane in _entries(lanes, where)]
+    if not segments:
+        raise UserError(f"{path} holds no lane segment: download it again")
+    by_id = {segment.id: segment for segment in segments}
+    if len(by_id) < len(segments):
+        ids = [segment.id for segment in segments]
+        twice = next(number for number in ids if ids.count(number) > 1)
+        raise UserError(f"{path} has two lane segments with the id {twice}: download it again")
+    return VectorMap(
+        segments=by_id,
+        crossings=tuple(_crossing(c, f"{where}: pedestrian_crossings.{k}") for k, c in _entries(crossings, where)),
+        road_boundaries=_boundaries(
+            [_points(a, "area_boundary", f"{where}: drivable_areas.{k}", 3) for k, a in _entries(areas, where)]
+        ),
+    )
+
+
+def _entries(records: Any, where: str) -> list[tuple[str, Any]]:
+    if not isinstance(records, Mapping):
+        raise UserError(f"{where} is no Argoverse 2 vector map: expected mappings from ids to records")
+    return list(records.items())
 
 
 def find_map(folder: Path) -> Path | None:
@@ -54,27 +70,62 @@ def line_type(mark: str) -> LineType:
     raise ValueError(f"unknown lane marking {mark}")
 
 
-def _points(points: list[dict[str, float]]) -> np.ndarray:
-    return np.array([[p["x"], p["y"], p["z"]] for p in points], np.float64).reshape(-1, 3)
+def _points(record: Any, name: str, where: str, least: int) -> np.ndarray:
+    """Return the points (n, 3) of an entry, n >= `least`."""
+    listed = items(record, name, where)
+    rows = [[member(point, axis, f"{where}.{name}[{i}]") for axis in "xyz"] for i, point in enumerate(listed)]
+    if any(isinstance(value, (str, bool)) for row in rows for value in row):
+        raise UserError(f"{where}.{name} holds text: coordinates are numbers")
+    points = numbers(rows, (None, 3), f"{where}.{name}")
+    if len(points) < least:
+        raise UserError(f"{where}.{name} has {len(points)} points, expected at least {least}")
+    return points
 
 
-def _lane_segment(record: dict[str, Any]) -> LaneSegment:
-    left, right = _points(record["left_lane_boundary"]), _points(record["right_lane_boundary"])
+def _lane_segment(record: Any, where: str) -> LaneSegment:
+    left, right = (_points(record, f"{side}_lane_boundary", where, 2) for side in ("left", "right"))
+    number = whole_number(member(record, "id", where), 0, _LARGEST_ID, f"{where}.id")
+    successors = tuple(
+        whole_number(other, 0, _LARGEST_ID, f"{where}.successors") for other in items(record, "successors", where)
+    )
+    if number in successors:
+        raise UserError(f"{where} is its own successor: download it again")
+    sides = resample(left, _CENTERLINE_POINTS), resample(right, _CENTERLINE_POINTS)
+    if _left_of(*sides) < 0.0:
+        raise UserError(f"{where}: the left boundary is to the right of the right one, in driving direction")
+    flags = member(record, "is_intersection", where), member(record, "lane_type", where)
+    if not isinstance(flags[0], bool) or not isinstance(flags[1], str):
+        raise UserError(f"{where}: is_intersection is true or false and lane_type is text, not {flags}")
     return LaneSegment(
-        id=int(record["id"]),
-        centerline=(resample(left, _CENTERLINE_POINTS) + resample(right, _CENTERLINE_POINTS)) / 2,
+        id=number,
+        centerline=(sides[0] + sides[1]) / 2,
         left=left,
         right=right,
-        left_type=line_type(record["left_lane_mark_type"]),
-        right_type=line_type(record["right_lane_mark_type"]),
-        is_intersection=bool(record["is_intersection"]),
-        successors=tuple(int(s) for s in record["successors"]),
-        vehicle=record["lane_type"] != "BIKE",
+        left_type=_mark(record, "left_lane_mark_type", where),
+        right_type=_mark(record, "right_lane_mark_type", where),
+        is_intersection=flags[0],
+        successors=successors,
+        vehicle=flags[1] != "BIKE",
     )
 
 
-def _crossing(record: dict[str, Any]) -> np.ndarray:
-    (a, b), (c, d) = _points(record["edge1"]), _points(record["edge2"])
+def _mark(record: Any, name: str, where: str) -> LineType:
+    mark = member(record, name, where)
+    try:
+        return line_type(str(mark))
+    except ValueError:
+        raise UserError(f"{where}.{name} is {mark!r:.40}, no lane marking of Argoverse 2") from None
+
+
+def _left_of(left: np.ndarray, right: np.ndarray) -> float:
+    """Return by how much the left boundary lies to the left, square metres: the area between the boundaries."""
+    ring = np.concatenate([right, left[::-1]])[:, :2]
+    x, y = (ring - ring[0]).T  # city coordinates are large
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2.0)
+
+
+def _crossing(record: Any, where: str) -> np.ndarray:
+    (a, b), (c, d) = (_points(record, edge, where, 2)[:2] for edge in ("edge1", "edge2"))
     return np.stack([a, b, d, c, a])
 
 

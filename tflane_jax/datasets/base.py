@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
+from tflane_jax.scene.logs import Log
 from tflane_jax.world.bev.sensor import BevSensorConfig
 from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
@@ -136,6 +138,15 @@ class Dataset(IndexedExamples, Protocol):
 
     def example(self, index: int) -> Example:
         """Return one example; the same index always gives the same bits."""
+        ...
+
+
+@runtime_checkable
+class DrivenDataset(Protocol):
+    """A dataset whose examples are key frames of logs."""
+
+    def drives(self) -> Iterator[Log]:
+        """Yield the logs, each once, in the order of the examples."""
         ...
 
 

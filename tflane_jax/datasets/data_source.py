@@ -89,6 +89,7 @@ class DataSource(Generic[ConfigT]):
         build: (config, progress) -> number of examples, after making them ahead of training; None where nothing is
             made.
         check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
+        tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
     """
 
     name: str
@@ -103,4 +104,5 @@ class DataSource(Generic[ConfigT]):
     load: Callable[[Any, bool, Collection[str]], Any] = load_or_stream
     sample: Callable[[ConfigT], Any] | None = None
     build: Callable[[ConfigT, bool], int] | None = None
-    check: Callable[[Path], FolderCheck] | None = None
+    check: Callable[..., FolderCheck] | None = None
+    tracks: bool = False

@@ -132,7 +132,7 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
     stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)
     flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks, stride=stride)
     sd_map, lines_dropped = (None, 0) if config.sd_map is None else make_sd_map(log, keyframe, config.sd_map)
-    _warn_dropped(
+    warn_dropped(
         config,
         lanes=lanes.dropped,
         segments=segments.dropped,
@@ -189,7 +189,8 @@ def _attributes(log: Log, frame: int) -> Int[np.ndarray, " m"]:
     return np.array([element.attribute for element in log.map.elements], int)
 
 
-def _warn_dropped(config: ExampleConfig, **dropped: int) -> None:
+def warn_dropped(config: ExampleConfig, **dropped: int) -> None:
+    """Warn of each capacity of `config` that was exceeded, by name."""
     for name, count in dropped.items():
         if count:
             # One text for all frames, so that Python's default filter shows it once.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from tflane_jax.datasets.base import SPLITS, Split
+from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
@@ -25,7 +25,9 @@ from tflane_jax.datasets.openlane_frames import (
     info_path,
     list_frames,
     read_frame,
+    source_logs,
 )
+from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
@@ -34,6 +36,7 @@ from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 _FASTEST = 70.0
 # First and last bytes of intact images.
 _MARKS = {".jpg": (b"\xff\xd8", b"\xff\xd9"), ".png": (b"\x89PNG", b"IEND\xaeB`\x82")}
+_WITH_LOG, _WITH_TRAFFIC = "with log", "with traffic"
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas")
 
 
@@ -52,10 +55,16 @@ class OpenLaneCheck:
     faults: list[str]
 
 
-def check_openlane_v2(root: Path, *, progress: bool = True) -> OpenLaneCheck:
+def check_openlane_v2(root: Path, tracks: Path | None = None, *, progress: bool = True) -> OpenLaneCheck:
     """Check every split that split files or folders contain.
 
-    Raises UserError where there is no frame at all.
+    Args:
+        root: of the dataset.
+        tracks: folder of the logs of which the segments are parts. With it, the rows say how many frames have such a
+            log, and in how many of them there is any road user; a log that does not fit its frames is a fault.
+        progress: show a bar.
+
+    Raises UserError where there is no frame at all, or `tracks` holds no log.
     """
     root, faults = Path(root), []
     named, on_disk = _named_frames(root, faults), _frames_on_disk(root)
@@ -75,13 +84,20 @@ def check_openlane_v2(root: Path, *, progress: bool = True) -> OpenLaneCheck:
             )
         before, found = None, len(faults)
         counts: Counter[str] = Counter(dict.fromkeys(_COUNTS, 0))
+        if tracks is not None:
+            counts |= {_WITH_LOG: 0, _WITH_TRAFFIC: 0}
+        logs = None if tracks is None else _logs(root, [key for key in keys if key not in absent], subset, tracks)
         for key in tqdm(keys, f"checking {split}", unit="frame", disable=not progress):
             if key not in absent:
                 frame = _check_frame(root, key, subset, counts, faults)
                 faults += _check_motion(before, key, frame, subset)
+                if logs is not None and frame is not None:
+                    # A log that cannot be read is one fault, not one of each of its frames.
+                    faults += [fault for fault in _check_tracks(logs, key, frame, counts) if fault not in faults]
                 before = (key, frame) if frame is not None else before
         counts["segments"] = len({key.segment for key in keys})
-        rows.append({"split": split, **counts, "faults": len(faults) - found + bool(absent)})
+        content = counts if logs is None else _with_share(counts)
+        rows.append({"split": split, **content, "faults": len(faults) - found + bool(absent)})
     return OpenLaneCheck(subset, rows, faults)
 
 
@@ -212,3 +228,33 @@ def _check_motion(
             f"{frame.path}: the vehicle is {metres:.0f} m from where it was {seconds:.2g} s before: pose or timestamp "
             "is wrong"
         )
+
+
+def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path) -> SourceTracks:
+    """Return the logs of a split; the files of a segment that do not name theirs have none."""
+    named: dict[tuple[str, str], str] = {}
+    for key in keys:
+        suffix = CENTERLINE.suffix if info_path(root, key, CENTERLINE.suffix).is_file() else SEGMENT.suffix
+        if (key.split, key.segment) not in named:
+            try:
+                named |= source_logs(root, [key], suffix)
+            except UserError:  # a fault of the file, which its own check reports
+                named[key.split, key.segment] = ""
+    return SourceTracks(tracks, subset, named)
+
+
+def _check_tracks(logs: SourceTracks, key: FrameKey, frame: FrameFile, counts: Counter[str]) -> Iterator[str]:
+    if not logs.has(key):
+        return
+    try:
+        flow = logs.flow(key, frame.global_from_ego, ExampleConfig())
+    except UserError as error:
+        yield str(error)
+        return
+    counts[_WITH_LOG] += 1
+    counts[_WITH_TRAFFIC] += bool(flow.valid.any())
+
+
+def _with_share(counts: Counter[str]) -> dict[str, Any]:
+    frames = max(counts["frames"], counts["-ls files"], 1)
+    return {**counts, _WITH_TRAFFIC: f"{counts[_WITH_TRAFFIC]} ({100 * counts[_WITH_TRAFFIC] / frames:.1f} %)"}

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from tflane_jax.datasets.areas import with_sides
-from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.openlane_annotation import Annotation
 from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, canvas_size
@@ -19,7 +19,37 @@ from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import DENSE_POINTS
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample_lines
-from tflane_jax.scene import Areas, CameraViews, LaneGraph, TrafficElements
+from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements, TrafficFlow
+
+
+def blank(
+    config: ExampleConfig, *, governed: Literal["lanes", "segments"], views: CameraViews | None, traffic: bool
+) -> Example:
+    """Return an example in which nothing is valid.
+
+    Args:
+        config: capacities and points.
+        governed: which lanes the rows of `TrafficElements.lane` are.
+        views: of the cameras, or None.
+        traffic: whether there is a traffic flow.
+    """
+    lanes = LaneGraph.empty(config.lanes, config.lane_points)
+    segments = LaneGraph.empty(config.segments, config.segment_points)
+    rows = segments if governed == "segments" else lanes
+    return Example(
+        bev=None,
+        hidden=None,
+        traffic_flow=TrafficFlow.empty(config.tracks, config.history) if traffic else None,
+        markers=None,
+        sd_map=None,
+        lanes=lanes,
+        segments=segments,
+        areas=Areas.empty(config.areas, config.area_points),
+        traffic_elements=TrafficElements.empty(config.elements, len(rows.valid)),
+        previous_from_ego=np.eye(4, dtype=np.float32),
+        has_previous=np.asarray(False),
+        cameras=views,
+    )
 
 
 def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraViews:

@@ -68,6 +68,11 @@ def export_openlane_v2(
     return out
 
 
+def time_offset(subset: SubsetName, timestamp_ns: int) -> int:
+    """Return the nanoseconds that are added to a timestamp; see `export_openlane_v2`."""
+    return _START_NS[subset] if timestamp_ns < _START_NS[subset] else 0
+
+
 def _subset_of(dataset: Dataset, before: SubsetName | None) -> SubsetName:
     """Return the subset that has as many cameras as the examples of a dataset."""
     if len(dataset) == 0:
@@ -97,7 +102,7 @@ def _export_split(
         if info.scene not in names:
             names[info.scene] = f"{SUBSETS[subset].first_segment[split] + len(names):05d}"
             ids = Identities()
-        offset = _START_NS[subset] if info.timestamp_ns < _START_NS[subset] else 0
+        offset = time_offset(subset, info.timestamp_ns)
         time = (info.timestamp_ns + offset) // SUBSETS[subset].tick_ns
         key = FrameKey(split, names[info.scene], str(time))
         segments.setdefault(key.segment, []).append(f"{key.timestamp}.json")

@@ -179,17 +179,23 @@ MAP_CHANGES = frozenset(
 
 
 def without_map_changes(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> list[FrameKey]:
-    """Return the frames that belong to none of the logs of `MAP_CHANGES`; reads one file of each segment.
+    """Return the frames that belong to none of the logs of `MAP_CHANGES`; see `source_logs`."""
+    logs = source_logs(root, keys, suffix)
+    return [key for key in keys if logs[key.split, key.segment] not in MAP_CHANGES]
+
+
+def source_logs(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> dict[tuple[str, str], str]:
+    """Return the log of which each (split, segment) is a part; reads one file of each segment.
 
     Raises UserError for a file that is missing or does not name its log.
     """
-    changed: dict[tuple[str, str], bool] = {}
+    logs: dict[tuple[str, str], str] = {}
     for key in keys:
-        if (key.split, key.segment) not in changed:
+        if (key.split, key.segment) not in logs:
             path = info_path(root, key, suffix)
             log = member(member(load_json(path), "meta_data", str(path)), "source_id", f"{path}: meta_data")
-            changed[key.split, key.segment] = log in MAP_CHANGES
-    return [key for key in keys if not changed[key.split, key.segment]]
+            logs[key.split, key.segment] = str(log)
+    return logs
 
 
 def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") -> FrameFile:

@@ -1,8 +1,8 @@
 """OpenLane-V2, either subset, in either flavour: frame files and images -> `Example`.
 
 Not in the files: the visibility of lanes (set to 1), the 3-D position of traffic elements (set to 0) and the
-boundaries of merged centerlines (left and right are the centerline itself). Examples have no bird's-eye-view evidence
-and no priors.
+boundaries of merged centerlines (left and right are the centerline itself). Examples have no bird's-eye-view evidence.
+Of the priors they have traffic flow, where the logs are at hand of which the segments are parts (`openlane_tracks`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_check import check_openlane_v2
-from tflane_jax.datasets.openlane_example import area_set, camera_views, element_set, empty_views, lane_graph
+from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
@@ -29,9 +29,11 @@ from tflane_jax.datasets.openlane_frames import (
     info_path,
     list_frames,
     read_frame,
+    source_logs,
     subset_of,
     without_map_changes,
 )
+from tflane_jax.datasets.openlane_tracks import SourceTracks, WithoutTracks
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
@@ -39,7 +41,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
 from tflane_jax.geometry import relative_pose
-from tflane_jax.scene import Areas, Example, LaneGraph, TrafficElements
+from tflane_jax.scene import CameraViews, Example
 
 Flavour = Literal["centerline", "lane_segment", "both"]
 OPENLANE_V2_SIZES = ExampleConfig(lanes=128, segments=192, areas=64, elements=48)
@@ -63,6 +65,10 @@ class OpenLaneV2Config:
         example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
         loading: workers; they change no example.
         map_changes: "drop" leaves out the logs whose streets differ from their map, see `openlane_frames.MAP_CHANGES`.
+        tracks: folder of the Argoverse 2 logs from which subset A was made, or of nuScenes for B; their boxes become
+            the traffic flow, as many frames and at the rate that `example.history` and `example.history_hz` say. None:
+            no traffic flow.
+        without_tracks: what becomes of frames whose log is not there, see `openlane_tracks.WithoutTracks`.
     """
 
     root: Path
@@ -74,6 +80,8 @@ class OpenLaneV2Config:
     example: ExampleConfig = OPENLANE_V2_SIZES
     loading: StreamingConfig = StreamingConfig()
     map_changes: Literal["keep", "drop"] = "keep"
+    tracks: Path | None = None
+    without_tracks: WithoutTracks = "refuse"
 
 
 class OpenLaneV2Dataset:
@@ -97,6 +105,11 @@ class OpenLaneV2Dataset:
             )
         if config.map_changes == "drop":
             self.keys = without_map_changes(self.root, self.keys, self._suffixes[0])
+        self._tracks: SourceTracks | None = None
+        if config.tracks is not None:
+            logs = source_logs(self.root, self.keys, self._suffixes[0])
+            self._tracks = SourceTracks(config.tracks, config.subset, logs)
+            self.keys = self._tracks.known(self.keys, config.without_tracks)
         self._poses: dict[int, np.ndarray] = {}
 
     def __len__(self) -> int:
@@ -109,28 +122,23 @@ class OpenLaneV2Dataset:
             None if file.annotation is None else read_annotation(file.annotation, names, f"{file.path}: annotation")
             for file, names in zip(files, self._names, strict=True)
         ]
-        lanes, segments = LaneGraph.empty(config.lanes, config.lane_points), None
+        example, by_flavour = _blank(self.config, None), dict(zip(self._names, annotations, strict=True))
+        lanes, segments, areas = example.lanes, example.segments, example.areas
         kept_lanes = kept_segments = np.zeros(0, int)
-        areas = Areas.empty(config.areas, config.area_points)
-        by_flavour = dict(zip(self._names, annotations, strict=True))
         if (found := by_flavour.get(CENTERLINE)) is not None:
             lanes, kept_lanes = lane_graph(found, config.lanes, config.lane_points)
-        segments = LaneGraph.empty(config.segments, config.segment_points)
         if (found := by_flavour.get(SEGMENT)) is not None:
             segments, kept_segments = lane_graph(found, config.segments, config.segment_points)
             areas = area_set(found, config.areas, config.area_points, config.crossings)
-        governed = (segments, kept_segments) if self._names[0] is SEGMENT else (lanes, kept_lanes)
-        elements = TrafficElements.empty(config.elements, len(governed[0].valid))
-        if annotations[0] is not None:
-            elements = element_set(annotations[0], elements, governed[1], self._fits[0])
+        elements = example.traffic_elements
+        if annotations[0] is not None and elements is not None:
+            kept = kept_segments if self._names[0] is SEGMENT else kept_lanes
+            elements = element_set(annotations[0], elements, kept, self._fits[0])
         before = index > 0 and self.keys[index - 1].segment == key.segment
         pose = files[0].global_from_ego
-        return Example(
-            bev=None,
-            hidden=None,
-            traffic_flow=None,
-            markers=None,
-            sd_map=None,
+        return replace(
+            example,
+            traffic_flow=None if self._tracks is None else self._tracks.flow(key, pose, config),
             lanes=lanes,
             segments=segments,
             areas=areas,
@@ -191,28 +199,17 @@ class OpenLaneV2Dataset:
 
 def nominal_example(config: OpenLaneV2Config) -> Example:
     """Return an example in which nothing is valid, with the official image sizes: shapes that need no data."""
-    sizes, subset = config.example, SUBSETS[config.subset]
     views = None
     if config.image is not None:
-        fits = [fit_image(*size, config.image, front=place == 0) for place, size in enumerate(subset.sizes)]
+        sizes = SUBSETS[config.subset].sizes
+        fits = [fit_image(*size, config.image, front=place == 0) for place, size in enumerate(sizes)]
         views = empty_views(fits, config.image)
-    lanes = LaneGraph.empty(sizes.lanes, sizes.lane_points)
-    segments = LaneGraph.empty(sizes.segments, sizes.segment_points)
-    governed = segments if config.flavour == "lane_segment" else lanes
-    return Example(
-        bev=None,
-        hidden=None,
-        traffic_flow=None,
-        markers=None,
-        sd_map=None,
-        lanes=lanes,
-        segments=segments,
-        areas=Areas.empty(sizes.areas, sizes.area_points),
-        traffic_elements=TrafficElements.empty(sizes.elements, len(governed.valid)),
-        previous_from_ego=np.eye(4, dtype=np.float32),
-        has_previous=np.asarray(False),
-        cameras=views,
-    )
+    return _blank(config, views)
+
+
+def _blank(config: OpenLaneV2Config, views: CameraViews | None) -> Example:
+    governed = "segments" if config.flavour == "lane_segment" else "lanes"
+    return blank(config.example, governed=governed, views=views, traffic=config.tracks is not None)
 
 
 @dataclass(frozen=True)
@@ -226,6 +223,7 @@ class OpenLaneV2Data:
         augmentation: of the colours of training images, or None.
         map_changes: whether the training split keeps or drops logs whose streets differ from their map, as
             `OpenLaneV2Config.map_changes`.
+        tracks, without_tracks: traffic flow, see `OpenLaneV2Config`.
     """
 
     root: Path
@@ -240,6 +238,8 @@ class OpenLaneV2Data:
     augmentation: PhotometricConfig | None = PhotometricConfig()
     loading: StreamingConfig = StreamingConfig()
     map_changes: Literal["keep", "drop"] = "keep"
+    tracks: Path | None = None
+    without_tracks: WithoutTracks = "refuse"
 
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""
@@ -253,6 +253,8 @@ class OpenLaneV2Data:
             self.example,
             self.loading,
             self.map_changes if split == "train" else "keep",
+            self.tracks,
+            self.without_tracks,
         )
 
 
@@ -273,8 +275,8 @@ def _choose(choice: Choice) -> OpenLaneV2Config:
     return OpenLaneV2Config(choice.root, choice.split, subset, image=image, example=choice.configured.example)
 
 
-def _check(root: Path) -> FolderCheck:
-    found = check_openlane_v2(root)
+def _check(root: Path, tracks: Path | None = None) -> FolderCheck:
+    found = check_openlane_v2(root, tracks)
     return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults)
 
 
@@ -290,4 +292,5 @@ SOURCE = DataSource(
     title=lambda config: f"openlane-v2-{config.subset}-{config.split}",
     root="its folder",
     check=_check,
+    tracks=True,
 )

@@ -7,6 +7,7 @@ training, validation and test scenes are disjoint by construction.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
@@ -77,6 +78,11 @@ class ProceduralDataset:
         log, keyframe = self._frame(index)
         moment = log.keyframes[keyframe]
         return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego)
+
+    def drives(self) -> Iterator[Log]:
+        """Yield the logs of all scenes."""
+        for scene in range(self.config.scenes):
+            yield self._frame(scene * self.config.world.keyframes)[0]
 
     def scene_id(self, index: int) -> int:
         """Return the world's scene number of one example; raises IndexError outside the dataset."""

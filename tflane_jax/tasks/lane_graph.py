@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 import jax
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -23,7 +21,6 @@ from tflane_jax.datasets.empty_frames import without_empty
 from tflane_jax.datasets.loading import TRAINING_PARTS, keep
 from tflane_jax.datasets.photometric import PhotometricConfig, augment_example
 from tflane_jax.datasets.streaming import Prepare, Streamed
-from tflane_jax.errors import UserError
 from tflane_jax.evaluation.interventions import traffic_interventions
 from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
@@ -32,8 +29,6 @@ from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
-from tflane_jax.models.bevformer import check_capacity
-from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.host import HostConfig, HostMemory
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
@@ -42,6 +37,7 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of
 from tflane_jax.tasks import lane_scores
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.fit import check_fit, reads_traffic
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
 T = TypeVar("T")
@@ -183,36 +179,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         return shapes_of(keep(sources.sample(data.source("train")), self.parts))
 
     def check(self, data: SplitData, train: Example | Streamed) -> None:
-        """Raise UserError if ranges or points of model and data differ, or a camera sees more cells than `capacity`."""
-        example = data.source("train").example
-        self._check_ranges(example)
-        if "lines" in self.model.predicts and "map_lines" in self.model.truth and example.map_lines is None:
-            raise UserError("this model learns the lines of a vector map: set data.example.map_lines")
-        for name, points in self.model.example_points.items():
-            if (found := attrgetter(name)(example)) != points:
-                raise UserError(
-                    f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
-                    f"(task.model.decoder.points), not {found}: change either"
-                )
-        encoder, cameras = self.model.encoder, first_example(train).cameras
-        if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
-            check_capacity(encoder.bev, cameras)
-
-    def _check_ranges(self, example: ExampleConfig) -> None:
-        encoder, bev_range = self.model.encoder, self.model.encoder.bev_range
-        if isinstance(encoder, EvidenceEncoderConfig) and example.sensor is not None:
-            raster = example.sensor.grid.range
-            if raster != bev_range:
-                raise UserError(
-                    f"the evidence raster covers x {raster.x}, y {raster.y} (data.example.sensor.grid.range), and the "
-                    f"model takes it for x {bev_range.x}, y {bev_range.y}: set task.model.encoder.range to the same"
-                )
-        low, high = (np.array([getattr(example.range, axis)[end] for axis in "xy"]) for end in (0, 1))
-        if not bev_range.contains(np.stack([low, high])).all():
-            raise UserError(
-                f"lanes are labelled within x {example.range.x}, y {example.range.y} (data.example.range), beyond the "
-                f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
-            )
+        """Raise UserError where data and model do not fit together, see `tasks.fit`."""
+        check_fit(self.model, data.source("train").example, first_example(train))
 
     def prepare(self, data: SplitData) -> Prepare | None:
         """Return the photometric augmentation of the data, or None."""
@@ -270,9 +238,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def interventions(self, data: Example | Streamed, config: EvaluationConfig) -> dict[str, EvaluationConfig]:
         """Return the evaluations of a model with traffic flow without it (TF-Lane, Table 7) and with that of others."""
-        traffic = self.model.priors.traffic_flow
-        blind = traffic is None or traffic.prior.top_instances == 0
-        return {} if blind else traffic_interventions(data, config)
+        return traffic_interventions(data, config) if reads_traffic(self.model) else {}
 
 
 def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:

@@ -43,6 +43,12 @@ def data(commands) -> None:
         default="argoverse2",
         help="of the dataset (default argoverse2)",
     )
+    check.add_argument(
+        "--tracks",
+        metavar="PATH",
+        type=Path,
+        help="folder of the logs of which OpenLane-V2's segments are parts: count and check the traffic flow, too",
+    )
     export = command(
         inner,
         "export",
@@ -64,6 +70,12 @@ def data(commands) -> None:
         help="jpg like the official data, or lossless png (default jpg)",
     )
     export.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    export.add_argument(
+        "--tracks",
+        metavar="DIR",
+        type=Path,
+        help="also write the road users' tracks and the ego poses, as Argoverse 2 logs",
+    )
     export.set_defaults(takes_overrides=True)
     overlap = command(
         inner,

@@ -1,0 +1,41 @@
+"""TopoNet with the traffic-flow module at the papers' sizes, on OpenLane-V2 subset A with the tracks of Argoverse 2.
+
+    tflane summary --config tf_lane/toponet_tfm_r50 --no-compile          # needs no data
+    tflane train --config tf_lane/toponet_tfm_r50 --data.root PATH --data.tracks PATH
+
+Host, schedule and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16` and
+`:six_layers`. Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of its module: it is as wide
+as the host here.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+HOST = str(Path(__file__).parent.with_name("camera") / "toponet_r50.py")
+TRAFFIC_FLOW = TrafficFlowConfig(module=TrafficFlowModuleConfig(width=256, heads=8))
+
+
+def get_config() -> RunConfig:
+    """Return the paper's host with the module."""
+    return _with_traffic_flow(load_config(HOST))
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the variants of the host."""
+    return {name: _with_traffic_flow(row) for name, row in load_ablations(HOST).items()}
+
+
+def _with_traffic_flow(config: RunConfig) -> RunConfig:
+    """Return a configuration on OpenLane-V2 with traffic flow."""
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.data, OpenLaneV2Data)
+    model = replace(config.task.model, priors=PriorsConfig(traffic_flow=TRAFFIC_FLOW))
+    data = replace(
+        config.data, tracks=Path("data/argoverse2"), example=replace(config.data.example, history_hz=2.0, tracks=128)
+    )
+    return replace(config, task=replace(config.task, model=model), data=data)

@@ -1,0 +1,73 @@
+"""A hand-made Argoverse 2 log of six frames: a car throughout, a walker in one frame, a bollard; one lane."""
+
+import json
+from pathlib import Path
+
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES
+
+FRAMES, MS = 6, 1_000_000
+POSE = {"qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0, "tx_m": 0.0, "ty_m": 0.0, "tz_m": 0.0}
+
+
+def write(path, rows, columns=None):
+    """Write rows as a feather file."""
+    import pyarrow as pa
+    from pyarrow import feather
+
+    columns = columns or list(rows[0])
+    feather.write_feather(pa.table({c: [row[c] for row in rows] for c in columns}), str(path))
+
+
+def box(frame, uuid, category, x, *, points=9):
+    return {
+        "timestamp_ns": (1000 + 100 * frame) * MS,
+        "track_uuid": uuid,
+        "category": category,
+        "length_m": 4.0,
+        "width_m": 2.0,
+        "height_m": 1.5,
+        **POSE,
+        "tx_m": x,
+        "qw": 0.0,
+        "qz": 1.0,
+        "num_interior_pts": points,
+    }
+
+
+def points(*xy):
+    return [{"x": float(x), "y": float(y), "z": 0.5} for x, y in xy]
+
+
+LANE = {
+    "id": 5,
+    "is_intersection": False,
+    "lane_type": "BIKE",
+    "left_lane_boundary": points((0, 2), (40, 2)),
+    "left_lane_mark_type": "DASHED_WHITE",
+    "right_lane_boundary": points((0, -2), (20, -2), (40, -2)),
+    "right_lane_mark_type": "NONE",
+    "successors": [6],
+    "predecessors": [],
+    "left_neighbor_id": None,
+    "right_neighbor_id": None,
+}
+MAP = {
+    "lane_segments": {"5": LANE},
+    "pedestrian_crossings": {"1": {"id": 1, "edge1": points((0, 0), (0, 5)), "edge2": points((3, 0), (3, 5))}},
+    "drivable_areas": {
+        "1": {"id": 1, "area_boundary": points((0, -9), (20, -9), (20, 9), (0, 9))},
+        "2": {"id": 2, "area_boundary": points((20, -9), (40, -9), (40, 9), (20, 9))},
+    },
+}
+
+
+def write_log(folder: Path) -> Path:
+    """Write the log, and return its folder."""
+    (folder / "map").mkdir(parents=True)
+    boxes = [box(f, "car", "REGULAR_VEHICLE", 10.0 + f, points=f) for f in range(FRAMES)]
+    boxes += [box(1, "walker", "PEDESTRIAN", 3.0), box(2, "post", "BOLLARD", 4.0)]
+    write(folder / ANNOTATIONS, boxes)
+    poses = [{"timestamp_ns": t * MS, **POSE, "tx_m": t / 100} for t in (990, *range(1000, 1600, 100), 1590)]
+    write(folder / POSES, poses)
+    (folder / "map" / "log_map_archive_log-a____PIT_city_1.json").write_text(json.dumps(MAP))
+    return folder

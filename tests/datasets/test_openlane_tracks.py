@@ -1,0 +1,204 @@
+"""Traffic flow of OpenLane-V2's frames: the built-in world written in both layouts, and read again."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.models.cases import CAMERA_TOPONET, WITH_TRAFFIC
+from tests.shared import shared_path
+from tflane_jax.cli import main
+from tflane_jax.config import OpenLaneV2Data, RunConfig
+from tflane_jax.datasets.argoverse2_export import export_tracks
+from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.openlane_check import check_openlane_v2
+from tflane_jax.datasets.openlane_tracks import SourceTracks
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.datasets.streaming import StreamingConfig
+from tflane_jax.datasets.view_images import ImageConfig
+from tflane_jax.errors import UserError
+from tflane_jax.files.openlane import FrameKey
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
+from tflane_jax.runs import open_run, train_run
+from tflane_jax.scene import shapes_of
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.simulate import WorldConfig
+
+feather = pytest.importorskip("pyarrow.feather")
+pa = pytest.importorskip("pyarrow")
+
+RIG = CameraRigConfig(ARGOVERSE2_RING, scale=0.02, multiple=16)
+EXAMPLE = ExampleConfig(sensor=None, cameras=RIG, history=6, history_hz=5.0)
+WORLD = ProceduralConfig("val", scenes=2, world=WorldConfig(keyframes=2), example=EXAMPLE)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Return the folders of frames and tracks, as one command writes them."""
+    root = tmp_path_factory.mktemp("export")
+    config = root / "world.py"
+    config.write_text(
+        "from tests.datasets.test_openlane_tracks import WORLD\n"
+        "from tflane_jax.config import RunConfig, WorldData\n"
+        "def get_config():\n"
+        "    return RunConfig(data=WorldData(val=WORLD.scenes, world=WORLD.world, example=WORLD.example))\n"
+    )
+    frames, tracks = root / "frames", root / "tracks"
+    arguments = ["data", "export", "--config", str(config), "--splits", "val", "--out", str(frames)]
+    assert main([*arguments, "--tracks", str(tracks)]) == 0
+    return frames, tracks
+
+
+def opened(frames, tracks, **other) -> OpenLaneV2Dataset:
+    return OpenLaneV2Dataset(
+        OpenLaneV2Config(frames, "val", image=None, **{"example": EXAMPLE, "tracks": tracks} | other)
+    )
+
+
+def by_place(flow):
+    """Return the instances of a traffic flow, in the order of their positions."""
+    rows = np.flatnonzero(flow.valid.any(-1))
+    masked = np.where(flow.valid[rows, :, None], flow.position[rows], 0.0)
+    order = rows[np.lexsort(masked.sum(1).round(2).T)]
+    return [np.asarray(leaf)[order] for leaf in (flow.valid, flow.position, flow.yaw, flow.size, flow.category)]
+
+
+@pytest.mark.parametrize("index", [0, 3])
+def test_frames_get_the_tracks_that_they_had(written, index):
+    made, read = ProceduralDataset(WORLD).example(index), opened(*written).example(index)
+    read.validate()
+    expected, got = by_place(made.traffic_flow), by_place(read.traffic_flow)
+    assert len(expected[0]) > 5
+    np.testing.assert_array_equal(got[0], expected[0])
+    valid = expected[0]
+    for name, mine, theirs in zip(("position", "yaw"), got[1:3], expected[1:3], strict=True):
+        np.testing.assert_allclose(mine[valid], theirs[valid], atol=1e-3, err_msg=name)
+    np.testing.assert_allclose(got[3], expected[3], rtol=1e-6)
+    np.testing.assert_array_equal(got[4], expected[4])
+    assert made.traffic_flow.occluded.sum() == read.traffic_flow.occluded.sum()
+
+
+def test_frames_are_earlier_ones_at_the_wanted_rate(written):
+    """Half the rate: the history is that of every second frame, the latest 0.4 s before."""
+    coarse = replace(EXAMPLE, history=3, history_hz=2.5)
+    every, half = (opened(*written, example=example).example(1).traffic_flow for example in (EXAMPLE, coarse))
+    shown = np.flatnonzero(half.valid.any(-1))
+    assert len(shown) > 5
+    # Frame i of the coarse history is frame 2 i of the fine one: 6 frames end 0.2 s before, 3 frames 0.4 s before.
+    fine = every.position[:, 0::2].round(3)
+    known = {tuple(row[f]) for row, v in zip(fine, every.valid[:, 0::2], strict=True) for f in range(3) if v[f]}
+    assert {tuple(half.position[k, f].round(3)) for k in shown for f in range(3) if half.valid[k, f]} == known
+
+
+def test_shapes_are_known_without_data(written, tmp_path):
+    frames, tracks = written
+    config = opened(frames, tracks).config
+    nominal = nominal_example(replace(config, root=tmp_path / "none"))
+    assert shapes_of(nominal) == shapes_of(opened(frames, tracks).example(0))
+    assert opened(frames, None).example(0).traffic_flow is None
+
+
+def test_missing_logs_are_named_and_can_be_dropped_or_left_empty(written, tmp_path):
+    frames, tracks = written
+    fewer = shutil.copytree(tracks, tmp_path / "tracks")
+    gone = sorted((fewer / "sensor" / "val").iterdir())[0]
+    shutil.rmtree(gone)
+    with pytest.raises(UserError, match=rf"lacks 1 of the logs .*{gone.name}.*2 of 4 frames"):
+        opened(frames, fewer)
+    assert len(opened(frames, fewer, without_tracks="drop")) == 2
+    kept = opened(frames, fewer, without_tracks="empty")
+    assert [bool(kept.example(i).traffic_flow.valid.any()) for i in range(4)] == [False, False, True, True]
+    shutil.rmtree(sorted((fewer / "sensor" / "val").iterdir())[0])
+    with pytest.raises(UserError, match="holds no Argoverse 2 log"):
+        opened(frames, fewer, without_tracks="drop")
+
+
+@pytest.mark.parametrize("fault", ["elsewhere", "another time"])
+def test_a_log_that_does_not_fit_is_refused_and_reported(written, tmp_path, fault):
+    frames, tracks = written
+    wrong = shutil.copytree(tracks, tmp_path / "tracks")
+    folder = sorted((wrong / "sensor" / "val").iterdir())[0]
+    for name in (ANNOTATIONS, POSES):
+        table = feather.read_table(folder / name).to_pydict()
+        if fault == "another time":
+            table["timestamp_ns"] = [time + 10**12 for time in table["timestamp_ns"]]
+        elif name == POSES:
+            table["tx_m"] = [x + 5000.0 for x in table["tx_m"]]
+        feather.write_feather(pa.table(table), str(folder / name))
+    with pytest.raises(UserError, match=f"does not belong to log {folder.name}"):
+        opened(frames, wrong).example(0)
+    found = check_openlane_v2(frames, wrong, progress=False)
+    assert len(found.faults) == 2
+    assert all("does not belong" in text for text in found.faults)
+    assert (found.rows[0]["with log"], found.rows[0]["with traffic"]) == (2, "2 (50.0 %)")
+
+
+def test_the_check_counts_frames_with_traffic(written, capsys):
+    frames, tracks = written
+    assert main(["data", "check", "--format", "openlane-v2", str(frames), "--tracks", str(tracks)]) == 0
+    assert "4 (100.0 %)" in capsys.readouterr().out
+    assert main(["data", "check", "--format", "tusimple", str(frames), "--tracks", str(tracks)]) == 2
+
+
+def test_tracks_are_written_once_and_only_beside_seven_cameras(written, tmp_path):
+    _, tracks = written
+    with pytest.raises(UserError, match="is not empty"):
+        export_tracks([], tracks)
+    with pytest.raises(UserError, match="subset B"):
+        SourceTracks(tracks, "B", {})
+    out = tmp_path / "six"
+    arguments = ["data", "export", "--config", "camera/toponet", "--splits", "val", "--out", str(out)]
+    assert main([*arguments, "--tracks", str(tmp_path / "t"), "--data.val", "1"]) == 2
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path):
+    """The whole chain: both layouts, workers, prior, camera model, update, evaluation with and without traffic."""
+    frames, tracks = written
+    loading = StreamingConfig(threads=1, ahead=2)
+    image = ImageConfig(divisor=16)
+    data = OpenLaneV2Data(
+        frames, "val", example=EXAMPLE, image=image, loading=loading, tracks=tracks, augmentation=None
+    )
+    traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=EXAMPLE.history))
+    encoder = replace(CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=7))
+    model = replace(CAMERA_TOPONET, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
+    training = TrainingConfig(steps=2, batch_size=2, eval_every=2)
+    run = RunConfig(LaneGraphTask(model), data, OptimConfig(warmup_steps=0), training)
+    result = train_run(run, tmp_path / "run", progress=False)
+    assert result.step == 2
+    flows = {name: replace(run.evaluation, traffic=name) for name in ("own", "none")}
+    trained = open_run(tmp_path / "run", "last")
+    examples = run.task.load(data.source("val"), progress=False)
+    answers = {name: run.task.evaluate(trained.params[0], examples, config) for name, config in flows.items()}
+    assert all(np.isfinite(answer.groups["all"]["DET_l"]) for answer in answers.values())
+
+
+def test_a_real_log_and_the_frames_of_its_segment():
+    """Frames with the log's own poses at OpenLane-V2's front-camera times, which are those of no box."""
+    root, table = shared_path("data/argoverse2"), shared_path("data/openlanev2")
+    split = json.loads((table / "OpenLane-V2" / "data_dict_av2_local.json").read_text())["val"]
+    (segment, names), name = next(iter(split.items())), "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
+    log = load_log(next(root.rglob(name)), openlane=table)
+    tracks = SourceTracks(root, "A", {("val", segment): name})
+    sizes = ExampleConfig(tracks=96)
+    counts = []
+    for moment in log.keyframes:
+        key = FrameKey("val", segment, str(moment.timestamp_ns))
+        assert f"{moment.timestamp_ns}.json" in names
+        flow = tracks.flow(key, moment.global_from_ego, sizes)
+        assert np.isfinite(flow.position).all()
+        near = (np.abs(flow.position[..., 0]) < 50.0) & (np.abs(flow.position[..., 1]) < 25.0) & flow.valid
+        counts.append((near.any(-1).sum(), (near.sum(-1) >= 5).sum()))
+    assert counts[0] == (0, 0)  # the first frame has no past
+    # Road users without street furniture; with it, the data's notes count 30.2 and 29.2 on average.
+    assert 25.0 < np.mean(counts, 0)[1] <= np.mean(counts, 0)[0] < 30.2

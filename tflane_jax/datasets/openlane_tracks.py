@@ -1,0 +1,118 @@
+"""Traffic flow for OpenLane-V2: the tracks of the logs of which its segments are parts (TF-Lane, section 3.2).
+
+OpenLane-V2 holds no tracks. A segment of subset A is a part of an Argoverse 2 sensor log, whose id its files name.
+Frame and log share the city frame and the clock: the frame's time is that of the front camera, some 10 ms before the
+lidar frame in which boxes are annotated.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.datasets.argoverse2_log import find_logs, load_log
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.examples import traffic_flow, warn_dropped
+from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName
+from tflane_jax.errors import UserError
+from tflane_jax.files.openlane import FrameKey
+from tflane_jax.scene import TrafficFlow
+from tflane_jax.scene.logs import KeyFrame, Log
+
+WithoutTracks = Literal["refuse", "drop", "empty"]
+"""What becomes of frames whose log is not at hand: an error that names the logs, frames left out, or an empty traffic
+flow."""
+
+# Seconds and metres between a frame and the nearest annotated one. Boxes come at 10 Hz; the ego vehicle moves less than
+# 5 m between two of them.
+_NEAR_S, _NEAR_M = 0.1, 5.0
+_NAMED = 3
+
+
+class SourceTracks:
+    """The logs at hand, read when they are needed and kept: about 1 MB each.
+
+    Args:
+        root: folder of the logs, as for `argoverse2_log.find_logs`; their maps are not needed.
+        subset: A; tracks of subset B are not read yet.
+        logs: name of the log of each (split, segment), see `openlane_frames.source_logs`.
+
+    Raises UserError where `root` holds no log.
+    """
+
+    def __init__(self, root: Path, subset: SubsetName, logs: Mapping[tuple[str, str], str]):
+        if subset != "A":
+            raise UserError("tracks of subset B (nuScenes) are not read yet: leave data.tracks out")
+        self._root, self._tick = Path(root), SUBSETS[subset].tick_ns
+        self._folders = {folder.name: folder for folder in find_logs(self._root)}
+        self._names, self._read = dict(logs), dict[str, Log]()
+
+    def has(self, key: FrameKey) -> bool:
+        """Return whether the log of a frame is at hand."""
+        return self._names[key.split, key.segment] in self._folders
+
+    def known(self, keys: Sequence[FrameKey], without: WithoutTracks) -> list[FrameKey]:
+        """Return the frames to use; see `WithoutTracks`.
+
+        Raises UserError where logs are missing and must not be, or no frame is left.
+        """
+        lacking = Counter(self._names[key.split, key.segment] for key in keys if not self.has(key))
+        if lacking and without == "refuse":
+            raise UserError(
+                f"{self._root} lacks {len(lacking)} of the logs of these frames ({listed(lacking)}), so "
+                f"{lacking.total()} of {len(keys)} frames would have no traffic flow: add the logs, or set "
+                "data.without_tracks to drop (leave such frames out) or empty (train on them without traffic)"
+            )
+        kept = list(keys) if without != "drop" else [key for key in keys if self.has(key)]
+        if not kept:
+            raise UserError(f"{self._root} holds none of the logs of these {len(keys)} frames ({listed(lacking)})")
+        return kept
+
+    def flow(self, key: FrameKey, global_from_ego: Float[np.ndarray, "4 4"], config: ExampleConfig) -> TrafficFlow:
+        """Return the traffic flow of a frame: boxes of earlier annotated frames, moved into its ego frame by Eq. (1).
+
+        It is empty where the log is not at hand, and at the first annotated frame.
+
+        Args:
+            key: of the frame.
+            global_from_ego: its pose, from its own file.
+            config: number and rate of past frames, and capacity.
+
+        Raises:
+            UserError: the log is damaged, or at the frame's time it has no annotated frame or is somewhere else.
+        """
+        if not self.has(key):
+            return TrafficFlow.empty(config.tracks, config.history)
+        log = self._log(self._names[key.split, key.segment])
+        time = int(key.timestamp) * self._tick
+        nearest = int(np.abs(log.timestamps_ns - time).argmin())
+        seconds = (log.timestamps_ns[nearest] - time) / 1e9
+        metres = float(np.linalg.norm((log.global_from_ego[nearest] - global_from_ego)[:3, 3]))
+        if abs(seconds) > _NEAR_S or not metres <= _NEAR_M:
+            raise UserError(
+                f"frame {key} does not belong to log {log.name}: the log's nearest annotated frame is {seconds:.2g} s "
+                f"after it and {metres:.0f} m away; restore the files of both"
+            )
+        log = replace(log, keyframes=(KeyFrame(time, global_from_ego, nearest),))
+        stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)
+        flow, dropped = traffic_flow(log, 0, history=config.history, capacity=config.tracks, stride=stride)
+        warn_dropped(config, tracks=dropped)
+        return flow
+
+    def _log(self, name: str) -> Log:
+        if name not in self._read:
+            self._read[name] = load_log(self._folders[name], keyframes="annotations", with_map=False)
+        return self._read[name]
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return the first names, in order, and how many more there are."""
+    ordered = sorted(names)
+    more = len(ordered) - _NAMED
+    return ", ".join(ordered[:_NAMED]) + (f" and {more} more" if more > 0 else "")

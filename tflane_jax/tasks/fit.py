@@ -1,0 +1,84 @@
+"""Whether a host and its data fit together; every misfit is an error that names both settings."""
+
+from __future__ import annotations
+
+from operator import attrgetter
+
+import numpy as np
+
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.errors import UserError
+from tflane_jax.models.bevformer import check_capacity
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.host import HostConfig
+from tflane_jax.scene import Example
+
+
+def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> None:
+    """Raise UserError where data and model do not fit together.
+
+    Ranges or points differ, the data lack the traffic flow or the past frames that the model reads, or a camera sees
+    more cells than `capacity`.
+
+    Args:
+        model: the host.
+        config: of the examples.
+        example: one of them.
+    """
+    _check_ranges(model, config)
+    if "lines" in model.predicts and "map_lines" in model.truth and config.map_lines is None:
+        raise UserError("this model learns the lines of a vector map: set data.example.map_lines")
+    _check_points(model, config)
+    _check_traffic(model, config, example)
+    encoder, cameras = model.encoder, example.cameras
+    if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
+        check_capacity(encoder.bev, cameras)
+
+
+def reads_traffic(model: HostConfig) -> bool:
+    """Return whether the host reads traffic flow; the matched control, which reads no instances, does not."""
+    traffic = model.priors.traffic_flow
+    return traffic is not None and traffic.prior.top_instances != 0
+
+
+def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
+    encoder, bev_range = model.encoder, model.encoder.bev_range
+    if isinstance(encoder, EvidenceEncoderConfig) and config.sensor is not None:
+        raster = config.sensor.grid.range
+        if raster != bev_range:
+            raise UserError(
+                f"the evidence raster covers x {raster.x}, y {raster.y} (data.example.sensor.grid.range), and the "
+                f"model takes it for x {bev_range.x}, y {bev_range.y}: set task.model.encoder.range to the same"
+            )
+    low, high = (np.array([getattr(config.range, axis)[end] for axis in "xy"]) for end in (0, 1))
+    if not bev_range.contains(np.stack([low, high])).all():
+        raise UserError(
+            f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), beyond the "
+            f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
+        )
+
+
+def _check_points(model: HostConfig, config: ExampleConfig) -> None:
+    for name, points in model.example_points.items():
+        if (found := attrgetter(name)(config)) != points:
+            raise UserError(
+                f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
+                f"(task.model.decoder.points), not {found}: change either"
+            )
+
+
+def _check_traffic(model: HostConfig, config: ExampleConfig, example: Example) -> None:
+    traffic = model.priors.traffic_flow
+    if traffic is None:
+        return
+    if reads_traffic(model) and example.traffic_flow is None:
+        raise UserError(
+            "this model reads traffic flow (task.model.priors.traffic_flow), and the data have none: name the folder "
+            "of the tracks (data.tracks) or leave the prior out"
+        )
+    if config.history < traffic.prior.frames:
+        raise UserError(
+            f"the model reads {traffic.prior.frames} past frames (task.model.priors.traffic_flow.prior.frames), and "
+            f"examples hold {config.history} (data.example.history): change either"
+        )

@@ -63,7 +63,7 @@ def _check_lines(model: HostConfig, config: ExampleConfig, example: Example) -> 
     if learned and (config.map_lines is None or example.map_lines is None):
         raise UserError(
             "this model learns the lines of a vector map, and the data label none: set data.example.map_lines, which "
-            "the built-in world and Argoverse 2 read"
+            "the built-in world, Argoverse 2 and nuScenes read"
         )
 
 

@@ -33,6 +33,9 @@ class CameraViews:
         intrinsics: (V, 3, 3), pixels from the top-left corner of the image (see `geometry.cameras`).
         camera_from_ego: (V, 4, 4) extrinsics, metres.
         valid: (V,) the camera delivered an image.
+        depth: (V, h, w) depth of the nearest surface in square cells of the image array, metres along the optical axis;
+            only for training. None if it is not known.
+        depth_valid: (V, h, w) a surface was measured in the cell.
     """
 
     image: UInt8[Array, "v h w 3"]
@@ -40,6 +43,8 @@ class CameraViews:
     intrinsics: Float[Array, "v 3 3"]
     camera_from_ego: Float[Array, "v 4 4"]
     valid: Bool[Array, " v"]
+    depth: Float[Array, "v h w"] | None = None
+    depth_valid: Bool[Array, "v h w"] | None = None
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""
@@ -49,3 +54,6 @@ class CameraViews:
         chex.assert_shape(self.intrinsics, (v, 3, 3))
         chex.assert_shape(self.camera_from_ego, (v, 4, 4))
         chex.assert_shape(self.valid, (v,))
+        if self.depth is not None:
+            chex.assert_shape(self.depth, (v, None, None))
+            chex.assert_equal_shape([self.depth, self.depth_valid])

@@ -81,6 +81,8 @@ class CameraRigConfig:
         weather: kinds of weather, and the camera's noise, blur and tone.
         element_pixels: smallest height of a light or sign in the native image that is part of the truth.
         markers: draw the scene's fiducial markers, whose boards may hide objects behind them.
+        depth_cell: side of the square cells for which images have the depth of the nearest surface, pixels (MapTRv2
+            learns it in cells of 32); None leaves it out.
     """
 
     cameras: tuple[CameraMount, ...] = NUSCENES_RING
@@ -91,6 +93,7 @@ class CameraRigConfig:
     weather: FrontWeatherConfig = FrontWeatherConfig()
     element_pixels: float = 8.0
     markers: bool = False
+    depth_cell: int | None = None
 
     @property
     def supersample(self) -> int:
@@ -115,6 +118,8 @@ class CameraRigConfig:
                 f"CameraRigConfig.scale = {self.scale} with multiple = {self.multiple} leaves less than 8 pixels of an "
                 "image: raise scale, and multiple to at least 1"
             )
+        if self.depth_cell is not None and self.depth_cell < 1:
+            raise UserError(f"CameraRigConfig.depth_cell must be at least 1 pixel, or None, not {self.depth_cell}")
 
 
 @functools.lru_cache(maxsize=16)

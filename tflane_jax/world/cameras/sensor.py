@@ -18,6 +18,7 @@ from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.cameras import crop_intrinsics
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.logs import Log
+from tflane_jax.world.cameras.depth import render_depth
 from tflane_jax.world.cameras.elements import element_bodies, element_boxes, unhidden
 from tflane_jax.world.cameras.ground import sample_ground
 from tflane_jax.world.cameras.light import View, light_ground, look, show_sky, vehicle_shadows
@@ -68,12 +69,24 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
         image[number, : camera.height, : camera.width] = _develop(
             rng, picture, camera, stage.weather, max(camera.width, camera.height)
         )
+    depth, depth_valid = None, None
+    if config.depth_cell is not None:
+        # Of the whole array: a smaller image has cells without depth.
+        rows, columns = (-(-side // config.depth_cell) for side in image.shape[1:3])
+        depth = np.zeros((len(cameras), rows, columns), np.float32)
+        depth_valid = np.zeros(depth.shape, bool)
+        for number, camera in enumerate(cameras):
+            near, seen = render_depth(moment.bodies, camera, config.depth_cell)
+            depth[number, : len(near), : near.shape[1]] = near
+            depth_valid[number, : len(near), : near.shape[1]] = seen
     return CameraViews(
         image=image,
         size=size,
         intrinsics=np.stack([camera.intrinsics for camera in cameras]).astype(np.float32),
         camera_from_ego=np.stack([camera.camera_from_ego for camera in cameras]).astype(np.float32),
         valid=np.ones(len(cameras), bool),
+        depth=depth,
+        depth_valid=depth_valid,
     )
 
 

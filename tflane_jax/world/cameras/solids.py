@@ -160,8 +160,8 @@ def draw_bodies(
     if not len(bodies.boxes):
         return
     eye = invert_pose(camera.camera_from_ego)[:3, 3]
-    bodies = _with_blobs(bodies, eye)
-    starts = bodies.stops - _counts(bodies.stops)
+    bodies = with_blobs(bodies, eye)
+    starts = polygon_starts(bodies)
     a = bodies.corners[starts]
     normal = np.cross(bodies.corners[starts + 1] - a, bodies.corners[starts + 2] - a)
     pixels, depth = camera.image_of(bodies.corners)
@@ -250,7 +250,7 @@ def footprints(boxes: Float[np.ndarray, "b 7"]) -> Float[np.ndarray, "b 4 2"]:
     return np.stack([cos * x - sin * y, sin * x + cos * y], -1) + boxes[:, None, :2]
 
 
-def _with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
+def with_blobs(bodies: Bodies, eye: Float[np.ndarray, "3"]) -> Bodies:
     """Return the bodies with their blobs as polygons that face the camera, drawn after the body's own polygons."""
     count = len(bodies.blobs)
     if not count:
@@ -311,6 +311,11 @@ def _lit(
 def _turned(points: Float[np.ndarray, "m 2"], pose: Float[np.ndarray, "m 4"]) -> Float[np.ndarray, "m 2"]:
     x, y, cos, sin = pose.T
     return np.stack([cos * points[:, 0] - sin * points[:, 1] + x, sin * points[:, 0] + cos * points[:, 1] + y], -1)
+
+
+def polygon_starts(bodies: Bodies) -> Int[np.ndarray, " k"]:
+    """Return the index of the first corner of each polygon."""
+    return bodies.stops - _counts(bodies.stops)
 
 
 def _counts(stops: Int[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:

@@ -79,7 +79,7 @@ _STAGES: dict[tuple[int, CameraRigConfig], Stage] = {}
 def stage_of(log: Log, config: CameraRigConfig) -> Stage:
     """Return the static content of a log, cached for the lifetime of the log object."""
     # Cameras and their calibration do not change the static content.
-    key = id(log), replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0)
+    key = id(log), replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0, depth_cell=None)
     if key not in _STAGES:
         _STAGES[key] = _set_stage(log, config)
         weakref.finalize(log, _STAGES.pop, key)

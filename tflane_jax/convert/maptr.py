@@ -1,4 +1,4 @@
-"""Weights of the head of the published MapTR (github.com/hustvl/MapTR) as our parameters.
+"""Weights of the heads of the published MapTR and MapTRv2 (github.com/hustvl/MapTR) as our parameters.
 
 The reference's head holds everything behind the image encoder: the BEV encoder, its queries and the decoder.
 """
@@ -11,21 +11,49 @@ from typing import Any
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER
 from tflane_jax.convert.lanesegnet import branch
 from tflane_jax.convert.renaming import Rule, below, convert
-from tflane_jax.convert.toponet import PLAIN_DECODER
+from tflane_jax.convert.toponet import ATTENTION, DEFORMABLE, FEED_FORWARD, LAYER, PLAIN_DECODER, REFERENCE
 from tflane_jax.geometry.namespace import AnyArray
 
 # Checkpoints hold embeddings of four levels; the only level has the first.
 _ENCODER: tuple[Rule, ...] = (("level_embeds", "levels", "first_row"), *BEV_CONSTRUCTER)
-MAPTR_HEAD: tuple[Rule, ...] = (
+_QUERIES_AND_HEADS: tuple[Rule, ...] = (
     (r"instance_embedding\.weight", "queries/instances", "vector"),
     (r"pts_embedding\.weight", "queries/points", "vector"),
-    *PLAIN_DECODER,
     *branch("cls_branches", "class", norm=True),
     *branch("reg_branches", "points"),
+)
+MAPTR_HEAD: tuple[Rule, ...] = (
+    *_QUERIES_AND_HEADS,
+    *PLAIN_DECODER,
     *below(r"(?:transformer\.)?", "encoder/bev", _ENCODER),
+)
+_NORMS = ("line_attention", "point_attention", "bev_attention", "feed_forward")
+_MASK: tuple[Rule, ...] = (
+    (r"0\.weight", "hidden/kernel", "conv"),
+    (r"2\.weight", "out/kernel", "conv"),
+    (r"2\.bias", "out/bias", "vector"),
+)
+MAPTRV2_HEAD: tuple[Rule, ...] = (
+    *_QUERIES_AND_HEADS,
+    REFERENCE,
+    *below(LAYER + r"attentions\.0\.", r"layer_\1/line_attention/attention", ATTENTION),
+    *below(LAYER + r"attentions\.1\.", r"layer_\1/point_attention/attention", ATTENTION),
+    *below(LAYER + r"attentions\.2\.", r"layer_\1/bev_attention", DEFORMABLE),
+    *below(LAYER + r"ffns\.0\.", r"layer_\1/feed_forward", FEED_FORWARD),
+    *((LAYER + rf"norms\.{i}\.(weight|bias)", rf"layer_\1/{name}_norm/\2", "norm") for i, name in enumerate(_NORMS)),
+    *below(r"seg_head\.", "mask_head", _MASK),
+    *below(r"pv_seg_head\.", "encoder/view_mask_head", _MASK),
+    # Of BEVFormer's encoder, which MapTRv2 replaces, and of the losses.
+    (r"positional_encoding\..*|transformer\.(level_embeds|cams_embeds|can_bus_mlp\..*)", "", "unused"),
+    (r"loss_(pv_)?seg\.loss_fn\.pos_weight", "", "unused"),
 )
 
 
 def map_head_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
     """Return the parameters of `MapTr` without those of the image encoder, from those of MapTRHead."""
     return convert(state, MAPTR_HEAD, "MapTR's head").variables["params"]
+
+
+def map_v2_head_params(state: Mapping[str, AnyArray]) -> dict[str, Any]:
+    """Return the parameters of `MapTrV2` without its encoder of images, from those of MapTRv2Head."""
+    return convert(state, MAPTRV2_HEAD, "MapTRv2's head").variables["params"]

@@ -17,7 +17,7 @@ AUXILIARY = "auxiliary"
 CELL_CHANNELS = 5
 """Channels per BEV cell: occupancy logit, offset to the nearest lane in cells (2), direction of that lane (2)."""
 
-AuxiliaryName = Literal["denoised", "lane_cells", "lane_proposals", "line_cells"]
+AuxiliaryName = Literal["denoised", "lane_cells", "lane_proposals", "line_cells", "one_to_many", "line_mask"]
 
 
 @struct.dataclass
@@ -43,12 +43,16 @@ class AuxiliaryOutputs:
         lane_cells: (h, w, `CELL_CHANNELS`) lanes per BEV cell.
         lane_proposals: of the heads that propose lanes, see `models.lane_proposals`.
         line_cells: (h, w) logit per cell of the image features: does a lane line pass through it?
+        one_to_many: map lines of MapTRv2's second group of queries, leading axis layer.
+        line_mask: (h, w) logit per BEV cell: does a map line pass through it?
     """
 
     denoised: CenterlinePrediction | SegmentPrediction | LinePrediction | None = None
     lane_cells: Float[Array, "*b h w c"] | None = None
     lane_proposals: LaneProposalOutputs | None = None
     line_cells: Float[Array, "*b h w"] | None = None
+    one_to_many: LinePrediction | None = None
+    line_mask: Float[Array, "*b h w"] | None = None
 
 
 def auxiliary_outputs(state: Any) -> AuxiliaryOutputs:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.common import Terms
@@ -70,3 +70,14 @@ def mask_loss(logits: Float[Array, "*b"], mask: Bool[Array, "*b"], positive: flo
     true = mask.astype(logits.dtype)
     weight = jnp.where(true > 0, positive, 1.0)
     return (weight * optax.losses.sigmoid_binary_cross_entropy(logits, true)).mean()
+
+
+def depth_loss(logits: Float[Array, "*b d"], bins: Int[Array, "*b"], valid: Bool[Array, "*b"]) -> Float[Array, ""]:
+    """Return the mean of -log p of the true depth bins, over the cells that have one; 0 without any.
+
+    Args:
+        logits: of the bins.
+        bins, valid: targets, see `losses.map_masks.depth_targets`.
+    """
+    chosen = jnp.take_along_axis(jax.nn.log_softmax(logits, -1), bins[..., None], -1)[..., 0]
+    return -jnp.where(valid, chosen, 0.0).sum() / jnp.maximum(valid.sum(), 1)

@@ -148,10 +148,10 @@ def test_points_outside_the_range_belong_to_no_cell_but_for_the_published_border
 def test_cameras_may_change_places_and_a_missing_one_may_hold_anything():
     views, features = make_views(), jax.random.normal(jax.random.key(0), (2, 4, 6, 8))
     model = LiftEncoder(CONFIG)
-    fresh = jax.eval_shape(lambda key: model.init(key, features, views, train=False), jax.random.key(0))
-    params = random_params(lambda key: model.init(key, features, views, train=False)["params"])
+    fresh = jax.eval_shape(lambda key: model.init(key, [features], views, train=False), jax.random.key(0))
+    params = random_params(lambda key: model.init(key, [features], views, train=False)["params"])
     rest = {name: jax.tree.map(lambda leaf: jnp.ones(leaf.shape), x) for name, x in fresh.items() if name != "params"}
-    run = jax.jit(lambda features, views: model.apply({"params": params} | rest, features, views, train=False)[0])
+    run = jax.jit(lambda features, views: model.apply({"params": params} | rest, [features], views, train=False))
     bev = run(features, views)
     assert bev.shape == (4, 8, 8)
     swapped = run(features[::-1], jax.tree.map(lambda leaf: leaf[::-1], views))

@@ -12,12 +12,9 @@ from tests.models.golden_maps import decoder_config, lines_by_name, perception_r
 from tflane_jax.convert.maptr import map_v2_head_params
 from tflane_jax.losses.maptr import assign_lines, line_losses, matching_cost
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig, mask_loss, one_to_many_losses
-from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
+from tflane_jax.models.auxiliary import AUXILIARY, LineMaskHead, auxiliary_outputs
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
-from tflane_jax.models.maptrv2 import LineMaskHead, MapTrV2, MapTrV2Config
-
-# Of the mask in the images, which has its own weight and counts cells alike.
-VIEW_WEIGHT, VIEW_POSITIVE = 2.0, 1.0
+from tflane_jax.models.maptrv2 import MapTrV2, MapTrV2Config
 
 
 @pytest.mark.golden
@@ -60,7 +57,7 @@ def check_head(case):
         out |= losses_by_name({name: weights.many_weight * term for name, term in repeated.items()}, "_one2many")
         drawn, seen = (stacked(inputs, name) for name in ("gt_seg", "gt_pv_seg"))
         out["loss.loss_seg"] = weights.mask_weight * mask_loss(auxiliary.line_mask, drawn[:, 0], weights.mask_positive)
-        out["loss.loss_pv_seg"] = VIEW_WEIGHT * mask_loss(views, seen[:, :, 0], VIEW_POSITIVE)
+        out["loss.loss_pv_seg"] = weights.view_mask_weight * mask_loss(views, seen[:, :, 0], weights.view_mask_positive)
         cost = jax.vmap(jax.vmap(lambda p, t: matching_cost(p, t, range_, weights), (0, None)))
         return out, (cost(lines, truth), cost(many, truth))
 

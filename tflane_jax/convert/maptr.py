@@ -79,7 +79,7 @@ LIFT: tuple[Rule, ...] = (
     *((rf"downsample\.{3 * i}\.weight", f"conv_{i}/kernel", "conv") for i in range(3)),
     *((rf"downsample\.{3 * i + 1}\.(\w+)", rf"norm_{i}/\1", "norm") for i in range(3)),
     # The grid, which is a setting here.
-    (r"dx|bx|nx", "", "unused"),
+    (r"(?:dx|bx|nx)", "", "unused"),
 )
 MAPTRV2_HEAD: tuple[Rule, ...] = (
     *_QUERIES_AND_HEADS,
@@ -93,7 +93,7 @@ MAPTRV2_HEAD: tuple[Rule, ...] = (
     *below(r"seg_head\.", "mask_head", _MASK),
     *below(r"pv_seg_head\.", "encoder/view_mask_head", _MASK),
     # Of BEVFormer's encoder, which MapTRv2 replaces, and of the losses.
-    (r"positional_encoding\..*|transformer\.(level_embeds|cams_embeds|can_bus_mlp\..*)", "", "unused"),
+    (r"(?:positional_encoding\..*|transformer\.(?:level_embeds|cams_embeds|can_bus_mlp\..*))", "", "unused"),
     (r"loss_(pv_)?seg\.loss_fn\.pos_weight", "", "unused"),
 )
 

@@ -81,26 +81,26 @@ class MapTrLossConfig(HostLossConfig):
         for name in host.auxiliary:
             if (output := getattr(auxiliary, name)) is None:
                 raise ValueError(f"the host declares the auxiliary output {name}, but it is missing")
-            terms = self.auxiliary_terms(name, output, targets, lines, range_)
+            terms = self.auxiliary_terms(name, output, targets, batch, host)
             loss, report = loss + total(terms), report | last_layer(terms)
         return loss, report
 
-    def auxiliary_terms(
-        self, name: str, output: Any, targets: LineTargets, lines: MapLines, range_: PerceptionRange
-    ) -> Terms:
+    def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output.
 
         Args:
             name, output: of `AuxiliaryOutputs`, leading axis batch.
-            targets, lines: ground truth with equivalent orders, and as it is labelled; leading axis batch.
-            range_: the box that the BEV features cover, metres.
+            targets: true lines with equivalent orders, leading axis batch.
+            batch: the examples.
+            host: the host's configuration.
 
         Raises:
             ValueError: the output has no loss here.
         """
         if name != "denoised":
             raise ValueError(f"the auxiliary output {name} has no loss here")
-        return {f"denoised_{key}": value for key, value in line_denoising_losses(output, targets, range_, self).items()}
+        terms = line_denoising_losses(output, targets, host.encoder.bev_range, self)
+        return {f"denoised_{key}": value for key, value in terms.items()}
 
 
 @struct.dataclass

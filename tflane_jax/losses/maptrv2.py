@@ -1,4 +1,4 @@
-"""MapTRv2's loss (Liao et al. 2024): that of MapTR, of a one-to-many group, and of a mask of lines."""
+"""MapTRv2's loss (Liao et al. 2024): that of MapTR, of a one-to-many group, of masks of lines, and of depth."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.common import Terms
-from tflane_jax.losses.map_masks import bev_line_mask
+from tflane_jax.losses.map_masks import bev_line_mask, depth_targets, view_line_masks
 from tflane_jax.losses.maptr import LineTargets, MapTrLossConfig, assign_lines, line_losses
-from tflane_jax.scene import LinePrediction, MapLines
+from tflane_jax.scene import Example, LinePrediction
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,8 @@ class MapTrV2LossConfig(MapTrLossConfig):
         many_weight: of all terms of that group.
         mask_weight: of the mask on the BEV features.
         mask_positive: weight of a cell with a line in it, relative to one without.
+        view_mask_weight, view_mask_positive: the same of the masks on the feature maps of the images.
+        depth_weight: of the depth of image cells.
         others: see `MapTrLossConfig`.
     """
 
@@ -34,18 +36,30 @@ class MapTrV2LossConfig(MapTrLossConfig):
     many_weight: float = 1.0
     mask_weight: float = 1.0
     mask_positive: float = 4.0
+    view_mask_weight: float = 2.0
+    view_mask_positive: float = 1.0
+    depth_weight: float = 3.0
 
-    def auxiliary_terms(
-        self, name: str, output: Any, targets: LineTargets, lines: MapLines, range_: PerceptionRange
-    ) -> Terms:
+    def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output, see `MapTrLossConfig.auxiliary_terms`."""
+        range_ = host.encoder.bev_range
+        lines: Any = batch.map_lines
+        views: Any = batch.cameras
         if name == "one_to_many":
             terms = one_to_many_losses(output, targets, range_, self)
             return {f"many_{key}": self.many_weight * value for key, value in terms.items()}
         if name == "line_mask":
             masks = jax.vmap(partial(bev_line_mask, shape=output.shape[-2:], range_=range_))(lines)
             return {"mask": self.mask_weight * mask_loss(output, masks, self.mask_positive)[None]}
-        return super().auxiliary_terms(name, output, targets, lines, range_)
+        if name == "view_line_masks":
+            masks = jax.vmap(partial(view_line_masks, shape=output.shape[-2:]))(lines, views)
+            return {"view_mask": self.view_mask_weight * mask_loss(output, masks, self.view_mask_positive)[None]}
+        if name == "depth":
+            low, high, step = host.encoder.bev.depth
+            each = partial(depth_targets, shape=output.shape[2:4], low=low, high=high, step=step)
+            bins, valid = jax.vmap(each)(views)
+            return {"depth": self.depth_weight * depth_loss(output, bins, valid)[None]}
+        return super().auxiliary_terms(name, output, targets, batch, host)
 
 
 def one_to_many_losses(

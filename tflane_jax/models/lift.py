@@ -7,6 +7,7 @@ points x 256 channels of the published size are never stored.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,9 +17,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.depth_net import DepthNet
+from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import CameraViews
 
 
@@ -36,6 +42,7 @@ class LiftConfig:
         dropout: probability in the depth network.
         image_scale: of the images, relative to the camera's own. The depth network knows the cameras' native
             intrinsics and this scale.
+        supervised: whether the network learns the depth of image cells, for which the training data must have it.
         border: "exact": points outside the range are left out. "published": those up to a cell below its lower ends
             count for the first cells, as the published code's rounding towards zero has it.
     """
@@ -48,6 +55,7 @@ class LiftConfig:
     pyramid: int = 96
     dropout: float = 0.5
     image_scale: float = 0.5
+    supervised: bool = False
     border: Literal["exact", "published"] = "exact"
 
     @property
@@ -99,10 +107,48 @@ class LiftEncoder(nn.Module):
         return x, logits
 
     def __call__(
+        self,
+        levels: Sequence[Float[Array, "v h w c"]],
+        cameras: CameraViews,
+        *,
+        train: bool,
+        fuse: BevHook | None = None,
+    ) -> Float[Array, "y x c"]:
+        """Return BEV features, from feature maps that cover the image arrays of calibrated cameras.
+
+        Sows the depth logits as auxiliary output `depth`, if the depth is supervised.
+
+        Args:
+            levels: one level of feature maps.
+            cameras: calibration and validity; of the images, only the shape is used.
+            train: see `encode`.
+            fuse: how priors change the BEV features, once; positions are a sine encoding of (x, y).
+
+        Raises:
+            UserError: several levels, or more cameras than configured.
+        """
+        config, grid = self.config, self.config.grid
+        if len(levels) != 1 or len(cameras.valid) > config.cameras:
+            raise UserError(
+                f"the lift takes one level of feature maps of at most {config.cameras} cameras and got {len(levels)} "
+                f"levels of {len(cameras.valid)}: change `images` of the encoder, or `cameras` of LiftConfig"
+            )
+        bev, logits = self.lift(levels[0], cameras, train=train)
+        if config.supervised and self.is_mutable_collection(AUXILIARY):
+            self.sow(AUXILIARY, "depth", logits)
+        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
+        bev = lax.optimization_barrier(bev)
+        if fuse is None:
+            return bev
+        places = cell_points(grid)
+        position = sine_encoding(jnp.asarray(places), config.dim // 4, lowest=0.125)
+        return lax.optimization_barrier(fuse(0, places, bev.reshape(-1, config.dim), position).reshape(bev.shape))
+
+    def lift(
         self, features: Float[Array, "v h w c"], cameras: CameraViews, *, train: bool
     ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
-        """Return what `encode` does, from feature maps that cover the image arrays of calibrated cameras."""
-        size, shape = cameras.image.shape[1:3], features.shape[1:3]
+        """Return what `encode` does, from calibrated cameras."""
+        size, shape = cameras.image.shape[1:3], (features.shape[1], features.shape[2])
         valid = jnp.asarray(cameras.valid)[:, None, None]
         # A missing camera's calibration may be anything; it must reach neither the points nor the norms.
         eye = jnp.eye(4, dtype=jnp.float32)[None]

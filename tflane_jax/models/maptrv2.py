@@ -1,8 +1,9 @@
 """MapTRv2 (Liao et al. 2024), with or without priors: MapTR with decoupled attention and one-to-many training.
 
-Differences from MapTR (`models.maptr`): self-attention runs among lines and, apart from that, along each line; in
-training, a second group of queries learns from true lines that are repeated; a head on the BEV features learns where
-lines are. Both exist in training only. Source: docs/reference/maptr.md.
+Differences from MapTR (`models.maptr`): image features are lifted into BEV by their depth (`models.lift`);
+self-attention runs among lines and, apart from that, along each line; in training, a second group of queries learns
+from true lines that are repeated, BEV and image features learn masks of the lines, and the lift learns depth. Source:
+docs/reference/maptr.md.
 """
 
 from __future__ import annotations
@@ -19,10 +20,19 @@ from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
-from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host
-from tflane_jax.models.map_lines import LineDecoderConfig, LineHeads, LineQueries, PointQueries, point_position
-from tflane_jax.models.maptr import MapTr, MapTrConfig, make_prediction
+from tflane_jax.models.lift import LiftConfig
+from tflane_jax.models.map_lines import (
+    PAPER_LINE_DECODER,
+    LineDecoderConfig,
+    LineHeads,
+    LineQueries,
+    PointQueries,
+    point_position,
+)
+from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, make_prediction
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.scene import MapLines, Prediction
@@ -43,10 +53,15 @@ class MapTrV2Config(MapTrConfig):
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:
-        """Those of MapTR, the one-to-many group, and the mask."""
-        many: tuple[AuxiliaryName, ...] = ("one_to_many",) if self.many else ()
-        mask: tuple[AuxiliaryName, ...] = ("line_mask",) if self.line_mask else ()
-        return (*super().auxiliary, *many, *mask)
+        """Those of MapTR, the one-to-many group, and those that BEV and image features learn."""
+        encoder = self.encoder if isinstance(self.encoder, CameraEncoderConfig) else None
+        learned: dict[AuxiliaryName, bool] = {
+            "one_to_many": self.many > 0,
+            "line_mask": self.line_mask,
+            "view_line_masks": encoder is not None and encoder.line_masks,
+            "depth": encoder is not None and isinstance(encoder.bev, LiftConfig) and encoder.bev.supervised,
+        }
+        return (*super().auxiliary, *(name for name, wanted in learned.items() if wanted))
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
@@ -54,6 +69,16 @@ class MapTrV2Config(MapTrConfig):
         if self.many and self.denoising is not None:
             raise UserError("choose one of task.model.many and task.model.denoising: both add queries in training")
         return MapTrV2(self)
+
+
+PAPER_LIFT_ENCODER = CameraEncoderConfig(PAPER_MAP_ENCODER.images, LiftConfig(supervised=True), line_masks=True)
+
+
+def paper_config() -> MapTrV2Config:
+    """Return the published sizes on nuScenes: ResNet-50, six cameras, 200 x 100 cells, 50 and 300 lines."""
+    return MapTrV2Config(
+        encoder=PAPER_LIFT_ENCODER, range=PAPER_RANGE, decoder=PAPER_LINE_DECODER, many=300, line_mask=True
+    )
 
 
 class MapTrV2(MapTr):
@@ -178,13 +203,3 @@ class _SelfAttention(nn.Module):
     def __call__(self, queries, placed, mask, deterministic):
         attention = MultiHeadAttention(self.dim, self.heads, self.dropout, name="attention")
         return attention(placed, placed, queries, mask, deterministic=deterministic)
-
-
-class LineMaskHead(nn.Module):
-    """Whether any line passes through a cell, from features of the cells."""
-
-    @nn.compact
-    def __call__(self, features: Float[Array, "*v h w c"]) -> Float[Array, "*v h w"]:
-        """Return the logit of each cell."""
-        x = nn.relu(nn.Conv(features.shape[-1], (3, 3), use_bias=False, name="hidden")(features))
-        return nn.Conv(1, (1, 1), name="out")(x)[..., 0]

@@ -8,6 +8,7 @@ import numpy as np
 
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
+from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
@@ -30,7 +31,7 @@ def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> Non
     _check_points(model, config)
     _check_traffic(model, config, example)
     encoder, cameras = model.encoder, example.cameras
-    if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
+    if isinstance(encoder, CameraEncoderConfig) and isinstance(encoder.bev, BevFormerConfig) and cameras is not None:
         check_capacity(encoder.bev, cameras)
 
 

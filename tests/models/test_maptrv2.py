@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import LINES, SMALL_LINES, make_line_example
+from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, make_line_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.maptrv2 import DecoupledLayer, MapTrV2Config
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -86,3 +88,35 @@ def test_it_trains_and_all_its_parameters_learn(params):
 def test_parts_that_do_not_fit_are_named():
     with pytest.raises(UserError, match="choose one of"):
         replace(MODEL, denoising=DenoisingConfig()).build()
+
+
+def make_depth_example(seed):
+    """Return `make_camera_example` with map lines, and with depth in cells of 32 pixels."""
+    rng, example = np.random.default_rng(seed), make_camera_example(seed)
+    shape = (2, 2, 3)
+    depth = rng.uniform(1.0, 9.0, shape).astype(np.float32)
+    cameras = example.cameras.replace(depth=depth, depth_valid=rng.random(shape) < 0.7)
+    return example.replace(cameras=cameras, map_lines=make_line_example(seed).map_lines)
+
+
+def test_with_cameras_it_learns_depth_and_masks_in_the_images_too():
+    images = replace(CAMERA.images, stages=(3,), pyramid=replace(CAMERA.images.pyramid, levels=1))
+    lift = LiftConfig(CAMERA.bev.grid, dim=16, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, supervised=True)
+    encoder = CameraEncoderConfig(images, lift, line_masks=True)
+    model = replace(MODEL, encoder=encoder, priors=replace(MODEL.priors, traffic_flow=None))
+    task = LaneGraphTask(model, MapTrV2LossConfig(many_repeats=2))
+    batch = stack_examples([make_depth_example(seed) for seed in (0, 1)])
+    params = random_params(task.init, make_depth_example(0))
+    run = jax.jit(jax.value_and_grad(task.loss, has_aux=True))
+    (loss, report), gradient = run(params, batch, jax.random.key(1))
+    assert np.isfinite(loss)
+    assert {"depth", "mask", "view_mask", "many_points"} <= set(report)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    learning = gradient["encoder"]["bev"]["depth_net"], gradient["encoder"]["view_mask_head"]
+    assert all(np.any(leaf) for part in learning for leaf in jax.tree.leaves(part))
+    assert task.start().bev is None
+    # Depth is a label: the prediction does not depend on it.
+    example = make_depth_example(0)
+    without = example.replace(cameras=example.cameras.replace(depth=None, depth_valid=None), map_lines=None)
+    predict = jax.jit(task.predict)
+    jax.tree.map(np.testing.assert_array_equal, predict(params, example), predict(params, without))

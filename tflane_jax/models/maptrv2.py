@@ -3,7 +3,7 @@
 Differences from MapTR (`models.maptr`): image features are lifted into BEV by their depth (`models.lift`);
 self-attention runs among lines and, apart from that, along each line; in training, a second group of queries learns
 from true lines that are repeated, BEV and image features learn masks of the lines, and the lift learns depth. Source:
-docs/reference/maptr.md.
+docs/reference/maptrv2.md.
 """
 
 from __future__ import annotations

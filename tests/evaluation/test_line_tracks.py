@@ -9,12 +9,12 @@ STILL = np.eye(4)
 
 
 def along(y, start=-20.0, stop=20.0):
-    return np.stack([np.linspace(start, stop, 6), np.full(6, y)], -1)
+    return np.stack([np.linspace(start, stop, 21), np.full(21, y)], -1)
 
 
 def steps(*frames, pose=STILL, classes=None):
     tracks = LineTracks()
-    found = [np.array(frame, float).reshape(-1, 6, 2) for frame in frames]
+    found = [np.array(frame, float).reshape(-1, 21, 2) for frame in frames]
     return [
         tracks.step(lines, np.zeros(len(lines), int) if classes is None else classes, pose).tolist() for lines in found
     ]
@@ -41,6 +41,7 @@ def test_the_ego_motion_is_taken_out():
 def test_a_line_cut_elsewhere_is_the_same_and_one_beside_it_is_not():
     assert steps([along(0)], [along(0, 10.0, 20.0)], [along(0, -20.0, 40.0)]) == [[0], [0], [0]]
     assert steps([along(0)], [along(1.6)]) == [[0], [1]]
+    assert steps([along(0)], [along(0)[:, ::-1]]) == [[0], [1]]  # crosses it
 
 
 def test_lines_of_other_classes_are_others():

@@ -89,6 +89,15 @@ def test_a_model_without_centerlines_is_measured_on_three_classes():
     assert found["recall"] == 1.0
 
 
+def test_a_model_with_heights_is_measured_with_them():
+    for dims, expected in ((2, 1.0), (3, 0.0)):
+        metrics = MapLineMetrics(labels=LABELS, dims=dims)
+        for example in world()[:2]:
+            lines = perfect(example.map_lines)
+            metrics.update(lines.replace(points=lines.points + np.array([0.0, 0.0, 5.0])), example)
+        assert metrics.compute()["lines"]["recall"] == expected
+
+
 def test_the_best_pairs_of_query_and_class_are_detections():
     logits = np.array([[2.0, 1.0, -5.0], [-3.0, -4.0, -6.0], [-9.0, 0.0, -9.0]])
     points = np.arange(3.0)[:, None, None] + np.zeros((3, 4, 2))

@@ -78,3 +78,10 @@ def test_centerlines_take_no_part():
         "C-AP_boundary": 0.0,
     }
     assert run([])["C-mAP"] == 0.0
+    # A centerline found first does not take the number of a divider.
+    metrics = MapConsistency()
+    for kind, identity in ((3, 5), (0, 1), (0, 1)):
+        found = MapDetections([line(0)], np.array([kind]), np.array([0.9]))
+        matched = match_map(found, MapTruth([line(0)], np.array([kind])))
+        metrics.add(matched, np.array([identity]), np.array([0]))
+    assert metrics.compute()["C-AP_divider"] == 1.0

@@ -188,6 +188,25 @@ def test_order_is_free_and_parts_merge(seed, sampling):
         assert evaluate([one], sampling) == evaluate([other], sampling)
 
 
+def test_heights_count_in_the_distance_alone():
+    flat = np.column_stack([line(0), np.zeros(2)])
+    # 0.8 m higher; and a slope of 100 percent, whose points are as far apart in the plane as those of the flat line.
+    higher, steep = flat + np.array([0, 0, 0.8]), flat + np.array([[0, 0, 0], [0, 0, 10]])
+    for raised, thresholds in ((higher, [1.0, 1.5]), (steep, [])):
+        detections, truth = frame([flat], [raised], [0.9])
+        metrics = VectorMapMetrics(dims=3)
+        metrics.update(detections, truth)
+        found = metrics.compute()
+        assert [t for t in MAP_THRESHOLDS if found[f"AP_divider@{t}"] == 1.0] == thresholds
+        assert "with heights" in metrics.protocol
+        overlap = match_map(detections, truth, measure="iou", dims=3)
+        assert overlap.hits.all()
+    with pytest.raises(UserError, match="cannot merge"):
+        VectorMapMetrics(dims=3).merge(VectorMapMetrics())
+    with pytest.raises(UserError, match="expected lines of 3-D points"):
+        match_map(*frame([line(0)], [line(0)], [0.9]), dims=3)
+
+
 def test_empty_input():
     none = frame([], [], [])
     for result in (evaluate([]), evaluate([none])):

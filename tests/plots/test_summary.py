@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.fakes import empty_example, fake_example
 from tflane_jax.plots.summary import dataset_summary
-from tflane_jax.scene import stack_examples
+from tflane_jax.scene import LineClass, MapLines, stack_examples
 
 
 def summary(*examples) -> dict:
@@ -48,3 +48,14 @@ def test_examples_without_a_quantity_do_not_count_in_its_mean():
 def test_quantities_that_a_dataset_lacks_have_no_row():
     bare = fake_example().replace(hidden=None, traffic_flow=None, traffic_elements=None)
     assert not {"road users", "share of ground out of sight", "traffic lights and signs"} & set(summary(bare))
+
+
+def test_lines_of_a_map_are_counted_by_class():
+    lines = MapLines.empty(4, 5)
+    lines.category[:3], lines.valid[:3] = [LineClass.DIVIDER, LineClass.DIVIDER, LineClass.BOUNDARY], True
+    lines.visibility[:] = 0.2, 1.0, 1.0, 0.0
+    rows = summary(fake_example().replace(map_lines=lines))
+    assert (rows["map lines"]["mean"], rows["map lines"]["capacity"]) == (3, 4)
+    assert [rows[f"- {name}"]["mean"] for name in ("divider", "crossing", "boundary", "centerline")] == [2, 0, 1, 0]
+    assert rows["- hidden lines"]["mean"] == 1
+    assert "map lines" not in summary(fake_example())

@@ -8,12 +8,13 @@ import pytest
 
 from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.cli import main
-from tflane_jax.metrics.vector_map import CLASSES
+from tflane_jax.metrics import MapDetections, MapTruth
+from tflane_jax.metrics.vector_map import CLASSES, LINE_CLASSES
 
 
 def vectors(lines, scores=None):
     return [
-        {"pts": np.asarray(points).tolist(), "pts_num": len(points), "cls_name": CLASSES[c], "type": int(c)}
+        {"pts": np.asarray(points).tolist(), "pts_num": len(points), "cls_name": LINE_CLASSES[c], "type": int(c)}
         | ({} if scores is None else {"confidence_level": float(scores[i])})
         for i, (points, c) in enumerate(zip(lines.points, lines.classes, strict=True))
     ]
@@ -50,6 +51,26 @@ def test_files_give_the_official_numbers(tmp_path, samples):
     assert code == 0
     assert row["mAP"] == pytest.approx(official["mAP"], abs=1e-6)
     assert [row[f"AP_{name}"] for name in CLASSES] == pytest.approx(official["AP_per_class"], abs=1e-6)
+
+
+@pytest.mark.golden
+def test_overlap_gives_the_official_numbers(tmp_path, samples):
+    write(tmp_path, samples)
+    official = expected_cases("maptr")["rand_mid"]["iou"]
+    code, row = run(tmp_path, "maptr-iou")
+    assert code == 0
+    assert [row[f"AP_{name}"] for name in CLASSES] == pytest.approx(official["AP_per_class"], abs=1e-6)
+
+
+def test_centerlines_are_a_fourth_class(tmp_path):
+    line = np.array([[0.0, 0.0], [0.0, 9.0]])
+    truth = MapTruth([line, line], np.array([0, 3]))
+    found = MapDetections([line, line + 0.7], np.array([0, 3]), np.array([0.9, 0.8]))
+    write(tmp_path, [(found, truth)])
+    code, row = run(tmp_path)
+    assert code == 0
+    assert (row["AP_divider"], row["AP_centerline"]) == (1.0, pytest.approx(2 / 3))
+    assert row["mAP"] == pytest.approx((1 + 2 / 3) / 4)
 
 
 DAMAGE = {

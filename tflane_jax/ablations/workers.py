@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from tqdm import tqdm
@@ -90,10 +90,7 @@ def _train_in_workers(waiting: list[Job], jobs: Sequence[Job], parallel: int) ->
             for worker in workers:
                 if worker.job is None and waiting:
                     others = {task for other in workers if other is not worker for task in other.tasks}
-                    # Prefer a model that this worker has compiled, then one that no worker has.
-                    mine = (job for job in waiting if job.config.task in worker.tasks)
-                    fresh = (job for job in waiting if job.config.task not in others)
-                    chosen = next(mine, None) or next(fresh, waiting[0])
+                    chosen = choose(waiting, worker.tasks, others)
                     waiting.remove(chosen)
                     with noted(chosen, failures):
                         _build(chosen, built)
@@ -106,6 +103,23 @@ def _train_in_workers(waiting: list[Job], jobs: Sequence[Job], parallel: int) ->
                     failures.append(failure)
                     _tell([failure])
     return failures
+
+
+def choose(waiting: Sequence[Job], mine: Collection[Any], others: Collection[Any]) -> Job:
+    """Return the job that a worker takes next.
+
+    All models get a seed before any gets the next one, so that a comparison stopped early has pairs. Within a seed, a
+    model that this worker has compiled goes first, then one that no other worker has.
+
+    Args:
+        waiting: in the order of seeds; not empty.
+        mine: tasks that this worker has compiled.
+        others: tasks that other workers have.
+    """
+    first = [job for job in waiting if job.config.training.seeds == waiting[0].config.training.seeds]
+    compiled = (job for job in first if job.config.task in mine)
+    fresh = (job for job in first if job.config.task not in others)
+    return next(compiled, None) or next(fresh, first[0])
 
 
 def _build(job: Job, built: set[Any]) -> None:

@@ -50,8 +50,8 @@ def confidences_of(
 
 def _line_confidences(truth: MapLines, found: LinePrediction) -> Float[np.ndarray, " n"]:
     kept = measured_lines(truth, found)
-    detections = detections_of_lines(found)
-    matched = match_map(detections, truth_of_lines(truth, found))
+    dims = 3 if found.points.shape[-1] == 3 else 2
+    matched = match_map(detections_of_lines(found), truth_of_lines(truth, found), dims=dims)
     confidences = np.full(len(kept), -np.inf)
     # Beyond the largest threshold the distance is inf.
     confidences[kept] = _highest(matched.distance, matched.nearest, matched.scores, int(kept.sum()))

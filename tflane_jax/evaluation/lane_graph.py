@@ -34,7 +34,7 @@ from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMe
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, Measure
+from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, Dims, Measure
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Example, MapLines, Prediction
 
@@ -54,7 +54,7 @@ class LaneGraphMetrics:
         frame_groups, lane_groups: names of the groups of frames and of further groups of lanes, see
             `GroupedCenterlineMetrics`.
         parts: predicted parts that are measured as long as no frame was seen.
-        map_measures, line_labels: of the lines of vector maps, see `MapLineMetrics`.
+        map_measures, line_labels, line_dims: of the lines of vector maps, see `MapLineMetrics`.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class LaneGraphMetrics:
         lane_groups: Sequence[str] = (),
         map_measures: Sequence[Measure] = ("chamfer",),
         line_labels: Sequence[LineLabel] = (),
+        line_dims: Dims = 2,
     ) -> None:
         self._centerlines = GroupedCenterlineMetrics(
             versions=versions, frame_groups=frame_groups, lane_groups=lane_groups
@@ -72,7 +73,7 @@ class LaneGraphMetrics:
         self._continues: list[bool] = []  # whether a frame belongs to the scene of the frame before
         self._segments = GroupedSegmentMetrics(frame_groups=frame_groups, lane_groups=lane_groups)
         self._devkit = LaneSegmentMetrics("OpenLane-V2")
-        self._lines = MapLineMetrics(map_measures, line_labels, lane_groups if line_labels else ())
+        self._lines = MapLineMetrics(map_measures, line_labels, lane_groups if line_labels else (), line_dims)
         self._measured = tuple(parts)
 
     @property
@@ -173,6 +174,12 @@ def line_labels(lines: MapLines | None) -> tuple[LineLabel, ...]:
     return tuple(name for name, values in known if values is not None)  # pyright: ignore[reportReturnType]
 
 
+def _line_dims(batch: Example, answer: Prediction) -> Dims:
+    """Return 3 for a model that predicts heights, if they are labelled."""
+    heights = answer.lines is not None and answer.lines.points.shape[-1] == 3
+    return 3 if heights and batch.map_lines is not None else 2
+
+
 def evaluate_lanes(
     task: Predictor,
     params: Params,
@@ -213,6 +220,7 @@ def evaluate_lanes(
                 lane_groups=LANE_GROUPS if _members(batch, answer, 0, ground) else (),
                 map_measures=config.map_measures,
                 line_labels=line_labels(batch.map_lines),
+                line_dims=_line_dims(batch, answer),
             )
         for row in range(len(indices)):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))

@@ -2,8 +2,11 @@
 
 The definition of C-mAP (`metrics.consistency`) leaves open how lines get them. Here: the lines of earlier frames are
 moved by the ego motion and assigned to the present ones of the same class (Hungarian assignment). Two lines are the
-same if the nearest `SHARED` of the points of either lie within `SAME` of the other in the mean: the perception range
+same if, of each, the nearest `SHARED` of its points lie within `SAME` of the other in the mean: the perception range
 cuts a line elsewhere in every frame. A line that is missing for up to `MEMORY` frames keeps its identity.
+
+On the true lines of 24 scenes of the built-in world (12 of each preset, 4 frames 2 s apart), 600 of 609 lines keep
+their identity, and none gets that of another line.
 """
 
 from __future__ import annotations
@@ -11,14 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from tflane_jax.datasets.identities import line_distances
 from tflane_jax.geometry import invert_pose
 
 SAME = 1.5  # metres, the largest threshold of MapTR's AP
-SHARED = 0.4  # of a line's points
+SHARED = 0.25  # of a line's points
 MEMORY = 5  # frames
 _FAR = 1e6
 
@@ -64,10 +66,7 @@ class LineTracks:
         moved = known.lines @ pose[:2, :2].T + pose[:2, 3]
         lost = known.missed >= MEMORY
         if len(lines) and len(moved):
-            there, back = line_distances(lines, moved)[0], line_distances(moved, lines)[0].swapaxes(0, 1)
-            # All points decide between lines that overlap in part.
-            cost = np.minimum(_near_part(there), _near_part(back)) + 1e-3 * (there.mean(-1) + back.mean(-1))
-            cost = np.where((cost < SAME) & (classes[:, None] == known.classes), cost, _FAR)
+            cost = _cost(lines, moved, classes[:, None] == known.classes)
             row, column = (side.astype(int) for side in linear_sum_assignment(cost))
             same = cost[row, column] < _FAR
             identity[row[same]] = known.identity[column[same]]
@@ -84,7 +83,33 @@ class LineTracks:
         return identity
 
 
-def _near_part(distance: Float[np.ndarray, "p k n"]) -> Float[np.ndarray, "p k"]:
+def _cost(
+    lines: Float[np.ndarray, "p n 2"], known: Float[np.ndarray, "k n 2"], same_class: Bool[np.ndarray, "p k"]
+) -> Float[np.ndarray, "p k"]:
+    """Return how far apart lines are, metres; `_FAR` for those that are not the same."""
+    low, high = lines.min(1)[:, None] - SAME, lines.max(1)[:, None] + SAME
+    meets = ((low <= known.max(1)) & (known.min(1) <= high)).all(-1)
+    row, column = np.nonzero(meets & same_class)
+    there, back = _distances(lines[row], known[column]), _distances(known[column], lines[row])
+    near = np.maximum(_near_part(there), _near_part(back))
+    cost = np.full(same_class.shape, _FAR)
+    # All points decide between lines that overlap in part.
+    cost[row, column] = np.where(near < SAME, near + 1e-2 * (there.mean(-1) + back.mean(-1)), _FAR)
+    return cost
+
+
+def _near_part(distance: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
     """Return the mean of the smallest distances of each pair of lines."""
     count = max(round(SHARED * distance.shape[-1]), 1)
     return np.partition(distance, count - 1, axis=-1)[..., :count].mean(-1)
+
+
+def _distances(lines: Float[np.ndarray, "k n 2"], others: Float[np.ndarray, "k n 2"]) -> Float[np.ndarray, "k n"]:
+    """Return the distance of every vertex of a line to the other line of its pair, metres."""
+    step = np.diff(others, axis=1)
+    square = np.maximum((step**2).sum(-1), 1e-12)[:, None]
+    from_start = [lines[:, :, None, axis] - others[:, None, :-1, axis] for axis in (0, 1)]
+    along = sum(part * step[:, None, :, axis] for axis, part in enumerate(from_start)) / square
+    along = np.clip(along, 0.0, 1.0)
+    across = [part - along * step[:, None, :, axis] for axis, part in enumerate(from_start)]
+    return np.sqrt((across[0] ** 2 + across[1] ** 2).min(-1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from tflane_jax.evaluation.line_tracks import LineTracks
 from tflane_jax.evaluation.vector_maps import detections_of_lines, map_truth, truth_of_lines
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
 from tflane_jax.metrics.groups import BY_OCCLUSION
-from tflane_jax.metrics.vector_map import GroupedMapMetrics, MatchedMap, Measure, VectorMapMetrics, match_map
+from tflane_jax.metrics.vector_map import Dims, GroupedMapMetrics, MatchedMap, Measure, VectorMapMetrics, match_map
 from tflane_jax.scene import Example, LinePrediction
 
 LineLabel = Literal["visibility", "identity"]
@@ -33,6 +34,7 @@ class MapLineMetrics:
         measures: "chamfer", always measured, and "iou".
         labels: what the labels of lines tell.
         groups: names of further groups of lines, see `evaluation.lane_groups`.
+        dims: 3 measures heights, too; only labelled lines have them.
     """
 
     def __init__(
@@ -40,10 +42,12 @@ class MapLineMetrics:
         measures: Collection[Measure] = ("chamfer",),
         labels: Collection[LineLabel] = (),
         groups: Sequence[str] = (),
+        dims: Dims = 2,
     ) -> None:
+        self._dims: Dims = dims
         partition = BY_OCCLUSION.names if "visibility" in labels else ()
-        self._chamfer = GroupedMapMetrics(("all", *partition), lane_groups=groups)
-        self._overlap = VectorMapMetrics(measure="iou") if "iou" in measures else None
+        self._chamfer = GroupedMapMetrics(("all", *partition), lane_groups=groups, dims=dims)
+        self._overlap = VectorMapMetrics(measure="iou", dims=dims) if "iou" in measures else None
         self._consistency = MapConsistency() if "identity" in labels else None
         self._tracks = LineTracks()
 
@@ -63,11 +67,12 @@ class MapLineMetrics:
             example: with labelled lines; without, they are derived from its lane segments and areas.
             members: for each of the further groups, which of the measured true lines belong to it.
         """
+        lines = replace(lines, points=lines.points[..., : self._dims])
         detections = detections_of_lines(lines)
         truth = map_truth(example.segments, example.areas)
         if example.map_lines is not None:
             truth = truth_of_lines(example.map_lines, lines)
-        frame = match_map(detections, truth, nearest="all")
+        frame = match_map(detections, truth, dims=self._dims, nearest="all")
         self._chamfer.add(frame, truth, None, members)
         if self._overlap is not None:
             self._overlap.update(detections, truth)
@@ -88,7 +93,7 @@ class MapLineMetrics:
             self._tracks.start()
         confident = frame.scores > CONFIDENT
         kept = frame.detections(confident)
-        identities = self._tracks.step(points[confident], kept.classes, np.asarray(example.previous_from_ego))
+        identities = self._tracks.step(points[confident][..., :2], kept.classes, np.asarray(example.previous_from_ego))
         consistency.add(kept, identities, lines)
 
     def compute(self) -> dict[str, dict[str, float]]:

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
 from tflane_jax.datasets.identities import line_distances
-from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
+from tflane_jax.metrics.vector_map import CLASSES, Dims, MapDetections, MapTruth
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LinePrediction, LineType, MapLines
 
 _DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "ped_crossing", "boundary"))
@@ -70,28 +70,36 @@ def map_detections(
     classes: Int[np.ndarray, " q"],
     scores: Float[np.ndarray, " q"],
     valid: Bool[np.ndarray, " q"] | None = None,
+    *,
+    dims: Dims = 2,
 ) -> MapDetections:
-    """Return the detected lines, best score first; only x and y of the points are kept.
+    """Return the detected lines, best score first.
 
     Args:
         points: metres.
         classes: index into `metrics.vector_map.LINE_CLASSES`.
         scores: confidence, 0 to 1.
         valid: detections to keep; None keeps all.
+        dims: coordinates of the points to keep.
     """
     order = np.argsort(-np.asarray(scores), kind="stable")
     if valid is not None:
         order = order[np.asarray(valid)[order]]
-    return MapDetections(np.asarray(points)[order][..., :2], np.asarray(classes)[order], np.asarray(scores)[order])
+    return MapDetections(np.asarray(points)[order][..., :dims], np.asarray(classes)[order], np.asarray(scores)[order])
 
 
 def truth_of_lines(lines: MapLines, found: LinePrediction) -> MapTruth:
-    """Return the labelled lines of the classes that a model predicts."""
+    """Return the labelled lines of the classes that a model predicts, with as many coordinates."""
     kept = measured_lines(lines, found)
     visibility, identity = (
         None if known is None else np.asarray(known)[kept] for known in (lines.visibility, lines.identity)
     )
-    return MapTruth(np.asarray(lines.points)[kept][..., :2], np.asarray(lines.category)[kept], visibility, identity)
+    return MapTruth(
+        np.asarray(lines.points)[kept][..., : found.points.shape[-1]],
+        np.asarray(lines.category)[kept],
+        visibility,
+        identity,
+    )
 
 
 def measured_lines(lines: MapLines, found: LinePrediction) -> Bool[np.ndarray, " l"]:
@@ -107,4 +115,5 @@ def detections_of_lines(lines: LinePrediction) -> MapDetections:
     confidence = expit(np.asarray(lines.logits, np.float64))
     queries, classes = confidence.shape
     best = np.argsort(-confidence, axis=None, kind="stable")[:queries]
-    return map_detections(np.asarray(lines.points)[best // classes], best % classes, confidence.ravel()[best])
+    points, dims = np.asarray(lines.points)[best // classes], 3 if lines.points.shape[-1] == 3 else 2
+    return map_detections(points, best % classes, confidence.ravel()[best], dims=dims)

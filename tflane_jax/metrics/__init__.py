@@ -1,6 +1,7 @@
 """Official lane metrics, re-implemented, with the version of the protocol in their name."""
 
 from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics.consistency import MapConsistency
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.frames import (
     ElementDetections,
@@ -17,7 +18,7 @@ from tflane_jax.metrics.segment_matching import (
     SegmentTruth,
 )
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
-from tflane_jax.metrics.vector_map import MapDetections, MapTruth, VectorMapMetrics
+from tflane_jax.metrics.vector_map import GroupedMapMetrics, MapDetections, MapTruth, VectorMapMetrics
 
 __all__ = [
     "AreaDetections",
@@ -27,10 +28,12 @@ __all__ = [
     "ElementDetections",
     "ElementTruth",
     "GroupedCenterlineMetrics",
+    "GroupedMapMetrics",
     "GroupedSegmentMetrics",
     "LaneDetections",
     "LaneSegmentMetrics",
     "LaneTruth",
+    "MapConsistency",
     "MapDetections",
     "MapTruth",
     "RowLanes",

@@ -50,8 +50,10 @@ class MapConsistency:
         Args:
             frame: matching results of the confident detections.
             identities: of these detections.
-            lines: numbers of the true lines, the same in every frame of the scene.
+            lines: numbers of the true lines, the same in every frame of the scene; those of centerlines are not read.
         """
+        measured = frame.classes < len(CLASSES)
+        frame, identities = frame.detections(measured), identities[measured]
         consistent = np.zeros(frame.hits.shape, bool)
         for row, hits, first in zip(consistent, frame.hits, self._first, strict=True):
             new: dict[int, set[int]] = {}
@@ -61,9 +63,8 @@ class MapConsistency:
                     new.setdefault(line, set()).add(identity)
                 row[p] = line not in first or identity in first[line]
             first |= new
-        measured = frame.classes < len(CLASSES)
         self._truths += frame.truths[: len(CLASSES)]
-        self._detections.append((frame.scores[measured], frame.classes[measured], consistent[:, measured]))
+        self._detections.append((frame.scores, frame.classes, consistent))
 
     def compute(self) -> dict[str, float]:
         """Return `C-mAP`, the mean over classes of `C-AP_divider` ..., each the mean over MapTR's thresholds."""

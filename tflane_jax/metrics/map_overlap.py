@@ -29,7 +29,7 @@ def map_overlap(true: PaddedLines, found: PaddedLines, same: Bool[np.ndarray, "g
     i, j = np.nonzero(same)
     overlap = np.zeros(same.shape)
     if len(i):
-        a, b = (_buffers(shapely, lines.points) for lines in (true, found))
+        a, b = (_buffers(shapely, lines.points[..., :2]) for lines in (true, found))
         meets = shapely.intersects(a[i], b[j])
         i, j = i[meets], j[meets]
         common = shapely.area(shapely.intersection(a[i], b[j]))

@@ -24,6 +24,7 @@ from tflane_jax.metrics.matching import average_precision_area, greedy_match, ne
 
 Sampling = Literal["maptr", "maptrv2", "as_given"]
 Measure = Literal["chamfer", "iou"]
+Dims = Literal[2, 3]
 CLASSES = ("divider", "ped_crossing", "boundary")
 LINE_CLASSES = (*CLASSES, "centerline")
 """With the fourth class of MapTRv2, in the order of `scene.LineClass`."""
@@ -44,7 +45,7 @@ class MapTruth:
     """Map elements of one frame: G lines.
 
     Attributes:
-        points: G polylines (n, 2), metres; each may have its own n >= 2. Closed ones repeat their first vertex.
+        points: G polylines (n, 2 or 3), metres; each may have its own n >= 2. Closed ones repeat their first vertex.
         classes: (G,) 0 divider, 1 pedestrian crossing, 2 boundary, 3 centerline.
         visibility: (G,) fraction in direct line of sight, for groups by occlusion; None if it is not known.
         identity: (G,) number of the line, the same in every frame of a scene, for `metrics.consistency`; None if it is
@@ -62,7 +63,7 @@ class MapDetections:
     """Detected map elements of one frame: P lines.
 
     Attributes:
-        points: P polylines (n, 2), metres; each may have its own n. Lines of one point are ignored, as officially.
+        points: P polylines (n, 2 or 3), metres; each may have its own n. Lines of one point are ignored, as officially.
         classes: (P,) 0 divider, 1 pedestrian crossing, 2 boundary, 3 centerline.
         scores: (P,) confidence; only the order counts.
     """
@@ -81,11 +82,14 @@ class VectorMapMetrics:
             "as_given": none. Ground truth is always resampled.
         measure: of the distance of two lines: "chamfer" at `MAP_THRESHOLDS`, or "iou", the overlap of their buffers, at
             `OVERLAP_THRESHOLDS`, which needs shapely.
+        dims: of the points. 3 is MapTRv2's variant for Argoverse 2: heights count in Chamfer distances, but neither in
+            arc lengths nor in buffers.
     """
 
-    def __init__(self, sampling: Sampling = "maptr", measure: Measure = "chamfer") -> None:
+    def __init__(self, sampling: Sampling = "maptr", measure: Measure = "chamfer", dims: Dims = 2) -> None:
         self.sampling: Sampling = sampling
         self.measure: Measure = measure
+        self.dims: Dims = dims
         self._frames = 0
         self._truths = np.zeros(len(LINE_CLASSES), np.int64)
         self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, hits
@@ -94,7 +98,8 @@ class VectorMapMetrics:
     def protocol(self) -> str:
         """Name and version, the title of every table of these numbers."""
         classes = ", with centerlines" if len(self.classes) > len(CLASSES) else ""
-        return f"{_NAMES[self.measure]} {_VERSIONS[self.sampling]}{classes}"
+        heights = ", with heights" if self.dims == 3 else ""
+        return f"{_NAMES[self.measure]} {_VERSIONS[self.sampling]}{heights}{classes}"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -108,7 +113,7 @@ class VectorMapMetrics:
 
     def update(self, detections: MapDetections, truth: MapTruth) -> None:
         """Add one frame; raise UserError for arrays that do not fit together."""
-        self.add(match_map(detections, truth, self.sampling, self.measure))
+        self.add(match_map(detections, truth, self.sampling, self.measure, dims=self.dims))
 
     def add(self, frame: MatchedMap) -> None:
         """Add one frame that has been matched by this measure."""
@@ -118,10 +123,11 @@ class VectorMapMetrics:
 
     def merge(self, other: Self) -> Self:
         """Return an accumulator of the frames of both, in this order (neither changes)."""
-        if (self.sampling, self.measure) != (other.sampling, other.measure):
+        settings = ("sampling", "measure", "dims")
+        if any(getattr(self, name) != getattr(other, name) for name in settings):
             raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one sampling")
-        merged = type(self)(self.sampling, self.measure)
-        for name in vars(self).keys() - {"sampling", "measure"}:
+        merged = type(self)(self.sampling, self.measure, self.dims)
+        for name in vars(self).keys() - set(settings):
             setattr(merged, name, getattr(self, name) + getattr(other, name))
         return merged
 
@@ -167,7 +173,7 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
     Args:
         groups, lane_groups: see `GroupedMetrics`; lines take the place of lanes.
         partition: of the lines; default by occlusion.
-        sampling: see `VectorMapMetrics`.
+        sampling, dims: see `VectorMapMetrics`.
     """
 
     def __init__(
@@ -177,9 +183,11 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
         lane_groups: Sequence[str] = (),
         partition: Partition = BY_OCCLUSION,
         sampling: Sampling = "maptr",
+        dims: Dims = 2,
     ) -> None:
         self.sampling: Sampling = sampling
-        super().__init__(partial(VectorMapMetrics, sampling), partition, groups, lane_groups=lane_groups)
+        self.dims: Dims = dims
+        super().__init__(partial(VectorMapMetrics, sampling, dims=dims), partition, groups, lane_groups=lane_groups)
 
     def update(
         self, detections: MapDetections, truth: MapTruth, members: Mapping[str, Bool[np.ndarray, " g"]] | None = None
@@ -188,7 +196,8 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
 
         Raises UserError for arrays that do not fit together, or a visibility that is not known.
         """
-        self.add(match_map(detections, truth, self.sampling, nearest="all"), truth, None, members)
+        frame = match_map(detections, truth, self.sampling, dims=self.dims, nearest="all")
+        self.add(frame, truth, None, members)
 
 
 @dataclass(frozen=True)
@@ -240,21 +249,22 @@ def match_map(
     sampling: Sampling = "maptr",
     measure: Measure = "chamfer",
     *,
+    dims: Dims = 2,
     nearest: Literal["close", "all"] = "close",
 ) -> MatchedMap:
     """Match one frame, all classes at once: only lines of the same class are compared.
 
     Args:
         detections, truth: lines of one frame.
-        sampling, measure: see `VectorMapMetrics`.
+        sampling, measure, dims: see `VectorMapMetrics`.
         nearest: of detections beyond the largest threshold: "close" leaves it arbitrary, "all" finds it by every
             `_COARSE`-th vertex.
     """
-    true = PaddedLines.of(truth.points, "truth", dims=2)
+    true = PaddedLines.of(truth.points, "truth", dims)
     true_classes = _checked_classes(truth.classes, len(true), "truth")
     if (true.counts < 2).any():
         raise UserError(f"truth: line {int((true.counts < 2).argmax())} has a single point")
-    found = PaddedLines.of(detections.points, "detections", dims=2)
+    found = PaddedLines.of(detections.points, "detections", dims)
     classes = _checked_classes(detections.classes, len(found), "detections")
     scores = np.asarray(detections.scores)
     check_shape(scores, (len(found),), "detections: scores")
@@ -303,7 +313,7 @@ def map_distance(true: PaddedLines, found: PaddedLines, same: Bool[np.ndarray, "
     close = chamfer <= MAP_THRESHOLDS[-1]
     i, j, chamfer = i[close], j[close], chamfer[close]
     distance = np.full(same.shape, np.inf)
-    distance[i, j] = np.where(buffers_touch(true.points, found.points, i, j, BUFFER), chamfer, np.inf)
+    distance[i, j] = np.where(buffers_touch(true.points[..., :2], found.points[..., :2], i, j, BUFFER), chamfer, np.inf)
     return distance
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 from numpy.typing import ArrayLike
 
-from tflane_jax.scene import AreaType, Example
+from tflane_jax.scene import AreaType, Example, LineClass
 
 
 def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[str, Any]]:
@@ -19,7 +19,7 @@ def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[
 
     Args:
         arrays: examples stacked along a leading axis.
-        hidden_below: a lane with a smaller visibility counts as hidden.
+        hidden_below: a lane or line with a smaller visibility counts as hidden.
     """
     lanes, areas, flow = arrays.lanes, arrays.areas, arrays.traffic_flow
     links = lanes.successor & lanes.valid[:, :, None] & lanes.valid[:, None]
@@ -34,6 +34,11 @@ def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[
         _subset("- crossings", areas.valid & (areas.category == AreaType.PEDESTRIAN_CROSSING)),
         _subset("- road boundaries", areas.valid & (areas.category == AreaType.ROAD_BOUNDARY)),
     ]
+    if (lines := arrays.map_lines) is not None:
+        rows.append(_slots("map lines", lines.valid))
+        rows += [_subset(f"- {kind.name.lower()}", lines.valid & (lines.category == kind)) for kind in LineClass]
+        if lines.visibility is not None:
+            rows.append(_subset("- hidden lines", lines.valid & (lines.visibility < hidden_below)))
     if flow is not None:
         known = flow.valid.any(-1)
         rows += [

@@ -13,7 +13,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_file, member, numbers, scores
-from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
+from tflane_jax.metrics.vector_map import LINE_CLASSES, MapDetections, MapTruth
 
 
 def read_predictions(path: Path) -> dict[str, MapDetections]:
@@ -53,8 +53,8 @@ def _lines(vectors: Any, where: str, least: int) -> tuple[list[np.ndarray], np.n
         if line.shape[1] not in (2, 3) or len(line) < least:
             raise UserError(f"{at}.pts has shape {line.shape}, expected (n, 2) with n of at least {least}")
         name = member(vector, "cls_name", at)
-        if name not in CLASSES:
-            raise UserError(f"{at}.cls_name is {name!r:.40}, expected one of {', '.join(CLASSES)}")
+        if name not in LINE_CLASSES:
+            raise UserError(f"{at}.cls_name is {name!r:.40}, expected one of {', '.join(LINE_CLASSES)}")
         points.append(line[:, :2])
-        classes.append(CLASSES.index(name))
+        classes.append(LINE_CLASSES.index(name))
     return points, np.array(classes, np.int64)

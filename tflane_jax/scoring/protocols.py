@@ -17,7 +17,7 @@ from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, Lane
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
-from tflane_jax.metrics.vector_map import CLASSES, Sampling, VectorMapMetrics
+from tflane_jax.metrics.vector_map import LINE_CLASSES, Measure, Sampling, VectorMapMetrics
 from tflane_jax.scoring import maptr, openlane_v2, plain
 from tflane_jax.scoring.score import Accumulator
 
@@ -75,13 +75,13 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
     )
 
 
-def _maptr(sampling: Sampling) -> ScoringProtocol:
+def _maptr(sampling: Sampling, measure: Measure = "chamfer") -> ScoringProtocol:
     return ScoringProtocol(
         read_predictions=maptr.read_predictions,
         read_truth=maptr.read_truth,
         scene_of=lambda token: token,  # the files do not say which drive a sample is of
-        metrics=partial(VectorMapMetrics, sampling),
-        columns=("mAP", *(f"AP_{name}" for name in CLASSES)),
+        metrics=partial(VectorMapMetrics, sampling, measure),
+        columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
     )
 
 
@@ -105,6 +105,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),
+    "maptr-iou": _maptr("maptr", "iou"),
     "tusimple": _tusimple(OFFICIAL_TIME_LIMIT),
     "tusimple-lstr": _tusimple(LSTR_TIME_LIMIT),
 }

@@ -19,8 +19,8 @@ from tflane_jax.scene import Example
 def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> None:
     """Raise UserError where data and model do not fit together.
 
-    Ranges or points differ, the data lack the traffic flow or the past frames that the model reads, or a camera sees
-    more cells than `capacity`.
+    Ranges or points differ, the data lack the lines of a map that the model learns, or the traffic flow or the past
+    frames that it reads, or a camera sees more cells than `capacity`.
 
     Args:
         model: the host.
@@ -28,6 +28,7 @@ def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> Non
         example: one of them.
     """
     _check_ranges(model, config)
+    _check_lines(model, config, example)
     _check_points(model, config)
     _check_traffic(model, config, example)
     encoder, cameras = model.encoder, example.cameras
@@ -55,6 +56,15 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
         raise UserError(
             f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), beyond the "
             f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
+        )
+
+
+def _check_lines(model: HostConfig, config: ExampleConfig, example: Example) -> None:
+    learned = "lines" in model.predicts and "map_lines" in model.truth
+    if learned and (config.map_lines is None or example.map_lines is None):
+        raise UserError(
+            "this model learns the lines of a vector map, and the data label none: set data.example.map_lines, which "
+            "the built-in world and Argoverse 2 read"
         )
 
 

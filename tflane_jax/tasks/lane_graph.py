@@ -203,7 +203,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
         """Return the names of the host's metrics by group, with those of traffic elements if it predicts them."""
-        example: ExampleConfig = data.source("val").example
+        example = data.source("val").example
         return score_names.score_names(self.model, example, config, grouped=self._ground is not None)
 
     def drawing(self, data: SplitData, config: EvaluationConfig) -> Draw:

@@ -21,6 +21,8 @@ from tflane_jax.config_files import find_config, split_reference
 from tflane_jax.config_io import choices, settings, with_setting
 from tflane_jax.datasets.argoverse2 import LogData
 from tflane_jax.datasets.front_views import FrontViewData
+from tflane_jax.datasets.nuscenes import NuScenesData
+from tflane_jax.datasets.nuscenes_scenes import SceneFileData
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Data
 from tflane_jax.datasets.procedural import WorldData
 from tflane_jax.datasets.sources import data_classes
@@ -42,8 +44,10 @@ __all__ = [
     "EvaluationConfig",
     "FrontViewData",
     "LogData",
+    "NuScenesData",
     "OpenLaneV2Data",
     "RunConfig",
+    "SceneFileData",
     "TuSimpleData",
     "WorldData",
     "apply_overrides",

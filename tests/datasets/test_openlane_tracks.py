@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.datasets.nuscenes_small import PITCH, START, write_nuscenes
 from tests.models.cases import CAMERA_TOPONET, WITH_TRAFFIC
 from tests.shared import shared_path
 from tflane_jax.cli import main
@@ -22,6 +23,7 @@ from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
+from tflane_jax.geometry import yaw_pose
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.runs import open_run, train_run
@@ -152,12 +154,34 @@ def test_tracks_are_written_once_and_only_beside_seven_cameras(written, tmp_path
     _, tracks = written
     with pytest.raises(UserError, match="is not empty"):
         export_tracks([], tracks)
-    with pytest.raises(UserError, match="subset B"):
+    with pytest.raises(UserError, match="holds no nuScenes tables"):
         SourceTracks(tracks, "B", {})
     out = tmp_path / "six"
     arguments = ["data", "export", "--config", "camera/toponet", "--splits", "val", "--out", str(out)]
     assert main([*arguments, "--tracks", str(tmp_path / "t"), "--data.val", "1"]) == 2
     assert not out.exists()
+
+
+@pytest.mark.parametrize("scene", ["scene-0061", "scene-a"])
+def test_subset_b_takes_the_tracks_of_nuscenes(tmp_path, scene):
+    """A frame 10 ms and 0.1 m after sample 3, from a pitched vehicle; the car of sample 0 was 15 m before it."""
+    tracks = SourceTracks(write_nuscenes(tmp_path), "B", {("val", "11000"): scene, ("val", "11001"): "scene-0001"})
+    key = FrameKey("val", "11000", str(START + 1_500_000 + 10_000))
+    other = FrameKey("val", "11001", key.timestamp)
+    assert tracks.known([key, other], "drop") == [key]
+    with pytest.raises(UserError, match=r"lacks 1 of the logs of these frames \(scene-0001\)"):
+        tracks.known([key, other], "refuse")
+    pitched = np.array([[np.cos(PITCH), 0, np.sin(PITCH)], [0, 1, 0], [-np.sin(PITCH), 0, np.cos(PITCH)]])
+    pose = yaw_pose(400.0, 1115.1, np.pi / 2)
+    pose[:3, :3] = pose[:3, :3] @ pitched
+    sizes = ExampleConfig(tracks=4, history=5, history_hz=2.0)
+    flow = tracks.flow(key, pose, sizes)
+    car = int(np.flatnonzero(flow.valid[:, 2])[0])
+    assert flow.valid[car].tolist() == [False, False, True, True, False]
+    np.testing.assert_allclose(flow.position[car, 2:4], [[-5.1, 3, 1], [-0.1, 3, 1]], atol=1e-5)
+    assert not tracks.flow(other, pose, sizes).valid.any()
+    with pytest.raises(UserError, match=r"does not belong to log scene-0061: .* 15 m away"):
+        tracks.flow(key, yaw_pose(400.0, 1130.0, np.pi / 2), sizes)
 
 
 @pytest.mark.slow

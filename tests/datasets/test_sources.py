@@ -12,17 +12,29 @@ import pytest
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser, main
 from tflane_jax.commands.sources import chosen_source
-from tflane_jax.config import FrontViewData, LogData, OpenLaneV2Data, RunConfig, TuSimpleData, WorldData
+from tflane_jax.config import (
+    FrontViewData,
+    LogData,
+    NuScenesData,
+    OpenLaneV2Data,
+    RunConfig,
+    SceneFileData,
+    TuSimpleData,
+    WorldData,
+)
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
 from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.front_views import FrontViewConfig
+from tflane_jax.datasets.nuscenes import NuScenesConfig
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 IMAGES = RunConfig(LaneShapeTask(), FrontViewData())
 
@@ -73,6 +85,8 @@ def test_every_source_has_its_own_name_and_one_config():
         (WorldData(), Example, ["procedural-train", "procedural-val", "procedural-test"]),
         (LogData(Path("a/train"), Path("b"), Path("c")), Example, ["argoverse2-train", "argoverse2", "argoverse2"]),
         (OpenLaneV2Data(Path("o")), Example, ["openlane-v2-A-train", "openlane-v2-A-val", "openlane-v2-A-val"]),
+        (NuScenesData(Path("n")), Example, ["nuscenes-train", "nuscenes-val", "nuscenes-val"]),
+        (SceneFileData(Path("n"), ("a",), ("b",), ("c",)), Example, ["nuscenes-scenes"] * 3),
         (FrontViewData(), RoadImage, ["front-views-train", "front-views-val", "front-views-test"]),
         (TuSimpleData(Path("t")), RoadImage, ["tusimple-train", "tusimple-val", "tusimple-test"]),
     ],
@@ -104,6 +118,22 @@ def test_root_does_not_override_the_split(tmp_path, logs):
     source = chosen("--data", "openlane-v2", "--root", tmp_path, "--split", "train")
     assert source == OpenLaneV2Config(tmp_path, "train", example=WorldData().example)
 
+    for split in SPLITS:
+        source = chosen("--data", "nuscenes", "--root", tmp_path, "--split", split)
+        assert source == NuScenesConfig(tmp_path, split, example=WorldData().example)
+
+
+def test_nuscenes_without_a_split_is_the_annotated_one(tmp_path):
+    """The default of eval is test, and the official test split has no truth; a run's own settings stay."""
+    assert chosen("--data", "nuscenes", "--root", tmp_path).split == "val"
+    run = RunConfig(data=NuScenesData(tmp_path / "old", version="v1.0-mini", frame="lidar", image=TOPONET_SUBSET_B))
+    found = chosen("--data", "nuscenes", "--root", tmp_path, config=run)
+    assert found == replace(run.data.source("test"), root=tmp_path)
+    # A model with cameras gets the real ones in place of rendered ones.
+    rendered = replace(WorldData().example, cameras=CameraRigConfig())
+    found = chosen("--data", "nuscenes", "--root", tmp_path, config=RunConfig(data=WorldData(example=rendered)))
+    assert (found.image, found.example.cameras) == (TOPONET_SUBSET_B, None)
+
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_the_split_is_used_for_generated_data(split):
@@ -134,9 +164,13 @@ def test_a_split_that_logs_do_not_have_is_refused(logs):
     [
         (["--data", "procedural", "--root", "x"], None, "--data procedural takes no --root"),
         (["--data", "argoverse2"], None, "needs --root PATH, a log or a folder of logs"),
-        (["--root", "x"], None, "add --data argoverse2 or --data openlane-v2"),
+        (["--root", "x"], None, "add --data argoverse2 or --data openlane-v2 or --data nuscenes"),
         (["--root", "x"], IMAGES, "--root is the folder of real data: add --data tusimple$"),
-        (["--data", "tusimple", "--root", "x"], None, "no lane graphs: this model takes procedural, .* or openlane-v2"),
+        (
+            ["--data", "tusimple", "--root", "x"],
+            None,
+            "no lane graphs: this model takes procedural, .* or nuscenes-scenes",
+        ),
         (["--data", "procedural"], IMAGES, "are no images: this model takes front-views or tusimple"),
         ([], replace(IMAGES, data=WorldData()), "data are lane graphs, but its task takes images"),
         ([], replace(RunConfig(), data=FrontViewData()), "data are images, but its task takes lane graphs"),
@@ -149,8 +183,11 @@ def test_unsuitable_data_sources_are_refused(arguments, config, message):
 
 def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
     for arguments, names in (
-        (["eval", "--help"], "{procedural,world-cameras,city,street,argoverse2,openlane-v2,front-views,tusimple}"),
-        (["data", "check", "--help"], "{argoverse2,openlane-v2,tusimple}"),
+        (
+            ["eval", "--help"],
+            "{procedural,world-cameras,city,street,argoverse2,openlane-v2,nuscenes,nuscenes-scenes,front-views,tusimple}",
+        ),
+        (["data", "check", "--help"], "{argoverse2,openlane-v2,nuscenes,nuscenes-scenes,tusimple}"),
     ):
         with pytest.raises(SystemExit) as ended:
             main(arguments)

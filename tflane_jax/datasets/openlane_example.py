@@ -12,8 +12,12 @@ from jaxtyping import Int
 from tflane_jax.datasets.areas import with_sides
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.openlane_annotation import Annotation
+from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, canvas_size
+from tflane_jax.errors import UserError
+from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import DENSE_POINTS
+from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements, TrafficFlow
 
@@ -59,6 +63,31 @@ def empty_views(fits: Sequence[ImageFit | None], config: ImageConfig) -> CameraV
         camera_from_ego=np.tile(np.eye(4, dtype=np.float32), (count, 1, 1)),
         valid=np.zeros(count, bool),
     )
+
+
+def camera_views(
+    cameras: Sequence[FrameCamera | None], fits: Sequence[ImageFit | None], config: ImageConfig
+) -> CameraViews:
+    """Read the images of a frame; a camera that is None, or has no fit, is not valid.
+
+    Raises UserError for an image that cannot be read or has another size than the camera's other images.
+    """
+    views = empty_views(fits, config)
+    for place, (camera, fit) in enumerate(zip(cameras, fits, strict=True)):
+        if camera is None or fit is None:
+            continue
+        image = read_image(camera.image)
+        if image.shape[1::-1] != fit.source:
+            raise UserError(
+                f"{camera.image} is {image.shape[1]} x {image.shape[0]} pixels, the first image of {camera.name} "
+                f"is {fit.source[0]} x {fit.source[1]}: restore the original file"
+            )
+        views.image[place, : fit.size[1], : fit.size[0]] = fit.image(image)
+        views.size[place] = fit.size
+        views.intrinsics[place] = fit.intrinsics(camera.intrinsics)
+        views.camera_from_ego[place] = invert_pose(camera.ego_from_camera)
+        views.valid[place] = True
+    return views
 
 
 def lane_graph(found: Annotation, capacity: int, points: int) -> tuple[LaneGraph, Int[np.ndarray, " n"]]:

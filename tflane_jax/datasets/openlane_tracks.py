@@ -1,8 +1,8 @@
 """Traffic flow for OpenLane-V2: the tracks of the logs of which its segments are parts (TF-Lane, section 3.2).
 
-OpenLane-V2 holds no tracks. A segment of subset A is a part of an Argoverse 2 sensor log, whose id its files name.
-Frame and log share the city frame and the clock: the frame's time is that of the front camera, some 10 ms before the
-lidar frame in which boxes are annotated.
+OpenLane-V2 holds no tracks. A segment of subset A is a part of an Argoverse 2 sensor log, whose id its files name; one
+of subset B is a scene of nuScenes, named or by its token. Frame and log share the city frame and the clock: the frame's
+time is that of the front camera, some 10 ms before the lidar frame in which boxes are annotated.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from jaxtyping import Float
 from tflane_jax.datasets.argoverse2_log import find_logs, load_log
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import traffic_flow, warn_dropped
+from tflane_jax.datasets.nuscenes_log import level_poses
+from tflane_jax.datasets.nuscenes_tracks import SceneTracks
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
@@ -29,8 +31,8 @@ WithoutTracks = Literal["refuse", "drop", "empty"]
 """What becomes of frames whose log is not at hand: an error that names the logs, frames left out, or an empty traffic
 flow."""
 
-# Seconds and metres between a frame and the nearest annotated one. Boxes come at 10 Hz; the ego vehicle moves less than
-# 5 m between two of them.
+# Seconds and metres between a frame and the nearest annotated one. Boxes of Argoverse 2 come at 10 Hz, those of
+# nuScenes at OpenLane-V2's own frames; the ego vehicle moves less than 5 m in 0.1 s.
 _NEAR_S, _NEAR_M = 0.1, 5.0
 _NAMED = 3
 
@@ -39,23 +41,24 @@ class SourceTracks:
     """The logs at hand, read when they are needed and kept: about 1 MB each.
 
     Args:
-        root: folder of the logs, as for `argoverse2_log.find_logs`; their maps are not needed.
-        subset: A; tracks of subset B are not read yet.
+        root: folder of the logs, as for `argoverse2_log.find_logs`, or of nuScenes, as for
+            `nuscenes_tables.find_tables`; their maps are not needed.
+        subset: which of the two `root` is.
         logs: name of the log of each (split, segment), see `openlane_frames.source_logs`.
 
     Raises UserError where `root` holds no log.
     """
 
     def __init__(self, root: Path, subset: SubsetName, logs: Mapping[tuple[str, str], str]):
-        if subset != "A":
-            raise UserError("tracks of subset B (nuScenes) are not read yet: leave data.tracks out")
         self._root, self._tick = Path(root), SUBSETS[subset].tick_ns
-        self._folders = {folder.name: folder for folder in find_logs(self._root)}
-        self._names, self._read = dict(logs), dict[str, Log]()
+        self._logs = _Argoverse2(self._root) if subset == "A" else SceneTracks(self._root)
+        # Heights and slopes are not those of Argoverse 2: nuScenes has none, and its logs are level.
+        self._level = subset == "B"
+        self._names = dict(logs)
 
     def has(self, key: FrameKey) -> bool:
         """Return whether the log of a frame is at hand."""
-        return self._names[key.split, key.segment] in self._folders
+        return self._names[key.split, key.segment] in self._logs
 
     def known(self, keys: Sequence[FrameKey], without: WithoutTracks) -> list[FrameKey]:
         """Return the frames to use; see `WithoutTracks`.
@@ -89,7 +92,9 @@ class SourceTracks:
         """
         if not self.has(key):
             return TrafficFlow.empty(config.tracks, config.history)
-        log = self._log(self._names[key.split, key.segment])
+        log = self._logs.log(self._names[key.split, key.segment])
+        if self._level:
+            global_from_ego = level_poses(global_from_ego[None])[0]
         time = int(key.timestamp) * self._tick
         nearest = int(np.abs(log.timestamps_ns - time).argmin())
         seconds = (log.timestamps_ns[nearest] - time) / 1e9
@@ -105,7 +110,18 @@ class SourceTracks:
         warn_dropped(config, tracks=dropped)
         return flow
 
-    def _log(self, name: str) -> Log:
+
+class _Argoverse2:
+    """Logs of Argoverse 2 by id, with an empty map."""
+
+    def __init__(self, root: Path):
+        self._folders = {folder.name: folder for folder in find_logs(root)}
+        self._read: dict[str, Log] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._folders
+
+    def log(self, name: str) -> Log:
         if name not in self._read:
             self._read[name] = load_log(self._folders[name], keyframes="annotations", with_map=False)
         return self._read[name]

@@ -21,7 +21,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_check import check_openlane_v2
-from tflane_jax.datasets.openlane_example import area_set, blank, element_set, empty_views, lane_graph
+from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
@@ -40,7 +40,7 @@ from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B, 
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT
-from tflane_jax.geometry import invert_pose, relative_pose
+from tflane_jax.geometry import relative_pose
 from tflane_jax.scene import CameraViews, Example
 
 Flavour = Literal["centerline", "lane_segment", "both"]
@@ -65,8 +65,9 @@ class OpenLaneV2Config:
         example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
         loading: workers; they change no example.
         map_changes: "drop" leaves out the logs whose streets differ from their map, see `openlane_frames.MAP_CHANGES`.
-        tracks: folder of the Argoverse 2 logs from which subset A was made; their boxes become the traffic flow, as
-            many frames and at the rate that `example.history` and `example.history_hz` say. None: no traffic flow.
+        tracks: folder of the Argoverse 2 logs from which subset A was made, or of nuScenes for B; their boxes become
+            the traffic flow, as many frames and at the rate that `example.history` and `example.history_hz` say. None:
+            no traffic flow.
         without_tracks: what becomes of frames whose log is not there, see `openlane_tracks.WithoutTracks`.
     """
 
@@ -144,7 +145,9 @@ class OpenLaneV2Dataset:
             traffic_elements=elements,
             previous_from_ego=relative_pose(self._pose(index - 1) if before else pose, pose).astype(np.float32),
             has_previous=np.asarray(before),
-            cameras=None if self.config.image is None else self._views(files[0]),
+            cameras=None
+            if self.config.image is None
+            else camera_views(files[0].cameras, self._fits, self.config.image),
         )
 
     def info(self, index: int) -> FrameInfo:
@@ -192,25 +195,6 @@ class OpenLaneV2Dataset:
         if not any(fits):
             raise UserError(f"{self.root}: no frame of {self.name} has a camera")
         return tuple(fits)
-
-    def _views(self, file: FrameFile) -> CameraViews:
-        assert self.config.image is not None
-        views = empty_views(self._fits, self.config.image)
-        for place, (camera, fit) in enumerate(zip(file.cameras, self._fits, strict=True)):
-            if camera is None or fit is None:
-                continue
-            image = read_image(camera.image)
-            if image.shape[1::-1] != fit.source:
-                raise UserError(
-                    f"{camera.image} is {image.shape[1]} x {image.shape[0]} pixels, the first image of {camera.name} "
-                    f"is {fit.source[0]} x {fit.source[1]}: restore the original file"
-                )
-            views.image[place, : fit.size[1], : fit.size[0]] = fit.image(image)
-            views.size[place] = fit.size
-            views.intrinsics[place] = fit.intrinsics(camera.intrinsics)
-            views.camera_from_ego[place] = invert_pose(camera.ego_from_camera)
-            views.valid[place] = True
-        return views
 
 
 def nominal_example(config: OpenLaneV2Config) -> Example:

@@ -54,6 +54,7 @@ class PreparedMap:
         segments, centerlines: its lanes in both flavours.
         chain_of: from segment id to the number of its merged lane in `centerlines`.
         crossings, boundaries: packed lines.
+        dividers: of the map's own record, global metres; None derives them from the sides of lanes.
         samples: dense points for the bird's-eye-view sensor.
     """
 
@@ -62,6 +63,7 @@ class PreparedMap:
     chain_of: dict[int, int]
     crossings: PackedLines
     boundaries: PackedLines
+    dividers: tuple[np.ndarray, ...] | None
     samples: MapSamples
 
     @cached_property
@@ -69,7 +71,7 @@ class PreparedMap:
         """The lines of the map, for `map_lines`; made when first asked for."""
         rings = (self.crossings.line(i) for i in range(len(self.crossings.ends)))
         return MapGeometry.of(
-            dividers=lane_dividers(self.segments.lanes),
+            dividers=lane_dividers(self.segments.lanes) if self.dividers is None else self.dividers,
             crossings=[[ring] for ring in rings],
             boundaries=[self.boundaries.line(i) for i in range(len(self.boundaries.ends))],
             centerlines=[lane.centerline for lane in self.centerlines.lanes],
@@ -104,5 +106,6 @@ def _prepare(vector_map: VectorMap, bike_lanes: bool) -> PreparedMap:
         chain_of={segment: number[chain] for segment, chain in merged.chain_of.items()},
         crossings=PackedLines.pack(vector_map.crossings),
         boundaries=PackedLines.pack(vector_map.road_boundaries),
+        dividers=vector_map.dividers,
         samples=sample_map(vector_map),
     )

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any, Union
 
-from tflane_jax.datasets import argoverse2, front_views, openlane_v2, procedural, tusimple
+from tflane_jax.datasets import (
+    argoverse2,
+    front_views,
+    nuscenes,
+    nuscenes_scenes,
+    openlane_v2,
+    procedural,
+    tusimple,
+)
 from tflane_jax.datasets.data_source import DataSource
 from tflane_jax.datasets.loading import TRAINING_PARTS
 from tflane_jax.errors import UserError
@@ -18,6 +26,8 @@ SOURCES: tuple[DataSource[Any], ...] = (
     procedural.STREET_SOURCE,
     argoverse2.SOURCE,
     openlane_v2.SOURCE,
+    nuscenes.SOURCE,
+    nuscenes_scenes.SOURCE,
     front_views.SOURCE,
     tusimple.SOURCE,
 )

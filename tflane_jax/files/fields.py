@@ -56,12 +56,14 @@ def items(record: Any, name: str, where: str) -> Sequence[Any]:
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """Return an array of finite numbers: float32 stays, every other type becomes float64.
+    """Return an array of finite numbers: float32 stays, every other type becomes float64. Text is no number.
 
     None in `shape` is any size. An empty list fits every shape in which some size is 0 or None.
     """
     try:
         array = np.asarray(value)
+        if array.dtype.kind in "SU":  # numpy would read "1.5" as a number
+            raise TypeError("text")
         array = array if array.dtype == np.float32 else array.astype(np.float64)
     except (TypeError, ValueError):
         raise UserError(f"{where} is {_kind(value)}, expected numbers of shape {_shape(shape)}") from None

@@ -67,6 +67,8 @@ class VectorMap:
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks of unlimited height.
         roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
+        dividers: painted dividers (n, 3) where the source records them on their own; None where the sides of its lanes
+            are all there is.
     """
 
     segments: dict[int, LaneSegment]
@@ -75,6 +77,7 @@ class VectorMap:
     elements: tuple[MapElement, ...] = ()
     buildings: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
     roads: tuple[np.ndarray, ...] = ()
+    dividers: tuple[np.ndarray, ...] | None = None
 
 
 @dataclass(frozen=True)

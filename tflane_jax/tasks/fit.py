@@ -69,8 +69,6 @@ def _check_lines(model: HostConfig, config: ExampleConfig, example: Example) -> 
 
 
 def _check_points(model: HostConfig, config: ExampleConfig) -> None:
-    if "lines" in model.predicts and "map_lines" in model.truth and config.map_lines is None:
-        raise UserError("this model learns the lines of a vector map: set data.example.map_lines")
     for name, points in model.example_points.items():
         if (found := attrgetter(name)(config)) != points:
             raise UserError(

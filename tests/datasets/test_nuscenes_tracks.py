@@ -1,0 +1,42 @@
+"""Tracks of nuScenes for frames of another data set, at its own times and poses."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.datasets.nuscenes_small import PITCH, write_nuscenes
+from tflane_jax.datasets.examples import traffic_flow
+from tflane_jax.datasets.nuscenes_log import level_poses
+from tflane_jax.datasets.nuscenes_tracks import SceneTracks
+from tflane_jax.errors import UserError
+from tflane_jax.scene.logs import KeyFrame
+
+
+def test_scenes_by_name_and_token_need_no_map(tmp_path):
+    write_nuscenes(tmp_path)
+    shutil.rmtree(tmp_path / "maps")
+    tracks = SceneTracks(tmp_path)
+    assert "scene-0061" in tracks
+    assert "scene-0001" not in tracks
+    log = tracks.log("scene-0061")
+    assert log is tracks.log("scene-a")
+    assert (log.map.segments, log.tracks.uuid.tolist()) == ({}, ["bus", "car", "walker"])
+    with pytest.raises(UserError, match="has no scene scene-0001"):
+        tracks.log("scene-0001")
+    assert SceneTracks(tmp_path, least_visibility="v60-80").log("scene-0061").tracks.occluded[2, 0]
+
+
+def test_a_frame_of_its_own_pose_gets_the_history(tmp_path):
+    """A frame 0.1 m and 10 ms beside sample 3, from a pose with pitch: the car 15 m before sample 3 was 10 m ahead."""
+    log = SceneTracks(write_nuscenes(tmp_path)).log("scene-0061")
+    pitched = np.array([[np.cos(PITCH), 0, np.sin(PITCH)], [0, 1, 0], [-np.sin(PITCH), 0, np.cos(PITCH)]])
+    pose = log.global_from_ego[3].copy()
+    pose[:3, :3] = pose[:3, :3] @ pitched
+    pose[:2, 3] += (0.0, 0.1)
+    moment = KeyFrame(int(log.timestamps_ns[3]) + 10_000_000, level_poses(pose[None])[0], 3)
+    flow, dropped = traffic_flow(replace(log, keyframes=(moment,)), 0, history=20, capacity=4)
+    assert dropped == 0
+    car = int(np.flatnonzero(flow.valid[:, 17])[0])
+    np.testing.assert_allclose(flow.position[car, 17], [-5.1, 3.0, 1.0], atol=1e-5)

@@ -1,0 +1,32 @@
+"""Drives that cannot be true."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.datasets.plausible import FAR, check_distance, check_motion, check_place
+from tflane_jax.errors import UserError
+
+TIMES = np.arange(3) * 500_000_000
+
+
+def test_speed():
+    check_motion(np.array([[0.0, 0.0], [34.0, 0.0], [68.0, 0.0]]), TIMES, "abc")  # 245 km/h
+    check_motion(np.zeros((1, 2)), TIMES[:1], "a")
+    with pytest.raises(UserError, match=r"c: the vehicle is 40 m from its place 0\.5 s before"):
+        check_motion(np.array([[0.0, 0.0], [0.0, 0.0], [40.0, 0.0]]), TIMES, "abc")
+
+
+def test_place():
+    path = np.array([[0.0, 0.0], [9.0, 0.0]])
+    lane = np.array([[0.0, FAR - 1.0, 0.0], [0.0, 2 * FAR, 0.0]])
+    check_place([lane + 1e6, lane], path, "x")
+    for lanes in ([], [lane + np.array([0.0, 2.0, 0.0])]):
+        with pytest.raises(UserError, match="x: the vehicle never comes within 200 m of a lane"):
+            check_place(lanes, path, "x")
+
+
+def test_distance():
+    check_distance(np.array([[499.0, 0.0, 0.0]]), "a")
+    check_distance(np.zeros((0, 3)), "")
+    with pytest.raises(UserError, match="b: the box is 600 m from the vehicle"):
+        check_distance(np.array([[1.0, 0.0, 0.0], [0.0, -600.0, 0.0]]), "ab")

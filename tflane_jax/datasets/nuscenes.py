@@ -1,0 +1,299 @@
+"""nuScenes without its devkit, as a dataset of lane graphs with traffic flow: tables, map expansion, images.
+
+<root>/v1.0-trainval/*.json          the thirteen tables (or v1.0-mini, ...)
+<root>/maps/expansion/<city>.json    map expansion, version 1.3
+<root>/samples/CAM_*/*.jpg           images of the key frames; read if `NuScenesConfig.image` is given
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.loading import load_or_stream, stream
+from tflane_jax.datasets.nuscenes_cameras import camera_fits, missing_images, sample_cameras
+from tflane_jax.datasets.nuscenes_log import (
+    ReferenceFrame,
+    SceneFrames,
+    Visibility,
+    scene_frames,
+    scene_log,
+    scene_tracks,
+)
+from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
+from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
+from tflane_jax.datasets.nuscenes_splits import split_scenes
+from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
+from tflane_jax.datasets.openlane_example import camera_views
+from tflane_jax.datasets.photometric import PhotometricConfig
+from tflane_jax.datasets.plausible import FAR, check_place
+from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Example
+from tflane_jax.scene.logs import Log
+
+# Metres of map beyond the corners of the perception range, so that chains of lanes are merged as on the whole map.
+_BEYOND = 60.0
+
+
+@dataclass(frozen=True)
+class NuScenesConfig:
+    """Which scenes, and how their key frames become examples.
+
+    Attributes:
+        root: folder of the data set.
+        split: official split by scene name; the official test split has no annotations.
+        version: folder of the tables, such as "v1.0-mini"; None finds it, see `nuscenes_tables.find_tables`.
+        splits: JSON file {split: [scene names]} in place of the official splits.
+        frame: origin of the examples: the vehicle's rear axle, or the lidar, as in MapTR (see
+            `nuscenes_log.level_poses`). x is forward and y left in both.
+        least_visibility: boxes of a lower level of visibility are `TrafficFlow.occluded`, as are those without lidar
+            and radar points.
+        image: scaling and cropping of the camera images; None does not read them.
+        example: what is in an example, and its capacities. `example.cameras` must be None: cameras are real here.
+        loading: workers that read images; they change no example.
+    """
+
+    root: Path
+    split: Split = "train"
+    version: str | None = None
+    splits: Path | None = None
+    frame: ReferenceFrame = "ego"
+    least_visibility: Visibility = "v0-40"
+    image: ImageConfig | None = None
+    example: ExampleConfig = NUSCENES_SIZES
+    loading: StreamingConfig = StreamingConfig()
+
+
+class NuScenesDataset:
+    """Key frames of one split, sorted by scene, then time.
+
+    Logs and maps are made when they are first asked for, and kept. Raises UserError for tables that are missing or
+    damaged and for a split without scenes.
+    """
+
+    def __init__(self, config: NuScenesConfig):
+        self.config = config
+        self.name = f"nuscenes-{config.split}"
+        if config.example.cameras is not None:
+            raise UserError("nuScenes has real cameras: set example.cameras=None and give `image`")
+        self.tables = read_tables(find_tables(config.root, config.version))
+        scenes = self.tables.scenes()
+        names = split_scenes(scenes, config.split, mini=self.tables.mini, file=config.splits)
+        self.scenes = {name: scenes[name] for name in names}
+        self._places = [(name, i) for name in names for i in range(len(self.tables.samples(scenes[name])))]
+        self._frames: dict[str, SceneFrames] = {}
+        self._logs: dict[str, Log] = {}
+        self._maps: dict[str, MapExpansion] = {}
+        self._lock = threading.Lock()
+
+    def __getstate__(self):
+        return self.__dict__ | {"_lock": None}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state | {"_lock": threading.Lock()})
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def example(self, index: int) -> Example:
+        """Return one key frame."""
+        config, (name, number) = self.config, self._place(index)
+        example = make_example(self.log(name), number, config.example)
+        if config.image is None:
+            return example
+        frames = self.frames(name)
+        cameras = sample_cameras(
+            self.tables,
+            frames.samples[number],
+            frames.global_from_ego[number],
+            frames.frame_from_ego[number] if config.frame == "lidar" else None,
+        )
+        return replace(example, cameras=camera_views(cameras, self._fits, config.image))
+
+    def info(self, index: int) -> FrameInfo:
+        """Return scene, time and (level) pose of one key frame."""
+        name, number = self._place(index)
+        frames = self.frames(name)
+        return FrameInfo("nuscenes", name, int(frames.timestamps_ns[number]), frames.global_from_frame[number])
+
+    def log(self, name: str) -> Log:
+        """Return a scene as a log with the part of the city's map around it."""
+        with self._lock:
+            if name not in self._logs:
+                frames = self._scene_frames(name)
+                location, scene = self.tables.location(self.scenes[name]), self.scenes[name]
+                if location not in self._maps:
+                    self._maps[location] = read_expansion(map_path(self.tables, location))
+                area = self._maps[location].around(frames.global_from_frame[:, :2, 3], _reach(self.config.example))
+                log = scene_log(self.tables, scene, frames, area, least_visibility=self.config.least_visibility)
+                prepare_map(log.map, bike_lanes=self.config.example.bike_lanes == "include")
+                self._logs[name] = log
+            return self._logs[name]
+
+    def frames(self, name: str) -> SceneFrames:
+        """Return moments and poses of a scene."""
+        with self._lock:
+            return self._scene_frames(name)
+
+    def _scene_frames(self, name: str) -> SceneFrames:
+        if name not in self._frames:
+            self._frames[name] = scene_frames(self.tables, self.scenes[name], self.config.frame)
+        return self._frames[name]
+
+    @cached_property
+    def _fits(self) -> tuple[ImageFit | None, ...]:
+        assert self.config.image is not None
+        return camera_fits(self.tables, self.config.image)
+
+    def _place(self, index: int) -> tuple[str, int]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
+        return self._places[index]
+
+
+def map_path(tables: Tables, location: str) -> Path:
+    """Return the map expansion's file of a city."""
+    return tables.root / "maps" / "expansion" / f"{location}.json"
+
+
+def _reach(config: ExampleConfig) -> float:
+    ranges = (config.range, config.ground)
+    return max(float(np.hypot(np.abs(r.x).max(), np.abs(r.y).max())) for r in ranges) + _BEYOND
+
+
+@dataclass(frozen=True)
+class NuScenesData:
+    """nuScenes, read from disk while training.
+
+    Attributes:
+        root: folder of the data set.
+        train, val, test: which official split serves as each; the official test split has no annotations.
+        version, splits, frame, least_visibility, image, example, loading: see `NuScenesConfig`.
+        augmentation: of the colours of training images, or None.
+    """
+
+    root: Path
+    train: Split = "train"
+    val: Split = "val"
+    test: Split = "val"
+    version: str | None = None
+    splits: Path | None = None
+    frame: ReferenceFrame = "ego"
+    least_visibility: Visibility = "v0-40"
+    image: ImageConfig | None = None
+    example: ExampleConfig = NUSCENES_SIZES
+    loading: StreamingConfig = StreamingConfig()
+    augmentation: PhotometricConfig | None = None
+
+    def source(self, split: Split) -> NuScenesConfig:
+        """Return the dataset of a split."""
+        return NuScenesConfig(
+            root=self.root,
+            split=getattr(self, split),
+            version=self.version,
+            splits=self.splits,
+            frame=self.frame,
+            least_visibility=self.least_visibility,
+            image=self.image,
+            example=self.example,
+            loading=self.loading,
+        )
+
+
+def check_nuscenes(root: Path) -> FolderCheck:
+    """Read every table, every scene and the map of every city; images are only looked for.
+
+    Raises UserError where there are no tables or they cannot be joined.
+    """
+    tables = read_tables(find_tables(root))
+    faults: list[str] = []
+    maps: dict[str, MapExpansion | None] = {}
+    counts: dict[str, Counter[str]] = {}
+    for name, scene in sorted(tables.scenes().items()):
+        location = tables.location(scene)
+        if location not in maps:
+            maps[location] = _checked_map(map_path(tables, location), faults)
+        count = counts.setdefault(location, Counter())
+        count["scenes"] += 1
+        try:
+            frames = scene_frames(tables, scene)
+            tracks = scene_tracks(tables, frames)
+            _check_scene_place(maps[location], frames, f"{name} on the map of {location}")
+        except UserError as error:
+            faults.append(f"{name}: {error}")
+            continue
+        absent = missing_images(tables, frames.samples)
+        if absent:
+            faults.append(f"{name}: {len(absent)} images are missing (first {absent[0]})")
+        count.update({"key frames": tracks.frames, "road users": len(tracks.uuid)})
+        count.update({"boxes": int(tracks.valid.sum()), "missing images": len(absent)})
+    rows = [_row(location, counts[location], maps[location]) for location in counts]
+    return FolderCheck(f"nuScenes, {tables.folder.name}", rows, faults)
+
+
+def _checked_map(path: Path, faults: list[str]) -> MapExpansion | None:
+    try:
+        return read_expansion(path)
+    except UserError as error:
+        faults.append(str(error))
+        return None
+
+
+def _check_scene_place(expansion: MapExpansion | None, frames: SceneFrames, where: str) -> None:
+    if expansion is not None:
+        path = frames.global_from_frame[:, :2, 3]
+        check_place([lane.centerline for lane in expansion.lanes_near(path, FAR).values()], path, where)
+
+
+def _row(location: str, count: Counter[str], expansion: MapExpansion | None) -> dict[str, int | str]:
+    names = ("scenes", "key frames", "road users", "boxes", "missing images")
+    found: dict[str, int | str] = {"location": location, **{name: count[name] for name in names}}
+    if expansion is None:
+        return found | dict.fromkeys(("lanes", "without arcline", "dividers", "crossings"), 0)
+    found |= {"lanes": len(expansion.lanes), "without arcline": len(expansion.without_line)}
+    return found | {"dividers": len(expansion.dividers), "crossings": len(expansion.crossings)}
+
+
+def _choose(choice: Choice) -> NuScenesConfig:
+    assert choice.root is not None
+    if isinstance(choice.configured, NuScenesConfig):  # its splits stay as configured: the official test has no truth
+        return replace(choice.configured, root=choice.root)
+    example = choice.configured.example
+    image = getattr(choice.configured, "image", None)
+    if image is None and example.cameras is not None:
+        image = TOPONET_SUBSET_B
+    # Sizes stay as configured; rendered cameras give way to the real ones.
+    split = choice.split if choice.split_given or choice.split != "test" else "val"
+    return NuScenesConfig(choice.root, split, image=image, example=replace(example, cameras=None))
+
+
+def _load(dataset: NuScenesDataset, progress: bool, parts: Collection[str]) -> Example | Streamed:
+    if dataset.config.image is not None:
+        return stream(dataset, dataset.config.loading, parts)
+    return load_or_stream(dataset, progress, parts)
+
+
+SOURCE = DataSource(
+    name="nuscenes",
+    data=NuScenesData,
+    config=NuScenesConfig,
+    example=Example,
+    dataset=NuScenesDataset,
+    load=_load,
+    choose=_choose,
+    title=lambda config: f"nuscenes-{config.split}",
+    root="its folder",
+    check=check_nuscenes,
+)

@@ -1,0 +1,241 @@
+"""A scene of nuScenes as a `Log`: key frames at 2 Hz, poses, and the boxes of each instance as a track.
+
+nuScenes has no heights: the z of every ego pose is 0, also uphill. Boxes are therefore taken into the vehicle's frame
+of their own moment with its whole pose, but moved from frame to frame, like the flat map, in the plane: the poses of
+the log are level (x, y and yaw).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tflane_jax.datasets.nuscenes_tables import Row, Tables, poses_of, vectors
+from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.scene import RoadUser
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
+
+CATEGORIES: Mapping[str, RoadUser | None] = {
+    "vehicle.car": RoadUser.CAR,
+    "vehicle.emergency.police": RoadUser.CAR,
+    "vehicle.emergency.ambulance": RoadUser.TRUCK,
+    "vehicle.truck": RoadUser.TRUCK,
+    "vehicle.trailer": RoadUser.TRUCK,
+    "vehicle.construction": RoadUser.TRUCK,
+    "vehicle.bus": RoadUser.BUS,
+    "vehicle.motorcycle": RoadUser.MOTORCYCLE,
+    "vehicle.bicycle": RoadUser.BICYCLE,
+    "vehicle.ego": None,
+    "human.pedestrian": RoadUser.PEDESTRIAN,
+    "movable_object": None,
+    "static_object": None,
+    "static": None,
+    "flat": None,
+    "animal": None,
+    "noise": None,
+}
+"""Road user of each category and of those below it; None is no traffic: barriers, cones and racks have tracks too."""
+
+ReferenceFrame = Literal["ego", "lidar"]
+"""Origin and heading of the frame of all examples, x forward, y left: the vehicle's, or MapTR's, see `level_poses`."""
+Visibility = Literal["v0-40", "v40-60", "v60-80", "v80-100"]
+VISIBILITY: tuple[Visibility, ...] = ("v0-40", "v40-60", "v60-80", "v80-100")
+"""Levels of the table `visibility`: percent of an object that the six cameras see together."""
+
+
+@dataclass(frozen=True)
+class SceneFrames:
+    """Moments and poses of the key frames of a scene.
+
+    Attributes:
+        samples: F rows.
+        timestamps_ns: (F,) of the samples.
+        global_from_ego: (F, 4, 4) at the moment of the lidar, with pitch and roll.
+        global_from_frame: (F, 4, 4) level poses of the frame in which examples are made.
+    """
+
+    samples: tuple[Row, ...]
+    timestamps_ns: Int[np.ndarray, " f"]
+    global_from_ego: Float[np.ndarray, "f 4 4"]
+    global_from_frame: Float[np.ndarray, "f 4 4"]
+
+    @property
+    def frame_from_ego(self) -> Float[np.ndarray, "f 4 4"]:
+        """Pose of the vehicle in the frame of examples, in the vehicle's own plane; the identity for frame "ego"."""
+        return relative_pose(self.global_from_frame, level_poses(self.global_from_ego))
+
+
+def level_poses(
+    global_from_ego: Float[np.ndarray, "f 4 4"], ego_from_lidar: Float[np.ndarray, "f 4 4"] | None = None
+) -> Float[np.ndarray, "f 4 4"]:
+    """Return x, y and yaw of the vehicle, or of MapTR's patch, as poses on the ground, x forward, y left.
+
+    MapTR cuts its ground truth around the lidar, about 0.94 m ahead of the rear axle, and calls x right and y forward:
+    a point of that frame is (-y, x) of this one.
+
+    Args:
+        global_from_ego: poses of the vehicle.
+        ego_from_lidar: calibration of the lidar, for MapTR's frame.
+    """
+    if ego_from_lidar is None:
+        return yaw_pose(global_from_ego[:, 0, 3], global_from_ego[:, 1, 3], pose_yaw(global_from_ego))
+    lidar = global_from_ego @ ego_from_lidar
+    return yaw_pose(lidar[:, 0, 3], lidar[:, 1, 3], pose_yaw(lidar) + np.pi / 2)
+
+
+def scene_frames(tables: Tables, scene: Row, frame: ReferenceFrame = "ego") -> SceneFrames:
+    """Return the key frames of a scene.
+
+    Raises:
+        UserError: the chain of samples is broken, the vehicle jumps, or a sample has no lidar frame or no proper pose.
+    """
+    samples = tables.samples(scene)
+    ego = np.stack([tables.ego_pose(sample) for sample in samples])
+    times = np.array([sample["timestamp"] for sample in samples], np.int64) * 1000
+    check_motion(ego[:, :2, 3], times, [tables.where("sample", sample["token"]) for sample in samples])
+    lidar = np.stack([tables.calibration(sample) for sample in samples]) if frame == "lidar" else None
+    return SceneFrames(
+        samples=tuple(samples),
+        timestamps_ns=times,
+        global_from_ego=ego,
+        global_from_frame=level_poses(ego, lidar),
+    )
+
+
+def scene_log(
+    tables: Tables,
+    scene: Row,
+    frames: SceneFrames,
+    vector_map: VectorMap | None,
+    *,
+    categories: Mapping[str, RoadUser | None] = CATEGORIES,
+    least_visibility: Visibility = "v0-40",
+) -> Log:
+    """Return a scene as a log.
+
+    Args:
+        tables, scene, frames: see `scene_frames`.
+        vector_map: around the scene, global metres; None leaves it empty.
+        categories: road user of each category, None to leave it out, see `road_user`.
+        least_visibility: boxes of a lower level count as occluded, as those without lidar and radar points always do.
+
+    Raises:
+        UserError: a box is malformed, far from the vehicle, has an unknown category, or is a second one of its instance
+            in a sample; or the vehicle never comes near a lane of the map.
+    """
+    if vector_map is not None:
+        lanes = [lane.centerline for lane in vector_map.segments.values()]
+        where = f"{scene['name']} on the map of {tables.location(scene)}"
+        check_place(lanes, frames.global_from_frame[:, :2, 3], where)
+    tracks = scene_tracks(tables, frames, categories, least_visibility)
+    return Log(
+        name=scene["name"],
+        source="nuscenes",
+        map=VectorMap({}) if vector_map is None else vector_map,
+        timestamps_ns=frames.timestamps_ns,
+        global_from_ego=frames.global_from_frame,
+        tracks=tracks,
+        actors=tracks,
+        keyframes=tuple(
+            KeyFrame(int(time), pose, number)
+            for number, (time, pose) in enumerate(zip(frames.timestamps_ns, frames.global_from_frame, strict=True))
+        ),
+        seed=zlib.crc32(scene["name"].encode()),
+    )
+
+
+def scene_tracks(
+    tables: Tables,
+    frames: SceneFrames,
+    categories: Mapping[str, RoadUser | None] = CATEGORIES,
+    least_visibility: Visibility = "v0-40",
+) -> Tracks:
+    """Return the boxes of a scene: a track for each instance token, without a box where a sample has none of it."""
+    found = [
+        (number, row)
+        for number, sample in enumerate(frames.samples)
+        for row in tables.annotations.get(sample["token"], ())
+        if _category(tables, row, categories) is not None
+    ]
+    rows = [row for _, row in found]
+    where = [tables.where("sample_annotation", row["token"]) for row in rows]
+    pose, size = poses_of(rows, where), vectors(rows, "size", 3, where)
+    if (size <= 0.0).any():
+        bad = int((size <= 0.0).any(-1).argmax())
+        raise UserError(f"{where[bad]}: size {size[bad].tolist()} is not positive")
+    instance, first, k = np.unique([row["instance_token"] for row in rows], return_index=True, return_inverse=True)
+    f, shape = np.array([number for number, _ in found], int), (len(frames.samples), len(instance))
+    _check_once(f, k, rows, where)
+    tracks = empty_tracks(*shape, uuid=instance.astype(str))
+    tracks.size[:] = size[first][:, [1, 0, 2]]  # the table has width, length, height
+    tracks.category[:] = [_category(tables, rows[i], categories) for i in first]
+    global_from_ego, frame_from_ego = frames.global_from_ego[f], frames.frame_from_ego[f]
+    ego_centre = transform_points(invert_pose(global_from_ego), pose[:, None, :3, 3])
+    check_distance(ego_centre[:, 0], where)
+    tracks.position[f, k] = transform_points(frame_from_ego, ego_centre)[:, 0]
+    yaw = pose_yaw(pose) - pose_yaw(global_from_ego) + pose_yaw(frame_from_ego)
+    tracks.yaw[f, k] = (yaw + np.pi) % (2 * np.pi) - np.pi
+    tracks.occluded[f, k] = _unseen(tables, rows, where, least_visibility)
+    tracks.valid[f, k] = True
+    return tracks
+
+
+def empty_tracks(frames: int, count: int, uuid: np.ndarray) -> Tracks:
+    """Return tracks without a box."""
+    flag = np.zeros((frames, count), bool)
+    return Tracks(
+        position=np.zeros((frames, count, 3)),
+        yaw=np.zeros((frames, count)),
+        size=np.zeros((count, 3)),
+        category=np.zeros(count, np.int32),
+        occluded=flag,
+        valid=flag.copy(),
+        uuid=uuid,
+    )
+
+
+def road_user(category: str, where: str, categories: Mapping[str, RoadUser | None] = CATEGORIES) -> RoadUser | None:
+    """Return the road user of a category such as "vehicle.bus.bendy", by the longest entry that it starts with.
+
+    Raises UserError, which names the place, for a category that no entry covers.
+    """
+    parts = category.split(".")
+    for length in range(len(parts), 0, -1):
+        if (name := ".".join(parts[:length])) in categories:
+            return categories[name]
+    raise UserError(f"{where}: unknown category {category!r}: add it to `categories` with its road user")
+
+
+def _category(tables: Tables, annotation: Row, categories: Mapping[str, RoadUser | None]) -> RoadUser | None:
+    token = tables.rows["instance"][annotation["instance_token"]]["category_token"]
+    return road_user(tables.rows["category"][token]["name"], tables.where("category", token), categories)
+
+
+def _check_once(f: np.ndarray, k: np.ndarray, rows: Sequence[Row], where: Sequence[str]) -> None:
+    """Raise UserError where an instance has two boxes in a sample."""
+    _, first, count = np.unique(np.stack([f, k]), axis=1, return_index=True, return_counts=True)
+    if (count > 1).any():
+        row = int(first[count.argmax()])
+        raise UserError(
+            f"{where[row]}: instance {rows[row]['instance_token']} has {count.max()} boxes in sample "
+            f"{rows[row]['sample_token']}"
+        )
+
+
+def _unseen(tables: Tables, rows: Sequence[Row], where: Sequence[str], least: Visibility) -> Bool[np.ndarray, " n"]:
+    """Return which boxes the sensors did not see: no points, or a known visibility below the least one."""
+    points = np.array([row["num_lidar_pts"] + row["num_radar_pts"] for row in rows], int)
+    known = tables.rows["visibility"]
+    levels = [known[row["visibility_token"]]["level"] if row["visibility_token"] else "" for row in rows]
+    rank = {"": len(VISIBILITY), **{level: number for number, level in enumerate(VISIBILITY)}}
+    for level, place in zip(levels, where, strict=True):
+        if level not in rank:
+            raise UserError(f"{place}: unknown visibility level {level!r}, expected one of {', '.join(VISIBILITY)}")
+    return (points == 0) | (np.array([rank[level] for level in levels], int) < VISIBILITY.index(least))

@@ -1,0 +1,126 @@
+"""Scene files of nuScenes (`nuscenes_scene_files`) as a dataset of lane graphs with traffic flow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file
+from tflane_jax.datasets.nuscenes_splits import official_split
+from tflane_jax.errors import UserError
+from tflane_jax.scene import Example
+
+NUSCENES_SIZES = ExampleConfig(lanes=64, segments=96, areas=32, tracks=160)
+"""Capacities of an example; the most in seven scenes were 40 centerlines, 61 segments, 10 areas and 103 road users."""
+
+
+@dataclass(frozen=True)
+class SceneFileConfig:
+    """Which scenes, and how their key frames become examples.
+
+    Attributes:
+        root: a scene file, or a folder of them.
+        scenes: names of the files without .npz; empty takes all.
+        example: what is in an example, and its capacities.
+    """
+
+    root: Path
+    scenes: tuple[str, ...] = ()
+    example: ExampleConfig = NUSCENES_SIZES
+
+
+class SceneFileDataset:
+    """Key frames of scene files, sorted by file name, then time.
+
+    Raises UserError where there is no file, one cannot be read, or a named scene is missing.
+    """
+
+    name = "nuscenes-scenes"
+
+    def __init__(self, config: SceneFileConfig):
+        self.config = config
+        files = {path.stem: path for path in find_scene_files(config.root)}
+        if missing := set(config.scenes) - set(files):
+            raise UserError(f"{config.root} has no scene {min(missing)}, only {', '.join(files)}")
+        self.logs = tuple(read_scene_file(path) for name, path in files.items() if name in (config.scenes or files))
+        self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def example(self, index: int) -> Example:
+        """Return one example."""
+        log, number = self._frames[index]
+        return make_example(log, number, self.config.example)
+
+    def info(self, index: int) -> FrameInfo:
+        """Return scene, time (from the scene's start) and pose of one example."""
+        log, number = self._frames[index]
+        moment = log.keyframes[number]
+        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego)
+
+
+@dataclass(frozen=True)
+class SceneFileData:
+    """Scene files for training, validation and test.
+
+    Attributes:
+        root: folder of the files.
+        train, val, test: names of the scenes of each.
+        example: what is in an example, and its capacities.
+    """
+
+    root: Path
+    train: tuple[str, ...]
+    val: tuple[str, ...]
+    test: tuple[str, ...]
+    example: ExampleConfig = NUSCENES_SIZES
+
+    def source(self, split: Split) -> SceneFileConfig:
+        """Return the dataset of a split."""
+        return SceneFileConfig(self.root, getattr(self, split), self.example)
+
+
+def check_scene_files(root: Path) -> FolderCheck:
+    """Read every scene file of a folder and count what is in it; raise UserError where there is none."""
+    rows, faults = [], []
+    for path in find_scene_files(root):
+        row = {"scene": path.stem, "key frames": 0, "road users": 0, "lanes": 0, "dividers": 0, "boundaries": 0}
+        try:
+            log = read_scene_file(path)
+        except UserError as error:
+            faults.append(str(error))
+        else:
+            row |= {"key frames": log.tracks.frames, "road users": len(log.tracks.uuid)}
+            row |= {"lanes": len(log.map.segments), "dividers": len(log.map.dividers or ())}
+            row["boundaries"] = len(log.map.road_boundaries)
+        rows.append(row)
+    return FolderCheck("nuScenes scene files", rows, faults)
+
+
+def _choose(choice: Choice) -> SceneFileConfig:
+    assert choice.root is not None
+    example = replace(choice.configured.example, cameras=None)
+    if not choice.split_given:
+        return SceneFileConfig(choice.root, example=example)
+    names = [path.stem for path in find_scene_files(choice.root)]
+    chosen = tuple(name for name in names if official_split(name, mini=False) == choice.split)
+    if not chosen:
+        raise UserError(f"{choice.root} has no scene of nuScenes' split {choice.split}: leave --split out to take all")
+    return SceneFileConfig(choice.root, chosen, example)
+
+
+SOURCE = DataSource(
+    name="nuscenes-scenes",
+    data=SceneFileData,
+    config=SceneFileConfig,
+    example=Example,
+    dataset=SceneFileDataset,
+    choose=_choose,
+    title=lambda config: "nuscenes-scenes",
+    root="a scene file (npz) or a folder of them",
+    check=check_scene_files,
+)

@@ -1,0 +1,46 @@
+"""Tracks of nuScenes scenes without their maps: the source logs of OpenLane-V2's subset B (TF-Lane, section 3.2)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tflane_jax.datasets.nuscenes_log import Visibility, scene_frames, scene_log
+from tflane_jax.datasets.nuscenes_tables import find_tables, read_tables
+from tflane_jax.errors import UserError
+from tflane_jax.scene.logs import Log
+
+
+class SceneTracks:
+    """Scenes by name or token, read when they are needed and kept.
+
+    A log's poses are level (`nuscenes_log`): a frame of another data set must have its pose levelled with `level_poses`
+    before its traffic flow is taken from here.
+
+    Args:
+        root, version: see `nuscenes_tables.find_tables`.
+        least_visibility: see `nuscenes_log.scene_log`.
+
+    Raises UserError for tables that are missing or damaged.
+    """
+
+    def __init__(self, root: Path, version: str | None = None, least_visibility: Visibility = "v0-40"):
+        self.tables = read_tables(find_tables(root, version))
+        scenes = self.tables.scenes()
+        self._scenes = {**{scene["token"]: scene for scene in scenes.values()}, **scenes}
+        self._least_visibility: Visibility = least_visibility
+        self._logs: dict[str, Log] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._scenes
+
+    def log(self, name: str) -> Log:
+        """Return a scene with an empty map; raises UserError for one that is damaged or not in the tables."""
+        if name not in self._scenes:
+            raise UserError(f"{self.tables.folder} has no scene {name}")
+        scene = self._scenes[name]
+        if scene["name"] not in self._logs:
+            frames = scene_frames(self.tables, scene)
+            self._logs[scene["name"]] = scene_log(
+                self.tables, scene, frames, None, least_visibility=self._least_visibility
+            )
+        return self._logs[scene["name"]]

@@ -1,0 +1,51 @@
+"""What cannot be true of a drive: a vehicle that jumps, a map of another place, a box that nobody can have seen.
+
+Such files would give examples without lanes or with senseless traffic, and no error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from tflane_jax.errors import UserError
+
+# Metres per second, and metres.
+_FASTEST, _JITTER = 70.0, 0.5
+FAR = 200.0
+"""Metres from a vehicle to the nearest lane. Parking lots are not on the map; another city is farther."""
+# Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
+_UNSEEN = 500.0
+
+
+def check_motion(position: Float[np.ndarray, "f 2"], times_ns: Int[np.ndarray, " f"], where: Sequence[str]) -> None:
+    """Raise UserError, which names the place, where a vehicle jumps from one key frame to the next."""
+    metres, seconds = np.linalg.norm(np.diff(position, axis=0), axis=-1), np.diff(times_ns) / 1e9
+    if (jumps := metres > _FASTEST * seconds + _JITTER).any():
+        i = int(jumps.argmax())
+        raise UserError(f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before")
+
+
+def check_place(lanes: Sequence[Float[np.ndarray, "_ d"]], position: Float[np.ndarray, "f 2"], where: str) -> None:
+    """Raise UserError if a vehicle never comes near a lane: the map is empty, or of another place.
+
+    Args:
+        lanes: centerlines, at least those within `FAR` of the vehicle.
+        position: of the vehicle.
+        where: what is checked, for the message.
+    """
+    apart = [float(np.linalg.norm(position[:, None] - line[:, :2], axis=-1).min()) for line in lanes]
+    if min(apart, default=np.inf) > FAR:
+        raise UserError(
+            f"{where}: the vehicle never comes within {FAR:.0f} m of a lane: the map is empty or of another place"
+        )
+
+
+def check_distance(position: Float[np.ndarray, "n 3"], where: Sequence[str]) -> None:
+    """Raise UserError, which names the place, for a box (vehicle's frame) that its sensors cannot have seen."""
+    metres = np.linalg.norm(position[:, :2], axis=-1)
+    if (metres > _UNSEEN).any():
+        i = int(metres.argmax())
+        raise UserError(f"{where[i]}: the box is {metres[i]:.0f} m from the vehicle: box or pose is wrong")

@@ -50,6 +50,8 @@ CLAIMS = {
     "modules/maptr_head_*": "tests/models/test_maptr_golden.py",
     "modules/maptr_losses*": "tests/losses/test_maptr.py",
     "modules/maptrv2_gt_permutations*": "tests/geometry/test_line_orders.py",
+    "modules/maptrv2_head_*": "tests/models/test_maptrv2_golden.py",
+    "modules/maptrv2_lss_transform*": "tests/models/test_lift.py",
     "modules/mha_*": "tests/layers/test_attention_golden.py",
     "modules/mmdet_losses*": "tests/losses/test_costs.py",
     "modules/mmdet_match_costs*": "tests/losses/test_costs.py",

@@ -19,8 +19,10 @@ from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.toponet import TopoNetConfig
 
 ENCODER = CameraEncoderConfig(
@@ -86,6 +88,28 @@ def maptr_checkpoint(head):
     return state | {levels: np.concatenate([state[levels], np.zeros((3, 16), np.float32)])}
 
 
+def maptrv2_checkpoint():
+    """Return MapTRv2's tensors; those of the lift are ones, of the fixture's shapes with the head's 16 channels."""
+    state = {name: value for name, value in checkpoint("maptrv2_head_train").items() if "bev_constructor" not in name}
+    state = {name: value for name, value in state.items() if name.startswith("pts_bbox_head.")} | {
+        name: value for name, value in maptr_checkpoint("maptr_head_gkt").items() if name.startswith("img_")
+    }
+    for name, value in fixture("maptrv2_lss_transform", "pts_bbox_head.transformer.encoder.").items():
+        shape = tuple(16 if size == 8 else size for size in value.shape)
+        # The first axis of the last layer of the depth network is that of the bins.
+        shape = (8, *shape[1:]) if ".depth_conv.4." in name else shape
+        state[name] = np.ones(shape, np.float32)
+    return state
+
+
+def maptrv2():
+    lift = LiftConfig(BevGrid(rows=6, columns=4), dim=16, cameras=3, depth=(1.0, 9.0, 1.0), pyramid=6)
+    images = dataclasses.replace(ENCODER.images, stages=(3,), pyramid=FeaturePyramidConfig(16, 1))
+    decoder = LineDecoderConfig(dim=16, heads=4, layers=2, queries=4, points=5, hidden=24)
+    encoder = CameraEncoderConfig(images, lift, line_masks=True)
+    return MapTrV2Config(encoder=encoder, decoder=decoder, many=6, line_mask=True)
+
+
 def maptr(attention):
     bev = BevFormerConfig(
         BevGrid(rows=6, columns=4), dim=16, heads=4, layers=1, hidden=24, levels=1, cameras=3, attention=attention
@@ -100,6 +124,7 @@ CASES = {
     "baseline": (BASELINE, lambda: checkpoint("olv2_lc_head", ("lclc_head", "lcte_head"))),
     "lanesegnet": (LANESEGNET, lanesegnet_checkpoint),
     "maptr": (maptr("kernel"), lambda: maptr_checkpoint("maptr_head_gkt")),
+    "maptrv2": (maptrv2(), maptrv2_checkpoint),
     "maptr, bevformer": (maptr("deformable"), lambda: maptr_checkpoint("maptr_head_bevformer")),
 }
 
@@ -113,12 +138,21 @@ def test_every_tensor_of_a_detector_has_its_place(name, tmp_path):
     _, table = load_host(path, model)
     assert [row["tensor"] for row in table] == [f"module.{key}" for key in state]
     leaves = [leaf for row in table for leaf in row["becomes"].split(", ")]
-    unused = [leaf for leaf in leaves if "not needed" in leaf or leaf.startswith("a ")]
-    assert unused == ["a constant of the loss", "not needed"]
-    assert len(set(leaves)) == len(leaves)
-    partly = [row["tensor"] for row in table if "unused" in row["becomes"]]
-    four_levels = name.startswith("maptr")
-    assert partly == (["module.pts_bbox_head.transformer.level_embeds"] if four_levels else [])
+    unused = [leaf for leaf in leaves if "not needed" in leaf or leaf.startswith("a ") or leaf.startswith("unused")]
+    assert unused[-2:] == ["a constant of the loss", "not needed"] or name == "maptrv2"
+    placed = [leaf for leaf in leaves if leaf not in unused]
+    assert len(set(placed)) == len(placed)
+    left_out = [row["tensor"].removeprefix("module.pts_bbox_head.") for row in table if "unused" in row["becomes"]]
+    if name == "maptrv2":
+        assert {tensor.split(".")[0] for tensor in left_out} == {
+            "positional_encoding",
+            "transformer",
+            "loss_seg",
+            "loss_pv_seg",
+        }
+        assert {"transformer.encoder.dx", "transformer.cams_embeds"} <= set(left_out)
+    else:
+        assert left_out == (["transformer.level_embeds"] if name.startswith("maptr") else [])
 
     incomplete = dict(state)
     del incomplete["pts_bbox_head.cls_branches.1.6.bias"]

@@ -57,12 +57,12 @@ def encoder_inputs(case):
 
 
 def decoder_config(case):
-    sizes = options(case, "dim", "heads", "layers", "hidden", "num_vec", "points", "classes")
+    sizes = options(case, "dim", "heads", "layers", "hidden", "points", "classes", num_vec=None, one2one=None)
     return LineDecoderConfig(
         dim=sizes.dim,
         heads=sizes.heads,
         layers=sizes.layers,
-        queries=sizes.num_vec,
+        queries=sizes.num_vec or sizes.one2one,
         points=sizes.points,
         classes=sizes.classes,
         hidden=sizes.hidden,

@@ -8,12 +8,22 @@ import jax
 import numpy as np
 import pytest
 
-from tests.models.cases import BASELINE, SEGMENTS, SMALL_SEGMENTS, WITH_TRAFFIC, make_segment_example
+from tests.models.cases import (
+    BASELINE,
+    LINES,
+    SEGMENTS,
+    SMALL_LINES,
+    SMALL_SEGMENTS,
+    WITH_TRAFFIC,
+    make_line_example,
+)
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import TrafficFlow
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -30,18 +40,20 @@ MODELS = {
     "fixed": dataclasses.replace(WITH_TRAFFIC, decoder=dataclasses.replace(WITH_TRAFFIC.decoder, refine="fixed")),
     "segments": SEGMENTS,
     "segments, traffic": SMALL_SEGMENTS,
+    "lines": LINES,
+    "lines, traffic": SMALL_LINES,
 }
+LOSSES = {LaneSegNetConfig: LaneSegNetLossConfig(), MapTrConfig: MapTrLossConfig()}
 
 
 def make_task(config):
-    losses = LaneSegNetLossConfig() if isinstance(config, LaneSegNetConfig) else TopoNetLossConfig()
-    return LaneGraphTask(model=config, losses=losses)
+    return LaneGraphTask(model=config, losses=LOSSES.get(type(config), TopoNetLossConfig()))
 
 
 def predicted(task, params, example):
-    """Return the lanes or lane segments."""
+    """Return the lanes, lane segments or map lines."""
     answer = task.predict(params, example)
-    return answer.centerlines if answer.segments is None else answer.segments
+    return next(part for part in (answer.centerlines, answer.segments, answer.lines) if part is not None)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +62,7 @@ def fitted():
     out = {}
     for name, config in MODELS.items():
         task = make_task(config)
-        params = random_params(task.init, make_segment_example(), spread=0.2)
+        params = random_params(task.init, make_line_example(), spread=0.2)
         out[name] = task, params, jax.jit(partial(predicted, task))
     return out
 
@@ -62,17 +74,21 @@ def same(a, b):
 @pytest.mark.parametrize("name", MODELS)
 def test_shapes_and_range(fitted, name):
     _, params, predict = fitted[name]
-    lanes = predict(params, make_segment_example())
-    chex.assert_shape(lanes.points, (6, 11, 3))
-    chex.assert_shape(lanes.successor_logits, (6, 6))
+    lanes = predict(params, make_line_example())
+    if name.startswith("lines"):
+        chex.assert_shape(lanes.points, (6, 5, 2))
+        chex.assert_shape(lanes.logits, (6, 3))
+    else:
+        chex.assert_shape(lanes.points, (6, 11, 3))
+        chex.assert_shape(lanes.successor_logits, (6, 6))
+        assert ((np.asarray(lanes.scores) > 0) & (np.asarray(lanes.scores) < 1)).all()
     assert np.abs(np.asarray(lanes.points)[..., 0]).max() <= 51.2
-    assert ((np.asarray(lanes.scores) > 0) & (np.asarray(lanes.scores) < 1)).all()
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_padding_may_hold_nan(fitted, name):
     _, params, predict = fitted[name]
-    example = make_segment_example(3, instances=6)
+    example = make_line_example(3, instances=6)
     flow = example.traffic_flow
     dirty = flow.replace(
         position=np.where(flow.valid[..., None], flow.position, np.nan),
@@ -83,10 +99,10 @@ def test_padding_may_hold_nan(fitted, name):
     same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
 
 
-@pytest.mark.parametrize("name", ["traffic", "every layer", "fixed", "segments, traffic"])
+@pytest.mark.parametrize("name", ["traffic", "every layer", "fixed", "segments, traffic", "lines, traffic"])
 def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
     _, params, predict = fitted[name]
-    example = make_segment_example(4)
+    example = make_line_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
     same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
     # The parameters of the temporal encoder must have no effect in an empty scene.
@@ -95,16 +111,16 @@ def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
     assert not np.array_equal(absent.points, predict(params, example).points)
 
 
-@pytest.mark.parametrize("name", ["baseline", "segments"])
+@pytest.mark.parametrize("name", ["baseline", "segments", "lines"])
 def test_baseline_does_not_depend_on_traffic(fitted, name):
     _, params, predict = fitted[name]
-    same(predict(params, make_segment_example(5)), predict(params, make_segment_example(5).replace(traffic_flow=None)))
+    same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))
 
 
-@pytest.mark.parametrize("name", ["traffic", "segments, traffic"])
+@pytest.mark.parametrize("name", ["traffic", "segments, traffic", "lines, traffic"])
 def test_lanes_do_not_depend_on_the_order_of_instances(fitted, name):
     _, params, predict = fitted[name]
-    example = make_segment_example(6)
+    example = make_line_example(6)
     order = np.random.default_rng(0).permutation(16)
     shuffled = example.replace(traffic_flow=jax.tree.map(lambda x: x[order], example.traffic_flow))
     same(predict(params, example), predict(params, shuffled))
@@ -113,7 +129,7 @@ def test_lanes_do_not_depend_on_the_order_of_instances(fitted, name):
 @pytest.mark.parametrize("name", MODELS)
 def test_batch_is_a_vmap(fitted, name):
     task, params, predict = fitted[name]
-    examples = [make_segment_example(s, instances=s) for s in (0, 3, 9)]
+    examples = [make_line_example(s, instances=s) for s in (0, 3, 9)]
     batch = jax.tree.map(lambda *x: np.stack(x), *examples)
     together = jax.jit(jax.vmap(partial(predicted, task), in_axes=(None, 0)))(params, batch)
     for i, example in enumerate(examples):
@@ -132,22 +148,22 @@ def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
         return jax.value_and_grad(lambda p: task.loss(p, batch, jax.random.key(0))[0])(params)
 
     for instances, lanes in ((9, 4), (0, 0), (1, 1)):
-        batch = jax.tree.map(lambda x: np.stack([x, x]), make_segment_example(1, instances, lanes, min(lanes, 1)))
+        batch = jax.tree.map(lambda x: np.stack([x, x]), make_line_example(1, instances, lanes, min(lanes, 1)))
         loss, gradient = step(params, batch)
         assert np.isfinite(loss)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
     if "temporal_encoder" in params:
-        batch = jax.tree.map(lambda x: np.stack([x, x]), make_segment_example(1, instances=0))
+        batch = jax.tree.map(lambda x: np.stack([x, x]), make_line_example(1, instances=0))
         silent = step(params, batch)[1]["temporal_encoder"]
         assert all(not np.asarray(g).any() for g in jax.tree.leaves(silent))
 
 
-@pytest.mark.parametrize("model", [WITH_TRAFFIC, SMALL_SEGMENTS], ids=["toponet", "lanesegnet"])
+@pytest.mark.parametrize("model", [WITH_TRAFFIC, SMALL_SEGMENTS, SMALL_LINES], ids=["toponet", "lanesegnet", "maptr"])
 def test_same_key_same_parameters(model):
     task = make_task(model)
-    a, b = (jax.jit(task.init).lower(jax.random.key(7), make_segment_example()) for _ in range(2))
+    a, b = (jax.jit(task.init).lower(jax.random.key(7), make_line_example()) for _ in range(2))
     assert a.as_text() == b.as_text()
-    params = a.compile()(jax.random.key(7), make_segment_example())
+    params = a.compile()(jax.random.key(7), make_line_example())
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     names = {"/".join(str(k.key) for k in path) for path, _ in jax.tree_util.tree_leaves_with_path(params)}
     assert not [n for n in names if "Dense_" in n or "Conv_" in n or "Norm_" in n]
@@ -156,4 +172,4 @@ def test_same_key_same_parameters(model):
 def test_no_bev_is_an_error(fitted):
     task, params, _ = fitted["baseline"]
     with pytest.raises(UserError, match="bev is None"):
-        task.predict(params, make_segment_example().replace(bev=None))
+        task.predict(params, make_line_example().replace(bev=None))

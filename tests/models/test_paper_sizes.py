@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from tflane_jax.convert.hosts import camera_shapes
-from tflane_jax.models import bevformer_detr, lanesegnet, maptr, toponet
+from tflane_jax.models import bevformer_detr, lanesegnet, maptr, maptrv2, toponet
 
 BACKBONE, PYRAMID, BEV = 23_508_032, 3_278_592, 7_667_648
 ELEMENTS, RELATIONS = 8_381_032, 460_801
@@ -16,6 +16,10 @@ TOPONET_LANES, POINT_LANES, CURVE_LANES = 20_030_524 - 33, 5_792_816 - 33, 5_765
 SEGMENTS, LANESEGNET = 10_497_781 - 90, 45_412_854
 # Of the embeddings of four levels in MapTR's checkpoints, one is used; four numbers are constant weights.
 MAPTR, MAPTR_HEAD, MAPTR_UNUSED = 36_193_568, 11_570_912, 3 * 256 + 4
+# Of MapTRv2's checkpoints, position encodings, level and camera embeddings, the motion's embedding, the grid and the
+# constant weights are not used.
+MAPTRV2, MAPTRV2_HEAD, LIFT = 40_578_399, 15_955_743, 7_230_521 - 9
+MAPTRV2_UNUSED = 300 * 128 + (4 + 6) * 256 + 35_968 + 9 + 4
 MAP = jax.ShapeDtypeStruct((100, 200, 256), jnp.float32)
 
 
@@ -78,6 +82,19 @@ def test_maptr_is_as_large_as_the_reference(attention, expected):
 
     assert answer.lines.points.shape == (6, 50, 20, 2)
     assert answer.lines.logits.shape == (6, 50, 3)
+
+
+def test_maptrv2_is_as_large_as_the_reference():
+    config = maptrv2.paper_config()
+    module, example = config.build(), camera_shapes(config.encoder)
+    answer, variables = jax.eval_shape(lambda key, e: module.init_with_output(key, e), jax.random.key(0), example)
+    params = dict(variables["params"])
+    assert count(params) == MAPTRV2 - 2 * 26_560 - MAPTRV2_UNUSED
+    assert count(params["encoder"]["bev"]) == LIFT
+    images = params["encoder"].pop("images")
+    assert count(params) == MAPTRV2_HEAD - MAPTRV2_UNUSED
+    assert count(images) == MAPTRV2 - MAPTRV2_HEAD - 2 * 26_560
+    assert answer.lines.points.shape[1:] == (50, 20, 2)
 
 
 @pytest.mark.parametrize(("control_points", "expected"), [(None, POINT_LANES), (5, CURVE_LANES)])

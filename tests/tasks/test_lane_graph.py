@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.fakes import fake_prediction
-from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example
+from tests.models.cases import BASELINE, WITH_TRAFFIC, make_example, make_line_example
 from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
 from tflane_jax.config import RunConfig, WorldData
@@ -59,11 +59,12 @@ def test_truth_of_other_points_is_named(model, setting):
 
 def test_map_lines_of_other_points_or_none_at_all_are_named():
     task = LaneGraphTask(MapTrConfig(decoder=LineDecoderConfig(points=12)))
+    examples = stack_examples([make_line_example()])
     with pytest.raises(UserError, match=r"set data\.example\.map_lines"):
-        task.check(WorldData(), EXAMPLES)
+        task.check(WorldData(), examples)
     with pytest.raises(UserError, match=r"data\.example\.map_lines\.points=12, .*not 20"):
-        task.check(WorldData(example=ExampleConfig(map_lines=MapLinesConfig())), EXAMPLES)
-    task.check(WorldData(example=ExampleConfig(map_lines=MapLinesConfig(points=12))), EXAMPLES)
+        task.check(WorldData(example=ExampleConfig(map_lines=MapLinesConfig())), examples)
+    task.check(WorldData(example=ExampleConfig(map_lines=MapLinesConfig(points=12))), examples)
 
 
 def test_a_model_of_traffic_flow_needs_data_with_it():

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
-from tflane_jax.convert.maptr import MAPTR_HEAD
+from tflane_jax.convert.maptr import MAPTR_HEAD, MAPTRV2_HEAD
 from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, convert
 from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
 from tflane_jax.convert.torch_file import read_state_dict
@@ -28,6 +28,7 @@ from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.parameters import Params
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import CameraViews, Example
@@ -43,6 +44,8 @@ def _head_rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
     if isinstance(model, LaneSegNetConfig):
         segments = below(r"pts_bbox_head\.", "", LANESEGNET_HEAD)
         return "LaneSegNet", (*segments, *below(r"lclc_head\.", "successor", RELATIONSHIP))
+    if isinstance(model, MapTrV2Config):
+        return "MapTRv2", below(r"pts_bbox_head\.", "", MAPTRV2_HEAD)
     if isinstance(model, MapTrConfig):
         return "MapTR", below(r"pts_bbox_head\.", "", MAPTR_HEAD)
     last = f"heads_{model.decoder.layers - 1}"
@@ -85,7 +88,9 @@ def load_host(path: Path, model: PublishedHost) -> tuple[Params, list[dict[str, 
         raise UserError("published weights are those of models with cameras: give the model an encoder of cameras")
     converted = convert_host(read_state_dict(path), model)
     expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), camera_shapes(model.encoder)))
-    check_fits(converted.variables, {"batch_stats": {}} | expected, path)
+    # Without auxiliary outputs.
+    kept = {name: expected.get(name, {}) for name in ("params", STATISTICS)}
+    check_fits(converted.variables, kept, path)
     variables = converted.variables
     return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
 

@@ -62,7 +62,8 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
             is_statistic = path.endswith(("/mean", "/var")) or re.fullmatch(frozen, path) is not None
             put(variables["batch_stats" if is_statistic else "params"], path, value)
         unused = math.prod(tensor.shape) - sum(math.prod(value.shape) for value in leaves.values())
-        table.append(row | {"becomes": ", ".join(leaves) + (f" ({unused} unused numbers left out)" if unused else "")})
+        becomes = ", ".join(leaves) + (f" ({unused} unused numbers left out)" if unused else "")
+        table.append(row | {"becomes": becomes if leaves else "unused by the network, not needed"})
     return Converted(variables, table)
 
 
@@ -144,6 +145,8 @@ def _leaves(path: str, tensor: AnyArray, kind: str) -> dict[str, Any]:
         if last == "weight":
             return {f"{parent}/{part}/kernel": value.T for part, value in parts.items()}
         return {f"{parent}/{part}/bias": value for part, value in parts.items()}
+    if kind == "unused":
+        return {}
     if kind == "first_row":
         return {path: tensor[:1]}
     if kind == "pair":  # a linear layer on [a | b] as one layer for each, the bias with the first

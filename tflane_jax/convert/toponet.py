@@ -12,12 +12,12 @@ from typing import Any
 from tflane_jax.convert.renaming import Rule, below, convert, renamed_params
 from tflane_jax.geometry.namespace import AnyArray
 
-_DEFORMABLE = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
-_ATTENTION = (
+DEFORMABLE: tuple[Rule, ...] = ((r"(\w+)\.(weight|bias)", r"\1/\2", "linear"),)
+ATTENTION: tuple[Rule, ...] = (
     (r"attn\.in_proj_(weight|bias)", r"\1", "packed"),
     (r"attn\.out_proj\.(weight|bias)", r"output/\1", "linear"),
 )
-_FEED_FORWARD = (
+FEED_FORWARD: tuple[Rule, ...] = (
     (r"layers\.0\.0\.(weight|bias)", r"expand/\1", "linear"),
     (r"layers\.1\.(weight|bias)", r"contract/\1", "linear"),
 )
@@ -38,10 +38,10 @@ RELATIONSHIP: tuple[Rule, ...] = (
     (r"classifier\.layers\.2\.(weight|bias)", r"pair_out/\1", "linear"),
 )
 _QUERIES = (r"query_embedding\.weight", r"queries/embedding", "vector")
-_REFERENCE = (r"transformer\.reference_points\.(weight|bias)", r"queries/reference/\1", "linear")
+REFERENCE = (r"transformer\.reference_points\.(weight|bias)", r"queries/reference/\1", "linear")
 _LANE_LAYER: tuple[Rule, ...] = (
-    *below(r"attentions\.0\.", "self_attention", _ATTENTION),
-    *below(r"attentions\.1\.", "bev_attention", _DEFORMABLE),
+    *below(r"attentions\.0\.", "self_attention", ATTENTION),
+    *below(r"attentions\.1\.", "bev_attention", DEFORMABLE),
     (r"norms\.0\.(weight|bias)", r"self_attention_norm/\1", "norm"),
     (r"norms\.1\.(weight|bias)", r"bev_attention_norm/\1", "norm"),
 )
@@ -55,13 +55,13 @@ _LANE_HEADS: tuple[Rule, ...] = (
     (r"reg_branches\.(\d+)\.2\.(weight|bias)", r"heads_\1/points/linear_1/\2", "linear"),
     (r"reg_branches\.(\d+)\.4\.(weight|bias)", r"heads_\1/points/linear_2/\2", "linear"),
 )
-_LAYER = r"transformer\.decoder\.layers\.(\d+)\."
+LAYER = r"transformer\.decoder\.layers\.(\d+)\."
 TOPONET_LANES: tuple[Rule, ...] = (
     _QUERIES,
-    _REFERENCE,
-    *below(_LAYER, r"layer_\1", _LANE_LAYER),
-    *below(_LAYER + r"ffns\.0\.", r"layer_\1/scene_graph", SCENE_GRAPH),
-    (_LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/scene_graph_norm/\2", "norm"),
+    REFERENCE,
+    *below(LAYER, r"layer_\1", _LANE_LAYER),
+    *below(LAYER + r"ffns\.0\.", r"layer_\1/scene_graph", SCENE_GRAPH),
+    (LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/scene_graph_norm/\2", "norm"),
     *_LANE_HEADS,
     *below(r"lclc_branches\.(\d+)\.", r"heads_\1/successor", RELATIONSHIP),
     *below(r"lcte_branches\.(\d+)\.", r"heads_\1/element_lane", RELATIONSHIP),
@@ -71,10 +71,10 @@ TOPONET_LANES: tuple[Rule, ...] = (
 # Queries and decoder layers without scene graph: of the baseline, and of LaneSegNet.
 PLAIN_DECODER: tuple[Rule, ...] = (
     _QUERIES,
-    _REFERENCE,
-    *below(_LAYER, r"layer_\1", _LANE_LAYER),
-    *below(_LAYER + r"ffns\.0\.", r"layer_\1/feed_forward", _FEED_FORWARD),
-    (_LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/feed_forward_norm/\2", "norm"),
+    REFERENCE,
+    *below(LAYER, r"layer_\1", _LANE_LAYER),
+    *below(LAYER + r"ffns\.0\.", r"layer_\1/feed_forward", FEED_FORWARD),
+    (LAYER + r"norms\.2\.(weight|bias)", r"layer_\1/feed_forward_norm/\2", "norm"),
 )
 BASELINE_LANES: tuple[Rule, ...] = (*PLAIN_DECODER, *_LANE_HEADS)
 _ENCODER = r"transformer\.encoder\.layers\.(\d+)\."
@@ -82,16 +82,16 @@ ELEMENTS: tuple[Rule, ...] = (
     (r"transformer\.level_embeds", "level", "vector"),
     (r"query_embedding\.weight", "queries", "vector"),
     (r"transformer\.reference_points\.(weight|bias)", r"reference/\1", "linear"),
-    *below(_ENCODER + r"attentions\.0\.", r"encoder_\1/attention", _DEFORMABLE),
-    *below(_ENCODER + r"ffns\.0\.", r"encoder_\1/feed_forward", _FEED_FORWARD),
+    *below(_ENCODER + r"attentions\.0\.", r"encoder_\1/attention", DEFORMABLE),
+    *below(_ENCODER + r"ffns\.0\.", r"encoder_\1/feed_forward", FEED_FORWARD),
     (_ENCODER + r"norms\.0\.(weight|bias)", r"encoder_\1/attended/norm/\2", "norm"),
     (_ENCODER + r"norms\.1\.(weight|bias)", r"encoder_\1/fed/norm/\2", "norm"),
-    *below(_LAYER + r"attentions\.0\.", r"decoder_\1/self_attention", _ATTENTION),
-    *below(_LAYER + r"attentions\.1\.", r"decoder_\1/attention", _DEFORMABLE),
-    *below(_LAYER + r"ffns\.0\.", r"decoder_\1/feed_forward", _FEED_FORWARD),
-    (_LAYER + r"norms\.0\.(weight|bias)", r"decoder_\1/attended/norm/\2", "norm"),
-    (_LAYER + r"norms\.1\.(weight|bias)", r"decoder_\1/crossed/norm/\2", "norm"),
-    (_LAYER + r"norms\.2\.(weight|bias)", r"decoder_\1/fed/norm/\2", "norm"),
+    *below(LAYER + r"attentions\.0\.", r"decoder_\1/self_attention", ATTENTION),
+    *below(LAYER + r"attentions\.1\.", r"decoder_\1/attention", DEFORMABLE),
+    *below(LAYER + r"ffns\.0\.", r"decoder_\1/feed_forward", FEED_FORWARD),
+    (LAYER + r"norms\.0\.(weight|bias)", r"decoder_\1/attended/norm/\2", "norm"),
+    (LAYER + r"norms\.1\.(weight|bias)", r"decoder_\1/crossed/norm/\2", "norm"),
+    (LAYER + r"norms\.2\.(weight|bias)", r"decoder_\1/fed/norm/\2", "norm"),
     (r"cls_branches\.(\d+)\.(weight|bias)", r"class_\1/\2", "linear"),
     (r"reg_branches\.(\d+)\.0\.(weight|bias)", r"box_\1/hidden/linear_0/\2", "linear"),
     (r"reg_branches\.(\d+)\.2\.(weight|bias)", r"box_\1/hidden/linear_1/\2", "linear"),

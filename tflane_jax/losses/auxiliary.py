@@ -24,12 +24,12 @@ T = TypeVar("T", CenterlinePrediction, SegmentPrediction, LinePrediction)
 def auxiliary_losses(
     outputs: AuxiliaryOutputs,
     names: Sequence[AuxiliaryName],
-    lanes: Any,
+    lanes: LaneGraph,
     *,
     bev_range: PerceptionRange,
     cell_weight: float,
     proposal_weights: tuple[float, float],
-    denoising: Callable[[Any, Any], Terms],
+    denoising: Callable[[Any, LaneGraph], Terms],
     cell_lanes: LaneGraph | None = None,
 ) -> tuple[list[Float[Array, ""]], Report]:
     """Return the weighted auxiliary losses of a batch, to be summed in this order, and the numbers to record.
@@ -37,7 +37,7 @@ def auxiliary_losses(
     Args:
         outputs: auxiliary outputs, leading axis batch.
         names: the auxiliary outputs that the host declares.
-        lanes: ground truth, leading axis batch; padding may hold anything. A `LaneGraph`, or what `denoising` takes.
+        lanes: ground truth, leading axis batch; padding may hold anything.
         bev_range: the box that the BEV features cover, metres.
         cell_weight: weight of the loss on BEV cells.
         proposal_weights: weights of the heat map and of the shapes of proposed lanes.

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.line_orders import Ways, point_orders
-from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
+from tflane_jax.losses.auxiliary import denoising_pairs
 from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
@@ -78,16 +78,29 @@ class MapTrLossConfig(HostLossConfig):
         coordinates, classes = outputs.lines.points.shape[-1], outputs.lines.logits.shape[-1]
         targets = jax.vmap(partial(line_targets, coordinates=coordinates, classes=classes, rings=self.rings))(lines)
         loss, report = line_loss(outputs.lines, targets, range_, self)
-        further, more = auxiliary_losses(
-            auxiliary,
-            host.auxiliary,
-            lines,
-            bev_range=range_,
-            cell_weight=self.cell_weight,
-            proposal_weights=(0.0, 0.0),
-            denoising=lambda found, _: line_denoising_losses(found, targets, range_, self),
-        )
-        return sum(further, loss), report | more
+        for name in host.auxiliary:
+            if (output := getattr(auxiliary, name)) is None:
+                raise ValueError(f"the host declares the auxiliary output {name}, but it is missing")
+            terms = self.auxiliary_terms(name, output, targets, batch, host)
+            loss, report = loss + total(terms), report | last_layer(terms)
+        return loss, report
+
+    def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
+        """Return the weighted losses of an auxiliary output.
+
+        Args:
+            name, output: of `AuxiliaryOutputs`, leading axis batch.
+            targets: true lines with equivalent orders, leading axis batch.
+            batch: the examples.
+            host: the host's configuration.
+
+        Raises:
+            ValueError: the output has no loss here.
+        """
+        if name != "denoised":
+            raise ValueError(f"the auxiliary output {name} has no loss here")
+        terms = line_denoising_losses(output, targets, host.encoder.bev_range, self)
+        return {f"denoised_{key}": value for key, value in terms.items()}
 
 
 @struct.dataclass
@@ -145,11 +158,19 @@ def line_loss(
 
 
 def assign_lines(
-    prediction: LinePrediction, targets: LineTargets, range_: PerceptionRange, config: MapTrLossConfig
+    prediction: LinePrediction,
+    targets: LineTargets,
+    range_: PerceptionRange,
+    config: MapTrLossConfig,
+    repeats: int = 1,
 ) -> Assignment:
-    """Return the assignment (B, D, L) of a batch."""
+    """Return the assignment (B, D, L) of a batch; with every target `repeats` times, one copy of all after the other.
+
+    Repeated targets need no costs of their own.
+    """
     each = jax.vmap(partial(matching_cost, range_=range_, config=config), in_axes=(0, None))
-    return match(jax.vmap(each)(prediction, targets), targets.valid[:, None], config.matcher)
+    cost = jnp.concatenate([jax.vmap(each)(prediction, targets)] * repeats, -1)
+    return match(cost, jnp.concatenate([targets.valid] * repeats, -1)[:, None], config.matcher)
 
 
 def matching_cost(

@@ -17,7 +17,16 @@ AUXILIARY = "auxiliary"
 CELL_CHANNELS = 5
 """Channels per BEV cell: occupancy logit, offset to the nearest lane in cells (2), direction of that lane (2)."""
 
-AuxiliaryName = Literal["denoised", "lane_cells", "lane_proposals", "line_cells"]
+AuxiliaryName = Literal[
+    "denoised",
+    "lane_cells",
+    "lane_proposals",
+    "line_cells",
+    "one_to_many",
+    "line_mask",
+    "view_line_masks",
+    "depth",
+]
 
 
 @struct.dataclass
@@ -43,12 +52,20 @@ class AuxiliaryOutputs:
         lane_cells: (h, w, `CELL_CHANNELS`) lanes per BEV cell.
         lane_proposals: of the heads that propose lanes, see `models.lane_proposals`.
         line_cells: (h, w) logit per cell of the image features: does a lane line pass through it?
+        one_to_many: map lines of MapTRv2's second group of queries, leading axis layer.
+        line_mask: (h, w) logit per BEV cell: does a map line pass through it?
+        view_line_masks: (V, h, w) the same of the image cells of V cameras.
+        depth: (V, h, w, D) logits of the depth bins of image cells, see `models.lift`.
     """
 
     denoised: CenterlinePrediction | SegmentPrediction | LinePrediction | None = None
     lane_cells: Float[Array, "*b h w c"] | None = None
     lane_proposals: LaneProposalOutputs | None = None
     line_cells: Float[Array, "*b h w"] | None = None
+    one_to_many: LinePrediction | None = None
+    line_mask: Float[Array, "*b h w"] | None = None
+    view_line_masks: Float[Array, "*b v h w"] | None = None
+    depth: Float[Array, "*b v h w d"] | None = None
 
 
 def auxiliary_outputs(state: Any) -> AuxiliaryOutputs:
@@ -66,3 +83,13 @@ class LaneCellHead(nn.Module):
         """Sow the prediction for each BEV cell. No-op unless the `auxiliary` collection is mutable."""
         if self.is_mutable_collection(AUXILIARY):
             self.sow(AUXILIARY, "lane_cells", nn.Dense(CELL_CHANNELS, name="out")(bev))
+
+
+class LineMaskHead(nn.Module):
+    """Whether any line passes through a cell, from features of the cells."""
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "*v h w c"]) -> Float[Array, "*v h w"]:
+        """Return the logit of each cell."""
+        x = nn.relu(nn.Conv(features.shape[-1], (3, 3), use_bias=False, name="hidden")(features))
+        return nn.Conv(1, (1, 1), name="out")(x)[..., 0]

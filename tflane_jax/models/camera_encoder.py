@@ -1,7 +1,7 @@
 """Camera encoder: images of one frame to BEV features and front-view features.
 
-Images -> image encoder -> feature maps of all cameras -> BEVFormer -> BEV features. The feature maps of the front
-camera also go to the traffic-element decoder.
+Images -> image encoder -> feature maps of all cameras -> BEVFormer, or lift by depth -> BEV features. The feature maps
+of the front camera also go to the traffic-element decoder.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.models.auxiliary import LaneCellHead
+from tflane_jax.models.auxiliary import AUXILIARY, LaneCellHead, LineMaskHead
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
 from tflane_jax.models.bevformer import BevFormer
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER, ImageEncoder, ImageEncoderConfig
+from tflane_jax.models.lift import LiftConfig, LiftEncoder
 from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import Example
 
@@ -31,14 +32,18 @@ class CameraEncoderConfig:
 
     Attributes:
         images: from images to feature maps.
-        bev: from feature maps to BEV features; levels and channels must match those of `images`.
+        bev: from feature maps to BEV features: BEVFormer, or the lift of MapTRv2, which has no memory and takes one
+            level. Levels and channels must match those of `images`.
         cells: predict for every BEV cell whether a lane passes through it, its offset and direction, for the auxiliary
             loss `losses.lane_cells`. Not in the papers; it speeds up training of small models.
+        line_masks: predict for every cell of the finest feature maps whether a map line passes through it, for
+            MapTRv2's loss.
     """
 
     images: ImageEncoderConfig = ImageEncoderConfig()
-    bev: BevFormerConfig = SMALL_BEVFORMER
+    bev: BevFormerConfig | LiftConfig = SMALL_BEVFORMER
     cells: bool = False
+    line_masks: bool = False
 
     @property
     def bev_range(self) -> PerceptionRange:
@@ -91,15 +96,24 @@ class CameraEncoder(nn.Module):
         if cameras is None:
             raise UserError("the model reads camera images, and these data have none: choose data with cameras")
         levels = ImageEncoder(self.config.images, name="images")(cameras, train=train)
-        if memory is not None:
-            # No gradient through time, as in the published code; a new scene starts without memory.
-            memory = BevMemory(lax.stop_gradient(memory.features), memory.valid & example.has_previous)
-        bev = BevFormer(self.config.bev, name="bev")(
-            levels, cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train, fuse=fuse
-        )
+        if self.config.line_masks and self.is_mutable_collection(AUXILIARY):
+            self.sow(AUXILIARY, "view_line_masks", LineMaskHead(name="view_mask_head")(levels[0]))
+        if isinstance(self.config.bev, LiftConfig):
+            bev, following = LiftEncoder(self.config.bev, name="bev")(levels, cameras, train=train, fuse=fuse), None
+        else:
+            bev = self._bevformer(self.config.bev, levels, example, memory, train, fuse)
+            following = BevMemory(bev, jnp.ones((), bool))
         if self.config.cells:
             LaneCellHead(name="cells")(bev)
         size = jnp.where(cameras.valid[0], cameras.size[0], 0)
         padded = cameras.image.shape[1], cameras.image.shape[2]
         front = FrontView([level[0] for level in levels], size, padded)
-        return EncoderOutput(bev, front, BevMemory(bev, jnp.ones((), bool)))
+        return EncoderOutput(bev, front, following)
+
+    def _bevformer(self, config, levels, example, memory, train, fuse) -> Float[Array, "h w c"]:
+        if memory is not None:
+            # No gradient through time, as in the published code; a new scene starts without memory.
+            memory = BevMemory(lax.stop_gradient(memory.features), memory.valid & example.has_previous)
+        return BevFormer(config, name="bev")(
+            levels, example.cameras, memory, jnp.asarray(example.previous_from_ego), deterministic=not train, fuse=fuse
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tflane_jax.errors import UserError
-from tflane_jax.models.bev_encoder import BevMemory
+from tflane_jax.models.bev_encoder import BevFormerConfig, BevMemory
 from tflane_jax.models.camera_encoder import CameraEncoder, CameraEncoderConfig, EncoderOutput
 from tflane_jax.models.element_decoder import ElementDecoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
@@ -50,7 +50,9 @@ def encode_example(
 
 def start_bev_memory(config: EncoderConfig) -> BevMemory | None:
     """Return the BEV memory before the first frame of a sequence; None for an encoder without memory."""
-    return BevMemory.empty(config.bev) if isinstance(config, CameraEncoderConfig) else None
+    if isinstance(config, CameraEncoderConfig) and isinstance(config.bev, BevFormerConfig):
+        return BevMemory.empty(config.bev)
+    return None
 
 
 def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoderConfig | None) -> None:

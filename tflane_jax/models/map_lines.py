@@ -91,20 +91,22 @@ class LineQueries(nn.Module):
     Attributes:
         config: sizes and forms.
         range: the box that normalised coordinates span.
+        more: lines beyond `config.queries`, the last ones.
     """
 
     config: LineDecoderConfig
     range: PerceptionRange
+    more: int = 0
 
     @nn.compact
     def __call__(self) -> PointQueries:
         """Return content, position and initial points."""
-        config, normal = self.config, nn.initializers.normal(1.0)
-        lines = self.param("instances", normal, (config.queries, 2 * config.dim))
+        config, normal, count = self.config, nn.initializers.normal(1.0), self.config.queries + self.more
+        lines = self.param("instances", normal, (count, 2 * config.dim))
         points = self.param("points", normal, (config.points, 2 * config.dim))
         position, content = jnp.split(lines[:, None] + points[None], 2, -1)
         if config.anchors == "spread":
-            start = spread_lanes(config.queries, config.points, self.range)[..., : config.coordinates]
+            start = spread_lanes(count, config.points, self.range)[..., : config.coordinates]
             anchors = self.param("anchors", lambda _: inverse_sigmoid(jnp.asarray(start)))
             return PointQueries(content, position, nn.sigmoid(anchors))
         place = nn.Dense(config.coordinates, kernel_init=nn.initializers.xavier_uniform(), name="reference")

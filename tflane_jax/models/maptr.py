@@ -132,6 +132,10 @@ class MapTr(Host):
             lines: ground truth to denoise; not used otherwise.
             deterministic: no dropout.
         """
+        return self.decode_one_to_one(bev, tokens, lines, deterministic)
+
+    def decode_one_to_one(self, bev, tokens, lines, deterministic) -> Prediction:
+        """Return the predictions of the learned queries, and sow those of noised ones in training; in `decode`."""
         config, range_ = self.config, self.config.spec.bev_range
         start = LineQueries(config.decoder, range_, name="queries")()
         rest = bev, None, tokens or {}, deterministic

@@ -8,6 +8,7 @@ import numpy as np
 
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
+from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
@@ -32,7 +33,7 @@ def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> Non
     _check_traffic(model, config, example)
     _check_elements(model, example)
     encoder, cameras = model.encoder, example.cameras
-    if isinstance(encoder, CameraEncoderConfig) and cameras is not None:
+    if isinstance(encoder, CameraEncoderConfig) and isinstance(encoder.bev, BevFormerConfig) and cameras is not None:
         check_capacity(encoder.bev, cameras)
 
 
@@ -79,8 +80,6 @@ def _check_lines(model: HostConfig, config: ExampleConfig, example: Example) -> 
 
 
 def _check_points(model: HostConfig, config: ExampleConfig) -> None:
-    if "lines" in model.predicts and "map_lines" in model.truth and config.map_lines is None:
-        raise UserError("this model learns the lines of a vector map: set data.example.map_lines")
     for name, points in model.example_points.items():
         if (found := attrgetter(name)(config)) != points:
             raise UserError(

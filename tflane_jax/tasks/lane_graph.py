@@ -13,7 +13,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets import sources
-from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import first_example
 from tflane_jax.datasets.clips import as_clips
 from tflane_jax.datasets.data_source import LaneGraphSource, SplitData

@@ -1,0 +1,166 @@
+"""The lift of image features into BEV against the reference's numbers; geometry, borders, cameras."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.golden import case_id, golden_modules, load_module_case, options
+from tests.golden_compare import compare
+from tests.parameters import random_params
+from tflane_jax.convert.maptr import LIFT
+from tflane_jax.convert.renaming import convert
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.losses.map_masks import depth_targets
+from tflane_jax.losses.maptrv2 import depth_loss
+from tflane_jax.models.lift import LiftConfig, LiftEncoder, cell_numbers, collect, ray_points
+from tflane_jax.scene import CameraViews
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize("path", golden_modules("maptrv2_lss_transform*"), ids=case_id)
+def test_it_matches_the_reference(path):
+    case = load_module_case(path)
+    sizes = ("dim", "pc_range", "voxel_size", "dbound", "downsample", "aspp_mid_channels", "loss_depth_weight")
+    found = options(case, *sizes, "feat_down_sample")
+    low, high = np.array(found.pc_range).reshape(2, 3)
+    columns, rows, _ = np.rint((high - low) / found.voxel_size).astype(int).tolist()
+    config = LiftConfig(
+        BevGrid(PerceptionRange(*zip(low, high, strict=True)), rows // found.downsample, columns // found.downsample),
+        fine=found.downsample,
+        dim=found.dim,
+        depth=tuple(found.dbound),
+        pyramid=found.aspp_mid_channels,
+        border="published",
+    )
+    inputs = case.inputs
+    size, shape = tuple(inputs["img_hw"].tolist()), inputs["images"].shape[-2:]
+    assert size == tuple(found.feat_down_sample * n for n in shape)
+    # Matrices of the images as they are, and from the lidar's frame, which is that of the BEV features.
+    augmented = inputs["img_aug_matrix"]
+    affine = augmented[..., :3, :3].copy()
+    affine[..., :2, 2] += augmented[..., :2, 3]
+    intrinsics = affine @ inputs["camera_intrinsics"][..., :3, :3]
+    pose = np.linalg.inv(inputs["camera2ego"].astype(np.float64)) @ inputs["lidar2ego"].astype(np.float64)[:, None]
+    place = jax.vmap(lambda k, p: ray_points(k, p, size, shape, config.depth))
+    points = jax.jit(place)(jnp.asarray(intrinsics), jnp.asarray(pose, jnp.float32))
+    one_hot = case.outputs["gt_depth_onehot"].reshape(*points.shape[:2], *shape, config.bins)
+    bins, counted = one_hot.argmax(-1), one_hot.any(-1)
+
+    def outputs(torch_params, arrays):
+        variables = convert(torch_params, LIFT, "LSS").variables
+
+        def one(features, vector, points):
+            model = LiftEncoder(config)
+            return model.apply(variables, features, vector, points, train=False, method="encode")
+
+        features = jnp.asarray(arrays["images"]).transpose(0, 1, 3, 4, 2)
+        bev, logits = jax.vmap(one)(features, jnp.asarray(case.outputs["mlp_input"]), points)
+        loss = depth_loss(logits, bins, counted)
+        return {
+            "bev": bev.transpose(0, 3, 1, 2),
+            "depth": jax.nn.softmax(logits, -1).transpose(0, 1, 4, 2, 3),
+            "geom": points,
+            "depth_loss": found.loss_depth_weight * loss,
+        }
+
+    statistics = {name: x for name, x in case.params.items() if name.endswith(("running_mean", "running_var"))}
+    constant = {name: case.params[name] for name in ("dx", "bx", "nx")}
+    learned = {name: x for name, x in case.params.items() if name not in statistics and name not in constant}
+    tolerances = {"geom": 1e-4, "bev": 1e-4}
+    ignore = ("mlp_input", "gt_depth_onehot")
+    run = lambda params, arrays: outputs(params | statistics | constant, arrays)  # noqa: E731
+    compare(case, run, params=learned, ignore=ignore, tolerances=tolerances)
+    # Its bins are ours, but that a point nearer than the first bin hides all others in its cell.
+    ours, valid = jax.vmap(lambda depth: targets_of(depth, shape, config.depth))(inputs["gt_depth"])
+    near = (inputs["gt_depth"] > 0) & (inputs["gt_depth"] < config.depth[0])
+    factor = size[0] // shape[0]
+    clear = ~near.reshape(*near.shape[:2], shape[0], factor, shape[1], factor).any((3, 5))
+    assert clear.any()
+    np.testing.assert_array_equal(np.asarray(valid)[clear], counted[clear])
+    np.testing.assert_array_equal(np.asarray(ours)[clear & counted], bins[clear & counted])
+
+
+def targets_of(depth, shape, bounds):
+    """Return the depth targets of the images of one example; 0 is no depth."""
+    count = len(depth)
+    views = CameraViews(
+        np.zeros((count, *depth.shape[1:], 3), np.uint8),
+        np.zeros((count, 2), np.int32),
+        np.zeros((count, 3, 3), np.float32),
+        np.zeros((count, 4, 4), np.float32),
+        np.ones(count, bool),
+        depth=depth,
+        depth_valid=depth > 0,
+    )
+    low, high, step = bounds
+    return depth_targets(views, shape, low=low, high=high, step=step)
+
+
+GRID = BevGrid(PerceptionRange((-8.0, 8.0), (-4.0, 4.0), (-3.0, 3.0)), 4, 8)
+CONFIG = LiftConfig(GRID, fine=1, dim=8, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, dropout=0.0, image_scale=1.0)
+
+
+def make_views(seed=0):
+    """Return two cameras, ahead and back, with random images of different contents."""
+    ahead = np.array([[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]], np.float32)
+    back = ahead @ np.diag([-1, -1, 1, 1]).astype(np.float32)
+    intrinsics = np.tile(np.array([[20, 0, 24], [0, 20, 16], [0, 0, 1]], np.float32), (2, 1, 1))
+    image = np.random.default_rng(seed).integers(0, 256, (2, 32, 48, 3), dtype=np.uint8)
+    return CameraViews(image, np.tile([48, 32], (2, 1)), intrinsics, np.stack([ahead, back]), np.ones(2, bool))
+
+
+def test_the_points_of_a_ray_are_seen_in_their_image_cell_at_their_depth():
+    views = make_views()
+    points = np.asarray(ray_points(views.intrinsics, views.camera_from_ego, (32, 48), (5, 7), (1.0, 9.0, 1.0)))
+    assert points.shape == (2, 8, 5, 7, 3)
+    for v in (0, 1):
+        local = points[v] @ views.camera_from_ego[v, :3, :3].T + views.camera_from_ego[v, :3, 3]
+        np.testing.assert_allclose(
+            local[..., 2], np.broadcast_to(np.arange(1, 9.0)[:, None, None], (8, 5, 7)), atol=1e-4
+        )
+        pixel = (local @ views.intrinsics[v].T)[..., :2] / local[..., 2:]
+        np.testing.assert_allclose(pixel[3, :, :, 0], np.tile(np.linspace(0, 47, 7), (5, 1)), atol=1e-3)
+        np.testing.assert_allclose(pixel[3, :, :, 1], np.tile(np.linspace(0, 31, 5)[:, None], (1, 7)), atol=1e-3)
+
+
+def test_collecting_is_the_sum_over_all_points_with_its_gradient():
+    rng = np.random.default_rng(0)
+    context, depth = (jnp.asarray(rng.normal(size=(2, 3, 4, n)), jnp.float32) for n in (5, 6))
+    cells = rng.integers(0, 9, (2, 6, 3, 4))  # 7 cells, the others are outside
+    stored = jnp.einsum("vhwc,vhwd->vdhwc", context, depth).reshape(-1, 5)
+    table = jnp.asarray((cells.reshape(-1)[None] == np.arange(7)[:, None]).astype(np.float32))
+    np.testing.assert_allclose(collect(context, depth, jnp.asarray(cells), 7), table @ stored, rtol=1e-4, atol=1e-5)
+    weight = jnp.asarray(rng.normal(size=(7, 5)), jnp.float32)
+    by_scan = jax.grad(lambda c, d: (collect(c, d, jnp.asarray(cells), 7) * weight).sum(), (0, 1))(context, depth)
+    plain = lambda c, d: ((table @ jnp.einsum("vhwc,vhwd->vdhwc", c, d).reshape(-1, 5)) * weight).sum()  # noqa: E731
+    for ours, theirs in zip(by_scan, jax.grad(plain, (0, 1))(context, depth), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_points_outside_the_range_belong_to_no_cell_but_for_the_published_border():
+    points = jnp.array([[-7.9, -3.9, 0.0], [-8.1, -3.9, 0.0], [-10.1, 0.0, 0.0], [7.9, 3.9, 0.0], [0.0, 0.0, 3.1]])
+    points = jnp.concatenate([points, jnp.full((1, 3), jnp.nan)])
+    assert cell_numbers(points, GRID, "exact").tolist() == [0, 32, 32, 31, 32, 32]
+    assert cell_numbers(points, GRID, "published").tolist() == [0, 0, 32, 31, 32, 32]
+
+
+def test_cameras_may_change_places_and_a_missing_one_may_hold_anything():
+    views, features = make_views(), jax.random.normal(jax.random.key(0), (2, 4, 6, 8))
+    model = LiftEncoder(CONFIG)
+    fresh = jax.eval_shape(lambda key: model.init(key, [features], views, train=False), jax.random.key(0))
+    params = random_params(lambda key: model.init(key, [features], views, train=False)["params"])
+    rest = {name: jax.tree.map(lambda leaf: jnp.ones(leaf.shape), x) for name, x in fresh.items() if name != "params"}
+    run = jax.jit(lambda features, views: model.apply({"params": params} | rest, [features], views, train=False))
+    bev = run(features, views)
+    assert bev.shape == (4, 8, 8)
+    swapped = run(features[::-1], jax.tree.map(lambda leaf: leaf[::-1], views))
+    np.testing.assert_allclose(swapped, bev, rtol=1e-4, atol=1e-4)
+    gone = views.replace(valid=np.array([True, False]))
+    dirty = gone.replace(
+        camera_from_ego=np.where(gone.valid[:, None, None], views.camera_from_ego, np.nan),
+        intrinsics=np.where(gone.valid[:, None, None], views.intrinsics, np.nan),
+    )
+    one = run(features, gone)
+    np.testing.assert_array_equal(run(features.at[1].set(jnp.nan), dirty), one)
+    assert np.abs(one - bev).max() > 1e-3

@@ -1,0 +1,122 @@
+"""MapTRv2: decoupled attention, the group that exists in training only, masks, parts that do not fit."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, make_line_example
+from tests.parameters import random_params
+from tflane_jax.errors import UserError
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
+from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lift import LiftConfig
+from tflane_jax.models.maptrv2 import DecoupledLayer, MapTrV2Config
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+DECODER = replace(SMALL_LINES.decoder, layers=2)
+MODEL = MapTrV2Config(encoder=LINES.encoder, decoder=DECODER, priors=SMALL_LINES.priors, many=4, line_mask=True)
+TASK = LaneGraphTask(MODEL, MapTrV2LossConfig(many_repeats=2))
+
+
+@pytest.fixture(scope="module")
+def params():
+    return random_params(TASK.init, make_line_example())
+
+
+@jax.jit
+def trained(params, example):
+    found, state = MODEL.build().apply({"params": params}, example, mutable=[AUXILIARY])
+    return found.lines, auxiliary_outputs(state)
+
+
+def test_the_second_group_exists_in_training_only_and_changes_nothing_else(params):
+    """With traffic, whose module gets the groups as the host's own mask."""
+    example = make_line_example()
+    lines, auxiliary = trained(params, example)
+    assert lines.points.shape == (2, 6, 5, 2)
+    assert auxiliary.one_to_many.points.shape == (2, 4, 5, 2)
+    assert auxiliary.line_mask.shape == (6, 10)
+    alone = jax.jit(TASK.predict)(params, example).lines
+    np.testing.assert_allclose(lines.points[-1], alone.points, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(lines.logits[-1], alone.logits, rtol=1e-4, atol=1e-3)
+    queries = params["queries"]
+    other = queries | {"instances": queries["instances"].at[6:].add(1.0)}
+    changed, moved = trained(params | {"queries": other}, example)
+    np.testing.assert_array_equal(changed.points, lines.points)
+    assert np.abs(moved.one_to_many.points - auxiliary.one_to_many.points).max() > 0.1
+
+
+def test_attention_runs_along_lines_and_among_lines_at_the_same_place():
+    rng = np.random.default_rng(0)
+    queries, position = (jnp.asarray(rng.normal(size=(3, 5, 16)), jnp.float32) for _ in range(2))
+    reference, bev = jnp.full((3, 5, 2), 0.5), jnp.asarray(rng.normal(size=(4, 6, 16)), jnp.float32)
+    layer = DecoupledLayer(DECODER)
+    params = random_params(lambda key: layer.init(key, queries, position, reference, bev)["params"])
+    groups = jnp.eye(3, dtype=bool)
+    run = jax.jit(lambda q, groups: layer.apply({"params": params}, q, position, reference, bev, groups))
+    push = queries.at[0, 0].add(1.0)
+    together, apart = (np.abs(run(push, g) - run(queries, g)).max(-1) > 1e-6 for g in (jnp.ones((3, 3), bool), groups))
+    # Among all lines at place 0, then along every line: everything hears of it.
+    assert together.all()
+    assert apart[0].all()
+    assert not apart[1:].any()
+
+
+def test_it_trains_and_all_its_parameters_learn(params):
+    batch = stack_examples([make_line_example(), make_line_example(1, lanes=0, crossings=0)])
+    run = jax.jit(jax.value_and_grad(TASK.loss, has_aux=True))
+    (loss, report), gradient = run(params, batch, jax.random.key(1))
+    assert np.isfinite(loss)
+    assert {"class", "points", "direction", "mask", "many_class", "many_points", "many_direction"} <= set(report)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    silent = [
+        f"{part}/{name}"
+        for part in ("queries", "mask_head", "layer_0", "layer_1", "heads_0", "heads_1", "spatial_encoder_0")
+        for name, leaf in gradient[part].items()
+        if not any(np.any(x) for x in jax.tree.leaves(leaf))
+    ]
+    assert not silent
+    assert np.abs(gradient["queries"]["instances"][6:]).max() > 0
+
+
+def test_parts_that_do_not_fit_are_named():
+    with pytest.raises(UserError, match="choose one of"):
+        replace(MODEL, denoising=DenoisingConfig()).build()
+
+
+def make_depth_example(seed):
+    """Return `make_camera_example` with map lines, and with depth in cells of 32 pixels."""
+    rng, example = np.random.default_rng(seed), make_camera_example(seed)
+    shape = (2, 2, 3)
+    depth = rng.uniform(1.0, 9.0, shape).astype(np.float32)
+    cameras = example.cameras.replace(depth=depth, depth_valid=rng.random(shape) < 0.7)
+    return example.replace(cameras=cameras, map_lines=make_line_example(seed).map_lines)
+
+
+def test_with_cameras_it_learns_depth_and_masks_in_the_images_too():
+    images = replace(CAMERA.images, stages=(3,), pyramid=replace(CAMERA.images.pyramid, levels=1))
+    lift = LiftConfig(CAMERA.bev.grid, dim=16, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, supervised=True)
+    encoder = CameraEncoderConfig(images, lift, line_masks=True)
+    model = replace(MODEL, encoder=encoder, priors=replace(MODEL.priors, traffic_flow=None))
+    task = LaneGraphTask(model, MapTrV2LossConfig(many_repeats=2))
+    batch = stack_examples([make_depth_example(seed) for seed in (0, 1)])
+    params = random_params(task.init, make_depth_example(0))
+    run = jax.jit(jax.value_and_grad(task.loss, has_aux=True))
+    (loss, report), gradient = run(params, batch, jax.random.key(1))
+    assert np.isfinite(loss)
+    assert {"depth", "mask", "view_mask", "many_points"} <= set(report)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    learning = gradient["encoder"]["bev"]["depth_net"], gradient["encoder"]["view_mask_head"]
+    assert all(np.any(leaf) for part in learning for leaf in jax.tree.leaves(part))
+    assert task.start().bev is None
+    # Depth is a label: the prediction does not depend on it.
+    example = make_depth_example(0)
+    without = example.replace(cameras=example.cameras.replace(depth=None, depth_valid=None), map_lines=None)
+    predict = jax.jit(task.predict)
+    jax.tree.map(np.testing.assert_array_equal, predict(params, example), predict(params, without))

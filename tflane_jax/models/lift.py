@@ -1,0 +1,251 @@
+"""BEV features by lifting image features along their depth (LSS, Philion and Fidler 2020; BEVDepth), as MapTRv2 has it.
+
+Every cell of a feature map is a ray of points, one for each depth bin. Each point gives its cell of the BEV grid the
+context of its image cell times the probability of its bin. The sum over all points is taken bin by bin: the 153,000
+points x 256 channels of the published size are never stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry.pillars import cell_points
+from tflane_jax.layers.batch_norm import BatchNorm
+from tflane_jax.layers.depth_net import DepthNet
+from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.models.auxiliary import AUXILIARY
+from tflane_jax.models.prior import BevHook
+from tflane_jax.scene import CameraViews
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """Sizes of the lift. The defaults are MapTRv2's on nuScenes.
+
+    Attributes:
+        grid: cells of the BEV features.
+        fine: points are collected in cells `fine` (1 or 2) times as fine as those of the grid, along each axis.
+        dim: channels of the image features and of the BEV features.
+        cameras: largest number of cameras.
+        depth: first, last (excluded) and size of the depth bins, metres.
+        pyramid: channels of each branch of the dilated convolutions in the depth network.
+        dropout: probability in the depth network.
+        image_scale: of the images, relative to the camera's own. The depth network knows the cameras' native
+            intrinsics and this scale.
+        supervised: whether the network learns the depth of image cells, for which the training data must have it.
+        border: "exact": points outside the range are left out. "published": those up to a cell below its lower ends
+            count for the first cells, as the published code's rounding towards zero has it.
+    """
+
+    grid: BevGrid = BevGrid(PerceptionRange((-30.0, 30.0), (-15.0, 15.0), (-10.0, 10.0)), 100, 200)
+    fine: Literal[1, 2] = 2
+    dim: int = 256
+    cameras: int = 6
+    depth: tuple[float, float, float] = (1.0, 35.0, 0.5)
+    pyramid: int = 96
+    dropout: float = 0.5
+    image_scale: float = 0.5
+    supervised: bool = False
+    border: Literal["exact", "published"] = "exact"
+
+    @property
+    def bins(self) -> int:
+        """Number of depth bins."""
+        low, high, step = self.depth
+        return round((high - low) / step)
+
+
+class LiftEncoder(nn.Module):
+    """From image features to BEV features."""
+
+    config: LiftConfig
+
+    @nn.compact
+    def encode(
+        self,
+        features: Float[Array, "v h w c"],
+        cameras: Float[Array, "v p"],
+        points: Float[Array, "v d h w 3"],
+        *,
+        train: bool,
+    ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
+        """Return BEV features, row 0 at the smallest y, column 0 at the smallest x; and depth logits.
+
+        Args:
+            features: of V cameras; finite.
+            cameras: parameters of the cameras, see `camera_vector`.
+            points: of the rays, metres, ego frame (`ray_points`); NaN for those of a camera that does not exist.
+            train: norms use batch statistics, and dropout is on.
+        """
+        config, grid = self.config, self.config.grid
+        network = DepthNet(config.dim, config.bins, config.pyramid, config.dropout, name="depth_net")
+        logits, context = network(features, cameras, train=train)
+        rows, columns = grid.rows * config.fine, grid.columns * config.fine
+        cells = cell_numbers(points, BevGrid(grid.range, rows, columns), config.border)
+        x = collect(context, jax.nn.softmax(logits, -1), cells, rows * columns).reshape(rows, columns, config.dim)
+        for i, stride in enumerate((1, config.fine, 1)):
+            conv = nn.Conv(
+                config.dim,
+                (3, 3),
+                (stride, stride),
+                [(1, 1), (1, 1)],
+                use_bias=False,
+                kernel_init=nn.initializers.xavier_uniform(),
+                name=f"conv_{i}",
+            )
+            x = nn.relu(BatchNorm(name=f"norm_{i}")(conv(x), train=train))
+        return x, logits
+
+    def __call__(
+        self,
+        levels: Sequence[Float[Array, "v h w c"]],
+        cameras: CameraViews,
+        *,
+        train: bool,
+        fuse: BevHook | None = None,
+    ) -> Float[Array, "y x c"]:
+        """Return BEV features, from feature maps that cover the image arrays of calibrated cameras.
+
+        Sows the depth logits as auxiliary output `depth`, if the depth is supervised.
+
+        Args:
+            levels: one level of feature maps.
+            cameras: calibration and validity; of the images, only the shape is used.
+            train: see `encode`.
+            fuse: how priors change the BEV features, once; positions are a sine encoding of (x, y).
+
+        Raises:
+            UserError: several levels, or more cameras than configured.
+        """
+        config, grid = self.config, self.config.grid
+        if len(levels) != 1 or len(cameras.valid) > config.cameras:
+            raise UserError(
+                f"the lift takes one level of feature maps of at most {config.cameras} cameras and got {len(levels)} "
+                f"levels of {len(cameras.valid)}: change `images` of the encoder, or `cameras` of LiftConfig"
+            )
+        bev, logits = self.lift(levels[0], cameras, train=train)
+        if config.supervised and self.is_mutable_collection(AUXILIARY):
+            self.sow(AUXILIARY, "depth", logits)
+        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
+        bev = lax.optimization_barrier(bev)
+        if fuse is None:
+            return bev
+        places = cell_points(grid)
+        position = sine_encoding(jnp.asarray(places), config.dim // 4, lowest=0.125)
+        return lax.optimization_barrier(fuse(0, places, bev.reshape(-1, config.dim), position).reshape(bev.shape))
+
+    def lift(
+        self, features: Float[Array, "v h w c"], cameras: CameraViews, *, train: bool
+    ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
+        """Return what `encode` does, from calibrated cameras."""
+        size, shape = cameras.image.shape[1:3], (features.shape[1], features.shape[2])
+        valid = jnp.asarray(cameras.valid)[:, None, None]
+        # A missing camera's calibration may be anything; it must reach neither the points nor the norms.
+        eye = jnp.eye(4, dtype=jnp.float32)[None]
+        pose = jnp.where(valid, cameras.camera_from_ego, eye)
+        intrinsics = jnp.where(valid, cameras.intrinsics, eye[:, :3, :3])
+        # Full float32: accelerators may multiply matrices at lower precision by default.
+        with jax.default_matmul_precision("highest"):
+            points = ray_points(intrinsics, pose, size, shape, self.config.depth)
+        points = jnp.where(valid[..., None, None], points, jnp.nan)
+        features = jnp.where(valid[..., None], features, 0.0)
+        vector = camera_vector(intrinsics, pose, self.config.image_scale)
+        return self.encode(features, vector, points, train=train)
+
+
+def ray_points(
+    intrinsics: Float[Array, "v 3 3"],
+    camera_from_ego: Float[Array, "v 4 4"],
+    size: tuple[int, int],
+    shape: tuple[int, int],
+    depth: tuple[float, float, float],
+) -> Float[Array, "v d h w 3"]:
+    """Return the points of the rays of all image cells, metres, ego frame.
+
+    As in the published code, the first and last cells' rays pass through the corner pixels of the image array, and a
+    bin's point lies at the bin's near end.
+
+    Args:
+        intrinsics, camera_from_ego: of the images as they are.
+        size: (rows, columns) of the image array, pixels.
+        shape: (h, w) of the feature maps.
+        depth: first, last (excluded) and size of the bins, metres.
+    """
+    low, high, step = depth
+    d = low + step * jnp.arange(round((high - low) / step))
+    v, u = (jnp.linspace(0.0, pixels - 1.0, cells) for pixels, cells in zip(size, shape, strict=True))
+    d, v, u = jnp.meshgrid(d, v, u, indexing="ij")
+    pixels = jnp.stack([u * d, v * d, d], -1).reshape(-1, 3)
+
+    def one(intrinsics, camera_from_ego):
+        local = pixels @ jnp.linalg.inv(intrinsics).T
+        return (local - camera_from_ego[None, :3, 3]) @ camera_from_ego[:3, :3]
+
+    return jax.vmap(one)(intrinsics, camera_from_ego).reshape(len(intrinsics), *d.shape, 3)
+
+
+def camera_vector(
+    intrinsics: Float[Array, "v 3 3"], camera_from_ego: Float[Array, "v 4 4"], scale: float
+) -> Float[Array, "v 22"]:
+    """Return the parameters that the depth network knows of each camera.
+
+    Focal lengths and centre of the native image, the rows of the affine map from it to the image (2 x 3), and the
+    camera's pose in the ego frame (3 x 4).
+    """
+    count, native = len(intrinsics), intrinsics[:, :2] / scale
+    lens = jnp.stack([native[:, 0, 0], native[:, 1, 1], native[:, 0, 2], native[:, 1, 2]], -1)
+    affine = jnp.broadcast_to(jnp.array([[scale, 0.0, 0.0, 0.0, scale, 0.0]]), (count, 6))
+    rotation = camera_from_ego[:, :3, :3].swapaxes(1, 2)
+    place = -jnp.einsum("vij,vj->vi", rotation, camera_from_ego[:, :3, 3])
+    pose = jnp.concatenate([rotation, place[..., None]], -1).reshape(count, 12)
+    return jnp.concatenate([lens, affine, pose], -1)
+
+
+def cell_numbers(
+    points: Float[Array, "*b 3"], grid: BevGrid, border: Literal["exact", "published"]
+) -> Int[Array, "*b"]:
+    """Return the number of the cell of each point, row by row; the number of cells for one outside the range or NaN."""
+    count = jnp.array([grid.columns, grid.rows, 1], jnp.float32).reshape((1,) * (points.ndim - 1) + (3,))
+    place = grid.range.normalise(points) * count
+    lowest = -1.0 if border == "published" else 0.0
+    above = (place > lowest) if border == "published" else (place >= lowest)
+    inside = (above & (place < count)).all(-1)
+    column, row = (jnp.where(inside, place[..., axis], 0.0).astype(jnp.int32) for axis in (0, 1))
+    return jnp.where(inside, row * grid.columns + column, grid.rows * grid.columns)
+
+
+def collect(
+    context: Float[Array, "v h w c"],
+    depth: Float[Array, "v h w d"],
+    cells: Int[Array, "v d h w"],
+    count: int,
+) -> Float[Array, "n c"]:
+    """Return for each of N = `count` cells the sum over its points of context times depth probability.
+
+    Args:
+        context: features of the image cells.
+        depth: probabilities of the bins.
+        cells: of the points; numbers from `count` on are left out.
+        count: N.
+    """
+    flat = context.reshape(-1, context.shape[-1])
+    parts = (
+        jnp.moveaxis(depth, -1, 0).reshape(depth.shape[-1], -1),
+        jnp.moveaxis(cells, 1, 0).reshape(depth.shape[-1], -1),
+    )
+
+    def add(total, part):
+        probability, cell = part
+        return total.at[cell].add(probability[:, None] * flat, mode="drop"), None
+
+    return lax.scan(add, jnp.zeros((count, flat.shape[1]), flat.dtype), parts)[0]

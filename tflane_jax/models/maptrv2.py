@@ -1,0 +1,205 @@
+"""MapTRv2 (Liao et al. 2024), with or without priors: MapTR with decoupled attention and one-to-many training.
+
+Differences from MapTR (`models.maptr`): image features are lifted into BEV by their depth (`models.lift`);
+self-attention runs among lines and, apart from that, along each line; in training, a second group of queries learns
+from true lines that are repeated, BEV and image features learn masks of the lines, and the lift learns depth. Source:
+docs/reference/maptrv2.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from tflane_jax.errors import UserError
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.deformable import DeformableAttention
+from tflane_jax.layers.transformer import FeedForward, TransformerConfig
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.host import Host
+from tflane_jax.models.lift import LiftConfig
+from tflane_jax.models.map_lines import (
+    PAPER_LINE_DECODER,
+    LineDecoderConfig,
+    LineHeads,
+    LineQueries,
+    PointQueries,
+    point_position,
+)
+from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, make_prediction
+from tflane_jax.models.prior import HostQueries
+from tflane_jax.models.priors import ByPrior, fuse_into_queries
+from tflane_jax.scene import MapLines, Prediction
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapTrV2Config(MapTrConfig):
+    """Configuration of MapTRv2; without priors, the vision-only baseline.
+
+    Attributes:
+        many: lines of the one-to-many group; 0 for none. Not together with `denoising`.
+        line_mask: whether the BEV features learn a mask of all lines.
+        decoder, denoising, encoder, range, priors: see `MapTrConfig`.
+    """
+
+    many: int = 0
+    line_mask: bool = False
+
+    @property
+    def auxiliary(self) -> tuple[AuxiliaryName, ...]:
+        """Those of MapTR, the one-to-many group, and those that BEV and image features learn."""
+        encoder = self.encoder if isinstance(self.encoder, CameraEncoderConfig) else None
+        learned: dict[AuxiliaryName, bool] = {
+            "one_to_many": self.many > 0,
+            "line_mask": self.line_mask,
+            "view_line_masks": encoder is not None and encoder.line_masks,
+            "depth": encoder is not None and isinstance(encoder.bev, LiftConfig) and encoder.bev.supervised,
+        }
+        return (*super().auxiliary, *(name for name, wanted in learned.items() if wanted))
+
+    def build(self) -> Host:
+        """Return the Linen module; raises UserError where its parts do not fit together."""
+        self.check()
+        if self.many and self.denoising is not None:
+            raise UserError("choose one of task.model.many and task.model.denoising: both add queries in training")
+        return MapTrV2(self)
+
+
+PAPER_LIFT_ENCODER = CameraEncoderConfig(PAPER_MAP_ENCODER.images, LiftConfig(supervised=True), line_masks=True)
+
+
+def paper_config() -> MapTrV2Config:
+    """Return the published sizes on nuScenes: ResNet-50, six cameras, 200 x 100 cells, 50 and 300 lines."""
+    return MapTrV2Config(
+        encoder=PAPER_LIFT_ENCODER, range=PAPER_RANGE, decoder=PAPER_LINE_DECODER, many=300, line_mask=True
+    )
+
+
+class MapTrV2(MapTr):
+    """From one example to the predictions of every decoder layer."""
+
+    config: MapTrV2Config
+
+    @nn.compact
+    def decode(
+        self,
+        bev: Float[Array, "h w e"],
+        tokens: ByPrior | None = None,
+        lines: MapLines | None = None,
+        *,
+        deterministic: bool = True,
+    ) -> Prediction:
+        """Return the lines of every decoder layer from BEV features and prior tokens, as `MapTr.decode` does.
+
+        Sows the lines of the one-to-many group as the auxiliary output `one_to_many`, and the mask as `line_mask`.
+        """
+        config, count = self.config, self.config.decoder.queries
+        training = self.is_mutable_collection(AUXILIARY)
+        if config.line_mask and training:
+            self.sow(AUXILIARY, "line_mask", LineMaskHead(name="mask_head")(bev))
+        if not config.many:
+            return self.decode_one_to_one(bev, tokens, lines, deterministic)
+        start = LineQueries(config.decoder, config.spec.bev_range, config.many, name="queries")()
+        if not training:
+            start = jax.tree.map(lambda leaf: leaf[:count], start)
+        found = self.decode_queries(start, bev, None, tokens or {}, deterministic)
+        if training:
+            self.sow(AUXILIARY, "one_to_many", jax.tree.map(lambda leaf: leaf[:, count:], found.lines))
+        return jax.tree.map(lambda leaf: leaf[:, :count], found)
+
+    def decode_queries(self, start: PointQueries, bev, elements, tokens, deterministic) -> Prediction:
+        """Return the predictions of one set of queries; those of the one-to-many group exchange nothing with others."""
+        config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
+        (lines, points, dim), outputs = queries.shape, []
+        groups = None
+        if lines > config.queries:
+            many = jnp.arange(lines) >= config.queries
+            groups = many[:, None] == many[None]
+        every = None if groups is None else jnp.repeat(jnp.repeat(groups, points, 0), points, 1)
+        for i in range(config.layers):
+            placed = point_position(config, i, position, reference)
+            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), every)
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
+            layer = DecoupledLayer(config, name=f"layer_{i}")
+            queries = layer(queries, placed, reference, bev, groups, deterministic=deterministic)
+            heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
+            outputs.append(heads(queries, reference))
+            reference = lax.stop_gradient(outputs[-1].unit)
+        return make_prediction(outputs)
+
+
+class DecoupledLayer(nn.Module):
+    """Self-attention among lines, then among the points of a line, deformable attention, feed-forward; post-norm.
+
+    Attributes:
+        config: sizes.
+    """
+
+    config: LineDecoderConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        queries: Float[Array, "i p c"],
+        position: Float[Array, "i p c"],
+        reference: Float[Array, "i p d"],
+        bev: Float[Array, "h w e"],
+        groups: Bool[Array, "i i"] | None = None,
+        *,
+        deterministic: bool = True,
+    ) -> Float[Array, "i p c"]:
+        """Return the queries after the layer.
+
+        Args:
+            queries, position: content of the queries and the position encoding added to it in attention.
+            reference: points in [0, 1].
+            bev: BEV features, row 0 at the smallest y, column 0 at the smallest x.
+            groups: which line may attend to which; None: all to all.
+            deterministic: no dropout.
+        """
+        config, (h, w, e) = self.config, bev.shape
+
+        def add(name, x, change):
+            change = nn.Dropout(config.dropout, name=f"{name}_dropout")(change, deterministic=deterministic)
+            return nn.LayerNorm(epsilon=1e-5, name=f"{name}_norm")(x + change)
+
+        def among(axis, mask, name):
+            """Attention among the queries along an axis, for each index of the other one."""
+            attend = nn.vmap(
+                _SelfAttention,
+                in_axes=(1 - axis, 1 - axis, None, None),  # pyright: ignore[reportArgumentType]
+                out_axes=1 - axis,
+                variable_axes={"params": None, "intermediates": 0},
+                split_rngs={"params": False, "dropout": True},
+            )
+            module = attend(config.dim, config.heads, config.dropout, name=name)
+            return add(name, queries, module(queries, queries + position, mask, deterministic))
+
+        queries = among(0, groups, "line_attention")
+        queries = among(1, None, "point_attention")
+        sample = DeformableAttention(config.dim, config.heads, config.sampling_points, name="bev_attention")
+        placed = (queries + position).reshape(-1, config.dim)
+        around = reference[..., :2].reshape(-1, 1, 2)
+        sampled = sample(placed, bev.reshape(h * w, e), ((h, w),), around)
+        queries = add("bev_attention", queries, sampled.reshape(queries.shape))
+        block = FeedForward(TransformerConfig(config.heads, config.hidden, config.dropout), name="feed_forward")
+        return add("feed_forward", queries, block(queries, deterministic=deterministic))
+
+
+class _SelfAttention(nn.Module):
+    """Attention among queries, with positional arguments for `nn.vmap`."""
+
+    dim: int
+    heads: int
+    dropout: float
+
+    @nn.compact
+    def __call__(self, queries, placed, mask, deterministic):
+        attention = MultiHeadAttention(self.dim, self.heads, self.dropout, name="attention")
+        return attention(placed, placed, queries, mask, deterministic=deterministic)

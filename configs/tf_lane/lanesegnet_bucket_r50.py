@@ -10,11 +10,13 @@ predicts areas as the published code does, without the reference that its decode
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config
 from tflane_jax.datasets.view_images import LANESEGNET_BUCKET
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER
 from tflane_jax.models.lanesegnet import LaneSegNetConfig, paper_bucket_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+HERE = Path(__file__)
 
 
 def get_config() -> RunConfig:
@@ -30,13 +32,12 @@ def ablations() -> dict[str, RunConfig]:
 
 def _bucket(model: LaneSegNetConfig) -> RunConfig:
     """Return LaneSegNet's configuration with another model, and the labels and images that it takes."""
-    config = load_config(str(Path(__file__).with_name("lanesegnet_r50.py")))
+    config = load_config(str(HERE.with_name("lanesegnet_r50.py")))
+    six_layers = load_ablations(str(HERE.parent.with_name("camera") / "toponet_r50.py"))["six_layers"]
     assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(six_layers.task, LaneGraphTask)
     assert isinstance(config.data, OpenLaneV2Data)
-    # Attention to as many cells as one camera sees, as in camera/toponet_r50.
-    bev = replace(model.encoder.bev, capacity=config.task.model.encoder.bev.capacity)
-    model = replace(model, encoder=replace(model.encoder, bev=bev))
+    task = replace(config.task, model=replace(model, encoder=six_layers.task.model.encoder))
     example = replace(config.data.example, crossings="ring")
     data = replace(config.data, image=LANESEGNET_BUCKET, example=example, augmentation=None)
-    training = replace(config.training, best_metric="all/OLUS")
-    return replace(config, task=replace(config.task, model=model), data=data, training=training)
+    return replace(config, task=task, data=data, training=replace(config.training, best_metric="all/OLUS"))

@@ -120,6 +120,7 @@ def test_export_writes_a_program_and_its_latencies(trained, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.json", "m.md", "m.stablehlo"]
 
 
+@pytest.mark.slow
 def test_a_comparison_quotes_table_1(trained, config, tmp_path):
     out = tmp_path / "table1"
     command = ["compare", f"a={config}", f"b={config}", "--seeds", "0", "--out", str(out)]

@@ -10,8 +10,8 @@ from tests.golden_compare import compare
 from tests.models.golden_lanes import by_layer
 from tests.parameters import random_params
 from tflane_jax.convert.toponet import element_decoder_params
-from tflane_jax.losses.toponet import TopoNetLossConfig, element_losses
-from tflane_jax.losses.traffic_elements import element_cost
+from tflane_jax.losses.toponet import TopoNetLossConfig
+from tflane_jax.losses.traffic_elements import element_cost, element_losses
 from tflane_jax.matching import match
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig
 from tflane_jax.scene import ElementPrediction, TrafficElements, stack_examples
@@ -68,7 +68,7 @@ def check(case):
         prediction = ElementPrediction(found.box, found.logits, jnp.zeros((*found.box.shape[:3], 1)))
         clear = elements.replace(box=jnp.where(elements.valid[..., None, None], elements.box, 0.0))
         cost = jax.vmap(lambda p, e, s: element_cost(p, e, s, weights.elements))(prediction, clear, sizes)
-        terms = element_losses(prediction, match(cost, elements.valid[:, None]), clear, sizes, weights)
+        terms = element_losses(prediction, match(cost, elements.valid[:, None]), clear, sizes, weights.elements)
         box = found.box / sizes[:, None, None, None].astype(np.float32)
         box = jnp.concatenate([box.mean(-2), box[..., 1, :] - box[..., 0, :]], -1)
         # The reference puts the layers before the batch.

@@ -18,6 +18,7 @@ from tests.models.cases import (
     make_line_example,
 )
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
@@ -137,7 +138,7 @@ def test_batch_is_a_vmap(fitted, name):
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=2e-4, atol=2e-4), alone, together)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", with_slow(MODELS, quick=("traffic", "segments, traffic", "lines, traffic")))
 def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
     task, params, _ = fitted[name]
     chex.clear_trace_counter()
@@ -158,9 +159,9 @@ def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
         assert all(not np.asarray(g).any() for g in jax.tree.leaves(silent))
 
 
-@pytest.mark.parametrize("model", [WITH_TRAFFIC, SMALL_SEGMENTS, SMALL_LINES], ids=["toponet", "lanesegnet", "maptr"])
-def test_same_key_same_parameters(model):
-    task = make_task(model)
+@pytest.mark.parametrize("name", with_slow(("traffic", "segments, traffic", "lines, traffic"), quick=("traffic",)))
+def test_same_key_same_parameters(name):
+    task = make_task(MODELS[name])
     a, b = (jax.jit(task.init).lower(jax.random.key(7), make_line_example()) for _ in range(2))
     assert a.as_text() == b.as_text()
     params = a.compile()(jax.random.key(7), make_line_example())

@@ -103,7 +103,8 @@ def test_an_untrained_shape_head_proposes_straight_lanes_along_the_bin():
     np.testing.assert_allclose(length, 24.0, rtol=1e-5)
 
 
-@pytest.mark.parametrize("host", ["toponet", pytest.param("bevformer_detr", marks=pytest.mark.slow)])
+@pytest.mark.slow  # tests/models/test_lanesegnet.py trains LaneSegNet with proposals
+@pytest.mark.parametrize("host", ["toponet", "bevformer_detr"])
 def test_hosts_train_with_proposals_and_all_their_parameters_learn(host):
     example = make_example()
     points = example.lanes.points.shape[1]

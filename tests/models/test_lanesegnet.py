@@ -171,6 +171,18 @@ def test_the_published_fault_of_the_areas_changes_their_points_alone():
     np.testing.assert_allclose(logit[1] - logit[0], change[1], rtol=1e-2, atol=1e-3)
 
 
+def test_areas_train_and_all_their_parameters_learn():
+    task = LaneGraphTask(BUCKET, LaneSegNetLossConfig())
+    example = make_segment_example()
+    params = random_params(task.init, example)
+    run = jax.jit(jax.value_and_grad(task.loss, has_aux=True))
+    (_, report), gradient = run(params, stack_examples([example]), jax.random.key(1))
+    assert {"area_class", "area_points", "area_direction"} <= set(report)
+    assert (float(report["matching/areas"]), float(report["matching/segments"])) == (2.0, 4.0)
+    assert all(np.any(leaf) for leaf in jax.tree.leaves(gradient["areas"]["heads_1"]))
+
+
+@pytest.mark.slow
 def test_the_bucket_trains_on_areas_and_elements_and_all_their_parameters_learn():
     model = replace(BUCKET, encoder=CAMERA, elements=ELEMENTS)
     task = LaneGraphTask(model, LaneSegNetLossConfig(cell_weight=0.0))

@@ -99,6 +99,7 @@ def make_depth_example(seed):
     return example.replace(cameras=cameras, map_lines=make_line_example(seed).map_lines)
 
 
+@pytest.mark.slow
 def test_with_cameras_it_learns_depth_and_masks_in_the_images_too():
     images = replace(CAMERA.images, stages=(3,), pyramid=replace(CAMERA.images.pyramid, levels=1))
     lift = LiftConfig(CAMERA.bev.grid, dim=16, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, supervised=True)

@@ -20,6 +20,7 @@ from tests.models.cases import (
 )
 from tests.models.toy_prior import CrossingsConfig, with_crossings
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.priors import PriorsConfig, encode, fuse_into_queries, observe, observe_clip
@@ -56,7 +57,7 @@ def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-@pytest.mark.parametrize("name", HOSTS)
+@pytest.mark.parametrize("name", with_slow(HOSTS, quick=set(HOSTS) - {"camera detr", "camera lanesegnet"}))
 def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     host, make = HOSTS[name]
     task = LaneGraphTask(replace(host, priors=WithToy(traffic_flow=FLOW, crossings=CrossingsConfig())))

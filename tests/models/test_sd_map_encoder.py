@@ -152,7 +152,9 @@ def cameras():
     return BevFormer(replace(CONFIG, remat=True)), (levels(), ring(), None, jnp.eye(4))
 
 
-@pytest.mark.parametrize(("make", "layers"), [(evidence, 2), (cameras, 1)], ids=["evidence", "cameras"])
+@pytest.mark.parametrize(
+    ("make", "layers"), [(evidence, 2), pytest.param(cameras, 1, marks=pytest.mark.slow)], ids=["evidence", "cameras"]
+)
 def test_encoders_fuse_the_map_in_every_layer(make, layers):
     encoder, inputs = make()
     fused, plain = Fused(encoder), Fused(encoder, fuses=False)

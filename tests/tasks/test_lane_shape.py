@@ -10,6 +10,7 @@ import pytest
 
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
@@ -53,7 +54,7 @@ def fit(name):
     return Fitted(tiny_task(ENCODERS[name]))
 
 
-@pytest.fixture(params=ENCODERS)
+@pytest.fixture(params=with_slow(ENCODERS, quick=("transformer", "gtn")))
 def fitted(request):
     return fit(request.param)
 

@@ -110,6 +110,7 @@ def test_a_clip_initialises_as_a_frame(params):
     assert jax.tree.map(lambda leaf: leaf.shape, shapes) == jax.tree.map(lambda leaf: leaf.shape, params)
 
 
+@pytest.mark.slow
 def test_the_summary_of_a_task_of_clips_counts_whole_clips():
     shapes = shapes_of(seeing(observed()))
     alone, together = (training_program(task, shapes, 2, OptimConfig(), compiled=False) for task in (ALONE, CLIPS))
@@ -117,6 +118,7 @@ def test_the_summary_of_a_task_of_clips_counts_whole_clips():
     assert together.gflop > 0.9 * alone.gflop
 
 
+@pytest.mark.slow
 def test_cameras_are_trained_on_clips_too():
     """Batch statistics and the BEV memory go from frame to frame; shapes alone show that they fit."""
     task = LaneGraphTask(CAMERA_TOPONET, clip=2)

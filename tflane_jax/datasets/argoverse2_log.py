@@ -16,6 +16,7 @@ import numpy as np
 
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
+from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
@@ -35,10 +36,8 @@ _BOX_COLUMNS: Mapping[str, Kind] = {
     **dict.fromkeys(_SIZE, "number"),
     "num_interior_pts": "integer",
 }
-# Metres per second, metres, and deviation of a quaternion's norm from 1.
-_FASTEST, _JITTER, _UNIT = 70.0, 0.5, 1e-2
-# Metres from the vehicle to the nearest lane. Parking lots and driveways are not on the map; another city is farther.
-_FAR = 200.0
+# Deviation of a quaternion's norm from 1.
+_UNIT = 1e-2
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
 
@@ -119,7 +118,7 @@ def load_log(
     city = VectorMap({})
     if with_map:
         city = read_map(folder / "map")
-        _check_place(folder, city, at_frames)
+        check_place([lane.centerline for lane in city.segments.values()], at_frames[:, :2, 3], f"{folder} and its map")
     return Log(
         name=folder.name,
         source="argoverse2",
@@ -136,17 +135,6 @@ def load_log(
     )
 
 
-def _check_place(folder: Path, city: VectorMap, poses: np.ndarray) -> None:
-    """Raise UserError if the vehicle is not where the map is."""
-    lanes = np.concatenate([lane.centerline[:, :2] for lane in city.segments.values()])
-    metres = float(np.linalg.norm(poses[:, None, :2, 3] - lanes, axis=-1).min())
-    if metres > _FAR:
-        raise UserError(
-            f"{folder}: the vehicle is never nearer than {metres:.0f} m to a lane of its map: poses and map are not of "
-            "the same log; download both again"
-        )
-
-
 def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return timestamps (P,), ascending, and global_from_ego (P, 4, 4).
 
@@ -158,13 +146,7 @@ def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     times, poses = table["timestamp_ns"][order], _pose_of(path, table)[order]
     if (same := np.diff(times) == 0).any():
         raise UserError(f"{path} has two poses at {times[same.argmax()]}: download it again")
-    metres, seconds = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=-1), np.diff(times) / 1e9
-    if (jumps := metres > _FASTEST * seconds + _JITTER).any():
-        i = int(jumps.argmax())
-        raise UserError(
-            f"{path}: at {times[i + 1]} the vehicle is {metres[i]:.0f} m from where it was {seconds[i]:.2g} s before: "
-            "download it again"
-        )
+    check_motion(poses[:, :2, 3], times, [f"{path}: time {time}" for time in times.tolist()])
     return times, poses
 
 
@@ -191,6 +173,8 @@ def _read_boxes(path: Path) -> dict[str, np.ndarray]:
     if (count > 1).any():
         time, track = keys[(count > 1).argmax()]
         raise UserError(f"{path} has track {track} twice at {time}: download it again")
+    place = np.stack([boxes[name] for name in ("tx_m", "ty_m", "tz_m")], -1)
+    check_distance(place, [f"{path}: row {row}" for row in range(len(place))])
     return boxes
 
 

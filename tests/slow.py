@@ -1,0 +1,8 @@
+"""Parameters of tests of which only some run by default."""
+
+import pytest
+
+
+def with_slow(names, quick):
+    """Return parameters: those not in `quick` belong to `make test-slow`."""
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]

@@ -85,7 +85,13 @@ def test_gradient_is_that_of_finite_differences():
     targets = lane_shape_targets(lines())
     config = LaneShapeLossConfig(least_depth=1e-2)
     check_grads(
-        lambda p: lane_shape_loss(p, targets, config)[0], (predictions(),), 1, ["rev"], eps=1e-3, atol=2e-2, rtol=2e-2
+        jax.jit(lambda p: lane_shape_loss(p, targets, config)[0]),
+        (predictions(),),
+        1,
+        ["rev"],
+        eps=1e-3,
+        atol=2e-2,
+        rtol=2e-2,
     )
 
 

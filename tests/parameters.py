@@ -17,6 +17,12 @@ def random_params(init, *arguments, spread=0.3):
     return jax.tree.map_with_path(lambda path, leaf: _random_leaf(path, leaf, spread), shapes)
 
 
+def zero_params(init, *arguments):
+    """Return parameters shaped like those of `init(key, *arguments)`, all of them zero."""
+    shapes = jax.eval_shape(init, jax.random.key(0), *arguments)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
 def _random_leaf(path, leaf, spread):
     rng = np.random.default_rng(zlib.crc32(jax.tree_util.keystr(path).encode()))
     if path[-1].key in ("scale", "var"):

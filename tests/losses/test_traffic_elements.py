@@ -111,7 +111,7 @@ def test_terms_match_plain_loops(counts):
     layers = [loop_terms(prediction, lanes, elements, layer) for layer in range(LAYERS)]
     for name, expected in zip(("class", "box", "iou", "lane"), layers[-1], strict=True):
         assert float(report[f"element_{name}"]) == pytest.approx(expected, rel=1e-4, abs=1e-6), name
-    alone = lane_graph_loss(prediction.replace(elements=None), lanes, TopoNetLossConfig())[0]
+    alone = value_and_gradient(prediction.replace(elements=None), lanes, None, None, TopoNetLossConfig())[0][0]
     assert float(total - alone) == pytest.approx(np.sum(layers), rel=1e-4)
     assert float(report["matching/elements"]) == pytest.approx(np.mean(counts))
 

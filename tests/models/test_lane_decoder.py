@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 
 from tests.models.cases import BASELINE
+from tests.parameters import zero_params
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.models.lane_decoder import LaneHeads, PointwiseRefinement, clip_with_return, directions, smooth_basis
 from tflane_jax.models.lane_queries import spread_lanes
@@ -81,7 +82,7 @@ def metric_heads(reference, unit_change, limits=None):
     config = dataclasses.replace(BASELINE.decoder, output="metric", points=reference.shape[1], relation=4)
     queries, bev = jnp.zeros((len(reference), config.dim)), jnp.zeros((4, 8, 5))
     heads = LaneHeads(config, RANGE, relations=False, limits=limits)
-    params = jax.tree.map(jnp.zeros_like, heads.init(jax.random.key(0), queries, reference, bev))
+    params = zero_params(heads.init, queries, reference, bev)
     # Column 0 of the basis moves all points alike.
     params["params"]["points"]["linear_2"]["bias"] = jnp.zeros((config.points, 3)).at[0].set(unit_change).reshape(-1)
     return jax.jit(lambda p: heads.apply(p, queries, reference, bev))(params), params, heads, (queries, reference, bev)
@@ -101,7 +102,7 @@ def test_lanes_end_at_the_limits_and_can_come_back_but_not_drift_away():
     np.testing.assert_allclose(output.points[..., 0], 50.0, rtol=1e-6)
 
     def slope(sign):
-        grads = jax.grad(lambda p: sign * heads.apply(p, *given).points[..., 0].sum())(params)
+        grads = jax.jit(jax.grad(lambda p: sign * heads.apply(p, *given).points[..., 0].sum()))(params)
         return grads["params"]["points"]["linear_2"]["bias"].reshape(5, 3)[0, 0]
 
     np.testing.assert_allclose(slope(1.0), 25.0, rtol=1e-4)  # five points, 5 m each

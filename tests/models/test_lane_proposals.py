@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.models.cases import BASELINE, make_example
-from tests.parameters import random_params
+from tests.parameters import random_params, zero_params
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_proposals import LaneProposals, best_cells, jittered_middles, lane_middles
@@ -97,8 +97,8 @@ def test_queries_lie_on_the_lanes_of_their_cells_and_the_shape_head_sees_the_tru
 def test_an_untrained_shape_head_proposes_straight_lanes_along_the_bin():
     bev = jnp.zeros((*SHAPE, 6))
     module = LaneProposals(DECODER, PerceptionRange((-100.0, 100.0), (-100.0, 100.0), (-1.0, 1.0)))
-    params = jax.tree.map(jnp.zeros_like, module.init(jax.random.key(0), bev, None))
-    _, _, reference = module.apply(params, bev, None)
+    params = zero_params(lambda key: module.init(key, bev, None))
+    _, _, reference = jax.jit(lambda p: module.apply(p, bev, None))(params)
     length = np.linalg.norm(np.asarray(200.0 * (reference[:, -1, :2] - reference[:, 0, :2])), axis=-1)
     np.testing.assert_allclose(length, 24.0, rtol=1e-5)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.models.cases import CAMERA, ELEMENTS, SEGMENTS, SMALL_SEGMENTS, make_bucket_example, make_segment_example
-from tests.parameters import random_params
+from tests.parameters import random_params, zero_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
@@ -93,7 +93,7 @@ def test_boundaries_of_the_small_form_start_beside_the_lane_and_end_at_the_borde
     line = np.stack([np.full(11, 0.99), np.linspace(0.2, 0.8, 11), np.full(11, 0.5)], -1)[None]
     line = np.concatenate([line, line - [0.3, 0, 0]]).astype(np.float32)
     queries = jnp.zeros((2, 16))
-    params = jax.tree.map(jnp.zeros_like, heads.init(jax.random.key(0), queries, line, BEV))
+    params = zero_params(heads.init, queries, line, BEV)
     found = jax.jit(lambda p: heads.apply(p, queries, line, BEV))(params)
     # Heading along +y, the left side is at smaller x.
     np.testing.assert_allclose(found.points[..., 0], np.array([[49.0], [19.0]]) + np.zeros((2, 11)), atol=1e-4)

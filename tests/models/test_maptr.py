@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.models.cases import CAMERA, ELEMENTS, LINES, SMALL_LINES, make_camera_example, make_line_example
-from tests.parameters import random_params
+from tests.parameters import random_params, zero_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
@@ -84,7 +84,7 @@ def test_lines_of_the_small_form_start_in_the_range_and_end_at_its_border():
     np.testing.assert_allclose(np.linalg.norm(start[:, -1] - start[:, 0], axis=-1), 24.0, rtol=0.3)
     heads = LineHeads(config.decoder, config.encoder.bev_range, config.range)
     queries, reference = jnp.zeros((2, 5, 16)), jnp.full((2, 5, 2), 0.5)
-    params = jax.tree.map(jnp.zeros_like, heads.init(jax.random.key(0), queries, reference))
+    params = zero_params(heads.init, queries, reference)
     params["params"]["points"]["linear_2"]["bias"] = jnp.array([1.0, -100.0])
     found = heads.apply(params, queries, reference)
     np.testing.assert_allclose(found.points, np.broadcast_to([5.0, -15.0], (2, 5, 2)), atol=1e-4)

@@ -100,6 +100,14 @@ def load_ablations(name: str) -> dict[str, RunConfig]:
     return _called(find_config(name), "ablations", dict)
 
 
+def with_priors_of(other: RunConfig, config: RunConfig) -> RunConfig:
+    """Return a configuration whose host has the priors of the host of another one."""
+    if not isinstance(other.task, LaneGraphTask) or not isinstance(config.task, LaneGraphTask):
+        raise UserError("only models of lanes around the vehicle have priors")
+    model = dataclasses.replace(config.task.model, priors=other.task.model.priors)
+    return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
+
+
 def _called(path: Path, function: str, kind: type[T]) -> T:
     """Run a config file and return the result of one of its functions."""
     spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)

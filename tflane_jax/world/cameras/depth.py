@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.geometry import invert_pose
+from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.solids import Bodies, polygon_starts, with_blobs
 from tflane_jax.world.render.camera import NEAR, FrontCamera
 from tflane_jax.world.render.polygons import SHIFT, clipped, fixed_point
@@ -59,17 +60,11 @@ def _add_bodies(inverse: Float[np.ndarray, "h w"], bodies: Bodies, camera: Front
         return
     eye = invert_pose(camera.camera_from_ego)[:3, 3]
     bodies = with_blobs(bodies, eye)
-    starts = polygon_starts(bodies)
-    a = bodies.corners[starts]
-    normal = np.cross(bodies.corners[starts + 1] - a, bodies.corners[starts + 2] - a)
-    pixels, depth = camera.image_of(bodies.corners)
-    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
-    nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
-    inside = ((high > 0.0) & (low < [camera.width, camera.height])).all(-1) | (nearest <= NEAR)
-    towards = ((eye - a) * normal).sum(-1)
-    for number in np.flatnonzero((towards > 0.0) & (farthest > NEAR) & inside).tolist():
-        corners, distance = (values[starts[number] : bodies.stops[number]] for values in (bodies.corners, depth))
-        if nearest[number] <= NEAR:
+    faces = faces_of(bodies.corners, polygon_starts(bodies), camera, eye)
+    for number in faces.shown.tolist():
+        part = slice(faces.starts[number], bodies.stops[number])
+        corners, distance = bodies.corners[part], faces.depth[part]
+        if faces.near[number]:
             corners = clipped(corners, distance)
             distance = camera.image_of(corners)[1]
         ring = camera.image_of(corners)[0]
@@ -80,10 +75,11 @@ def _add_bodies(inverse: Float[np.ndarray, "h w"], bodies: Bodies, camera: Front
         covered = np.zeros((bottom - top, right - left), np.uint8)
         cv2.fillPoly(covered, [fixed_point(ring - [left, top])], 1, cv2.LINE_8, SHIFT)
         # On a plane, 1 / depth is linear in the pixel.
-        plane = (camera.camera_from_ego[:3, :3] @ normal[number]) @ np.linalg.inv(camera.intrinsics) / -towards[number]
+        plane = (camera.camera_from_ego[:3, :3] @ faces.normal[number]) @ np.linalg.inv(camera.intrinsics)
+        plane = plane / -faces.towards[number]
         u, v = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
         near = plane[0] * u + (plane[1] * v)[:, None] + plane[2]
         # cv2 fills the pixels of the border too, whose centres lie outside.
         near = np.clip(near, 1.0 / distance.max(), 1.0 / max(distance.min(), NEAR))
-        part = inverse[top:bottom, left:right]
-        np.maximum(part, np.where(covered > 0, near, 0.0), out=part)
+        window = inverse[top:bottom, left:right]
+        np.maximum(window, np.where(covered > 0, near, 0.0), out=window)

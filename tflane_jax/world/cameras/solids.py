@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.geometry import invert_pose
+from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.pictures import paint_picture
-from tflane_jax.world.render.camera import NEAR, FrontCamera
+from tflane_jax.world.render.camera import FrontCamera
 from tflane_jax.world.render.polygons import HEADLIGHTS, SHIFT, Solid, clipped, fixed_point
 from tflane_jax.world.render.weather import Weather
 
@@ -161,18 +162,11 @@ def draw_bodies(
         return
     eye = invert_pose(camera.camera_from_ego)[:3, 3]
     bodies = with_blobs(bodies, eye)
-    starts = polygon_starts(bodies)
-    a = bodies.corners[starts]
-    normal = np.cross(bodies.corners[starts + 1] - a, bodies.corners[starts + 2] - a)
-    pixels, depth = camera.image_of(bodies.corners)
-    low, high = np.minimum.reduceat(pixels, starts), np.maximum.reduceat(pixels, starts)
-    nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
-    near = nearest <= NEAR
-    inside = ((high > 0.0) & (low < [camera.width, camera.height])).all(-1)
-    visible = (((eye - a) * normal).sum(-1) > 0.0) & (farthest > NEAR) & (inside | near)
-    shown = np.flatnonzero(visible)
+    faces = faces_of(bodies.corners, polygon_starts(bodies), camera, eye)
+    starts, a, normal, near, shown = faces.starts, faces.corner, faces.normal, faces.near, faces.shown
     if not len(shown):
         return
+    low, high = faces.low, faces.high
     low[near], high[near] = -np.inf, np.inf
     present, owner = np.unique(bodies.owner[shown], return_inverse=True)
     outline = np.full((2, len(present), 2), np.inf)
@@ -182,12 +176,12 @@ def draw_bodies(
     rank[_far_to_near(bodies.boxes[present], eye, outline[0], -outline[1])] = np.arange(len(present))
     shown = shown[np.argsort(rank[owner], kind="stable")]
     colours = _lit(bodies.colours[shown], normal[shown], bodies.light[shown], a[shown], weather).tolist()
-    fixed = fixed_point(pixels)
+    fixed = fixed_point(faces.pixels)
     for number, colour in zip(shown.tolist(), colours, strict=True):
         part = slice(starts[number], bodies.stops[number])
         ring = fixed[part]
         if near[number]:
-            ring = fixed_point(camera.image_of(clipped(bodies.corners[part], depth[part]))[0])
+            ring = fixed_point(camera.image_of(clipped(bodies.corners[part], faces.depth[part]))[0])
         if number in bodies.pictures and not near[number]:
             black = _lit(_INK, normal[[number]], bodies.light[[number]], a[[number]], weather)[0]
             paint_picture(image, bodies.corners[part], bodies.pictures[number], camera, np.stack([black, colour]))

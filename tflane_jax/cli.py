@@ -50,6 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
     data.data(commands)
     models.summary(commands)
     comparisons.compare(commands)
+    comparisons.tables(commands)
     comparisons.sweep(commands)
     comparisons.score(commands)
     markers.markers(commands)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from tflane_jax.ablations.compare import compare
-from tflane_jax.ablations.declaration import Declaration
+from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.ablations.effects import Effect, effects
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import OWN_TEST
@@ -35,7 +35,7 @@ The scenes are made first; then both trainings run side by side."""
 _BASELINE, _TREATMENT = "baseline", "+traffic"
 _BLIND = f"{_TREATMENT}, no traffic flow at inference"
 _COLUMNS = {_BASELINE: _BASELINE, _TREATMENT: _TREATMENT, _BLIND: "+traffic, none at inference"}
-_DECLARED = Declaration("hidden+traffic/recall", _TREATMENT, "hidden-traffic/recall")
+_DECLARED = Declaration("hidden+traffic/recall", (Claim(_TREATMENT),), "hidden-traffic/recall")
 _LANES = {
     "all/recall": "all",
     _DECLARED.primary: "hidden, vehicles drove along them",

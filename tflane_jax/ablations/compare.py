@@ -55,8 +55,8 @@ def compare(
         tests: further test sets by name: settings, `--data.name value`, that differ from the own test split.
         retrain: whether runs of other configurations in the folders are deleted and trained anew.
         declaration: what is tested. It is written to `declaration.json` before the trainings, and the report gets a
-            table of these tests alone, `effects.md`. The picture shows where its treatment and the control differ;
-            without a declaration, where the first two configurations do.
+            table of these tests alone, `effects.md`. The picture shows where the first claim's treatment and the
+            control differ; without a declaration, where the first two configurations do.
         summary: returns the text to print if no training failed; None prints all tables. The files are the same.
 
     Returns:
@@ -76,25 +76,16 @@ def compare(
     every = [plan[name][i] for i in range(len(seeds)) for name in plan]
     failures = train_all(every, jobs)
 
-    results, models = Results(tuple(configs), tuple(seeds), tests), {}
-    failed = {failure.job.folder for failure in failures}
-    trained = {name: [job for job in planned if job.folder not in failed] for name, planned in plan.items()}
-    failures += _evaluate(trained, results)
-    written = _save_plan(plan, failures, results, out)
+    results = Results(tuple(configs), tuple(seeds), tests)
+    trained = without_failures(plan, failures)
+    failures += evaluate_runs(trained, results)
+    written = [save_plan(plan, failures, results, out)]
     if not results.scores:
-        raise UserError(_summary(failures, len(every)))
-    first = next(iter(configs.values()))
-    for name, done in trained.items():
-        if results.has(name):
-            run = open_run(done[0].folder, "last")
-            models[name] = Model(run.config.task, run.params[0])
+        raise UserError(summary_of(failures, len(every)))
+    first, models = next(iter(configs.values())), first_models(trained, results)
     remarks = {name: model.task.remarks(model.params) for name, model in models.items()}
-    if importlib.util.find_spec("matplotlib") is not None:
-        source = first.data.source("test")
-        if declaration is not None:
-            pair = next(iter(configs)), declaration.treatment
-            models = {name: models[name] for name in sorted(models, key=lambda name: name not in pair)}
-        written.append(first.task.draw_comparison(models, source, load_test_data(first), out / "comparison.png"))
+    pair = list(configs)[:2] if declaration is None else [next(iter(configs)), declaration.claims[0].treatment]
+    written += draw_models(first, models, pair, out / "comparison.png")
     with contextlib.nullcontext() if summary is None else contextlib.redirect_stdout(io.StringIO()):
         tables = save_report(results, first.task, remarks, out)
         if declared is not None:
@@ -102,7 +93,7 @@ def compare(
                 tables += save_effects(results, declared, test, first.task.errors, out / f"effects{suffix}")
         print("\nwritten:", *tables, *written, sep="\n  ")
     if failures:
-        raise UserError(_summary(failures, len(every)))
+        raise UserError(summary_of(failures, len(every)))
     if summary is not None:
         print(summary(results))
     return tables[0]
@@ -118,7 +109,13 @@ def _check_tests(configs: Mapping[str, RunConfig], tests: Tests) -> None:
             raise UserError(f"the configurations have different test data ({what}): their numbers cannot be compared")
 
 
-def _evaluate(trained: Mapping[str, Sequence[Job]], results: Results) -> list[Failure]:
+def without_failures(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure]) -> dict[str, list[Job]]:
+    """Return the trainings that did not fail."""
+    failed = {failure.job.folder for failure in failures}
+    return {name: [job for job in planned if job.folder not in failed] for name, planned in plan.items()}
+
+
+def evaluate_runs(trained: Mapping[str, Sequence[Job]], results: Results) -> list[Failure]:
     """Add the scores of all finished runs to the results, test set by test set; return the runs that failed."""
     failures: list[Failure] = []
     pairs = [(name, job) for name, done in trained.items() for job in done]
@@ -135,9 +132,29 @@ def _evaluate(trained: Mapping[str, Sequence[Job]], results: Results) -> list[Fa
     return failures
 
 
-def _save_plan(
-    plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], results: Results, out: Path
-) -> list[Path]:
+def first_models(trained: Mapping[str, Sequence[Job]], results: Results) -> dict[str, Model]:
+    """Return the model of each row's first seed at its last checkpoint."""
+    models = {}
+    for name, done in trained.items():
+        if results.has(name):
+            run = open_run(done[0].folder, "last")
+            models[name] = Model(run.config.task, run.params[0])
+    return models
+
+
+def draw_models(first: RunConfig, models: Mapping[str, Model], pair: Sequence[str], path: Path) -> list[Path]:
+    """Draw test frames in which the first two models differ, those of `pair` first; nothing without matplotlib.
+
+    Returns:
+        The picture, if it was drawn.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        return []
+    ordered = {name: models[name] for name in sorted(models, key=lambda name: name not in pair)}
+    return [first.task.draw_comparison(ordered, first.data.source("test"), load_test_data(first), path)]
+
+
+def save_plan(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure], results: Results, out: Path) -> Path:
     """Write what was compared: identity and folder of every run, failures, scores by seed."""
     content: dict[str, Any] = {
         "seeds": list(results.seeds),
@@ -150,10 +167,10 @@ def _save_plan(
         "scores": results.by_seed(),
     }
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "comparison.json", content)
-    return [out / "comparison.json"]
+    return write_json(out / "comparison.json", content)
 
 
-def _summary(failures: Sequence[Failure], count: int) -> str:
+def summary_of(failures: Sequence[Failure], count: int) -> str:
+    """Return what failed, for the error at the end."""
     lines = [f"{len(failures)} of {count} trainings failed; the same command tries them again:"]
     return "\n  ".join([*lines, *map(str, failures)])

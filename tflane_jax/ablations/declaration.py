@@ -24,18 +24,33 @@ FILE = "declaration.json"
 
 
 @dataclass(frozen=True)
+class Claim:
+    """A row is better than another one in the primary measure.
+
+    Attributes:
+        treatment: row whose effect is tested: a model, or "model, intervention".
+        control: row that it is compared with; None for every other model, and the interventions on the treatment.
+        text: what a paper claims, in words; "" for none.
+    """
+
+    treatment: str
+    control: str | None = None
+    text: str = ""
+
+
+@dataclass(frozen=True)
 class Declaration:
-    """What is tested: a treatment against every other row, on one score.
+    """What is tested: claims about rows, on one score.
 
     Attributes:
         primary: the score ("group/name") that decides.
-        treatment: name of the model whose effect is tested.
-        negative_control: score on which the treatment should change nothing; None for none.
+        claims: what is claimed; Holm's correction is over all of them.
+        negative_control: score on which no treatment should change anything; None for none.
         alpha: significance level of the corrected tests.
     """
 
     primary: str
-    treatment: str
+    claims: tuple[Claim, ...]
     negative_control: str | None = None
     alpha: float = 0.05
 
@@ -67,21 +82,17 @@ class Declared:
         if self.declaration.negative_control is not None:
             what += f", negative control {self.declaration.negative_control}"
         when = "before any run" if self.begun == 0 else f"when {self.begun} runs had begun already"
+        treatments = ", ".join(dict.fromkeys(claim.treatment for claim in self.declaration.claims))
         return (
-            f"Declared {when} ({self.time}): {what}, treatment {self.declaration.treatment}, "
+            f"Declared {when} ({self.time}): {what}, treatment {treatments}, "
             f"level {self.declaration.alpha:g}, {len(self.seeds)} seeds."
         )
 
 
 def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
-    """Raise UserError for a score that is not measured, or a treatment that is no row beside the control."""
-    control, *others = configs
-    if declaration.treatment not in others:
-        names = ", ".join(others) or "none"
-        raise UserError(
-            f"--treatment {declaration.treatment} is compared with the other configurations, the first of which "
-            f"({control}) is the control: choose one of the others ({names})"
-        )
+    """Raise UserError for a score that is not measured, or a claim about rows that there are not."""
+    for claim in declaration.claims:
+        _check_claim(claim, list(configs))
     for name, config in configs.items():
         known = config.task.score_names(config.data, config.evaluation)
         for score in declaration.scores:
@@ -94,16 +105,31 @@ def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
         raise UserError(f"--alpha {declaration.alpha:g} is no significance level between 0 and 1")
 
 
+def _check_claim(claim: Claim, models: Sequence[str]) -> None:
+    control, *others = models
+    if claim.control is None and claim.treatment not in others:
+        names = ", ".join(others) or "none"
+        raise UserError(
+            f"--treatment {claim.treatment} is compared with the other configurations, the first of which "
+            f"({control}) is the control: choose one of the others ({names})"
+        )
+    for row in (claim.treatment, claim.control):
+        # An intervention, "model, intervention", is known only when its model was evaluated.
+        if row is not None and not any(row == model or row.startswith(f"{model}, ") for model in models):
+            raise UserError(f"a claim is about {row}, which is none of the models ({', '.join(models)})")
+
+
 def declare(declaration: Declaration, plan: Mapping[str, Sequence[Job]], seeds: Sequence[int], out: Path) -> Declared:
     """Write the declaration into the comparison's folder, unless it is there already, and return it.
 
     Raises:
         UserError: the folder holds another declaration, or one of other models or without some of the seeds.
     """
-    path, wanted = out / FILE, asdict(declaration) | {"models": list(plan)}
+    claims = [asdict(claim) for claim in declaration.claims]
+    path, wanted = out / FILE, asdict(declaration) | {"claims": claims, "models": list(plan)}
     found: dict[str, Any] = {}
     with contextlib.suppress(FileNotFoundError):
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = _current_form(json.loads(path.read_text(encoding="utf-8")))
     if not found:
         source = provenance()
         begun = sum(job.start() == "resume" for planned in plan.values() for job in planned)
@@ -117,3 +143,10 @@ def declare(declaration: Declaration, plan: Mapping[str, Sequence[Job]], seeds: 
     if difference:
         raise UserError(f"{path} holds another declaration ({difference}): choose another folder with --out")
     return declared
+
+
+def _current_form(found: dict[str, Any]) -> dict[str, Any]:
+    """Return a declaration file's content with claims; files of an earlier form name one treatment."""
+    if "treatment" in found:
+        found["claims"] = [asdict(Claim(found.pop("treatment")))]
+    return found

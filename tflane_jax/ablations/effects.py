@@ -1,9 +1,10 @@
-"""The table of a declared comparison: the treatment against every other row, on the declared measures alone.
+"""The table of a declared comparison: treatments against other rows, on the declared measures alone.
 
-Rows are the other models and the interventions on the treatment itself. Every difference has two uncertainties: between
-seeds (paired t-test, corrected by Holm for the rows of one measure and checkpoint) and between test scenes (bootstrap
-interval over scenes, the seeds averaged). An effect is *shown* if the corrected p is below the declared level and the
-interval excludes 0, *contradicted* if the same holds in the wrong direction, else *not shown*.
+A claim without a control compares its treatment with the other models and the interventions on the treatment itself.
+Every difference has two uncertainties: between seeds (paired t-test, corrected by Holm for all differences of one
+measure and checkpoint) and between test scenes (bootstrap interval over scenes, the seeds averaged). An effect is
+*shown* if the corrected p is below the declared level and the interval excludes 0, *contradicted* if the same holds in
+the wrong direction, else *not shown*.
 
 The interval is exact for ratios of counts, such as recall. Scores that rank detections over all scenes (DET_l, AP_l,
 TOP_ll) have none.
@@ -21,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.ablations.declaration import Declaration, Declared
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared
 from tflane_jax.ablations.report import listed
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, Which
@@ -50,11 +51,12 @@ class Effect:
     """The treatment minus another row, in one measure at one checkpoint.
 
     Attributes:
-        measure, checkpoint, row: name of the measure, checkpoint of both rows, and the other row.
+        measure, checkpoint, claim: name of the measure, checkpoint of both rows, and the claim that is tested.
+        row: the other row.
         mean, std: of the other row, over seeds; the standard deviation with n - 1, NaN for one seed.
         difference: treatment minus the other row, mean over seeds.
         low, high: 95 % interval of the difference over scenes; NaN where there is none.
-        p, p_holm: of the two-sided paired t-test over seeds, and corrected for the rows of this measure and checkpoint.
+        p, p_holm: of the two-sided paired t-test over seeds, and corrected for all of this measure and checkpoint.
         better: number of seeds in which the treatment is better.
         seeds: that both rows have.
         finding: about the claim that the treatment is better.
@@ -62,6 +64,7 @@ class Effect:
 
     measure: str
     checkpoint: Which
+    claim: Claim
     row: str
     mean: float
     std: float
@@ -88,9 +91,9 @@ def measures(declaration: Declaration) -> tuple[Measure, ...]:
 def effects(
     results: Results, declaration: Declaration, test: str, which: Which, errors: Collection[str] = ()
 ) -> list[Effect]:
-    """Return the effects in every measure at one checkpoint, over the seeds that all compared rows have.
+    """Return the effects in every measure at one checkpoint, claim by claim.
 
-    Empty without a seed that all have.
+    Each claim is tested over the seeds that all of its rows have; one without such a seed has no effects.
 
     Args:
         results: of the comparison.
@@ -99,42 +102,54 @@ def effects(
         which: checkpoint.
         errors: scores where lower is better.
     """
-    table, treatment = results.rows(test, which), declaration.treatment
-    others = [row for row in table if row != treatment and (row in results.models or results.owners[row] == treatment)]
-    shared = tuple(
-        seed for seed in results.seeds if all(seed in table.get(row, {}) for row in (treatment, *others)) and others
-    )
-    if not shared:
-        return []
     sign, found = -1.0 if declaration.primary in errors else 1.0, []
     for measure in measures(declaration):
-        values = {row: _values(table[row], measure, shared) for row in (treatment, *others)}
-        samples = _samples(results, test, which, measure, (treatment, *others), shared)
-        of_measure = []
-        for row in others:
-            paired = paired_difference(sign * values[treatment], sign * values[row])
-            low, high = interval(samples[treatment] - samples[row]) if samples else (math.nan, math.nan)
-            of_measure.append(
-                Effect(
-                    measure=measure.name,
-                    checkpoint=which,
-                    row=row,
-                    mean=float(values[row].mean()),
-                    std=_std(values[row]),
-                    difference=sign * paired.mean,
-                    low=low,
-                    high=high,
-                    p=paired.p_value,
-                    p_holm=math.nan,
-                    better=paired.better,
-                    seeds=shared,
-                    finding="not shown",
-                )
-            )
-        for effect, corrected in zip(of_measure, holm([effect.p for effect in of_measure]), strict=True):
+        every = [e for claim in declaration.claims for e in _of_claim(results, claim, measure, test, which, sign)]
+        for effect, corrected in zip(every, holm([effect.p for effect in every]), strict=True):
             judged = _finding(effect, corrected, declaration.alpha, sign)
             found.append(replace(effect, p_holm=corrected, finding=judged))
     return found
+
+
+def _of_claim(results: Results, claim: Claim, measure: Measure, test: str, which: Which, sign: float) -> list[Effect]:
+    """Return the effects of a claim in one measure, not yet corrected and judged."""
+    table, treatment = results.rows(test, which), claim.treatment
+    others = [claim.control] if claim.control is not None else _compared(results, table, treatment)
+    shared = tuple(
+        seed for seed in results.seeds if others and all(seed in table.get(row, {}) for row in (treatment, *others))
+    )
+    if not shared:
+        return []
+    values = {row: _values(table[row], measure, shared) for row in (treatment, *others)}
+    samples = _samples(results, test, which, measure, (treatment, *others), shared)
+    found = []
+    for row in others:
+        paired = paired_difference(sign * values[treatment], sign * values[row])
+        low, high = interval(samples[treatment] - samples[row]) if samples else (math.nan, math.nan)
+        found.append(
+            Effect(
+                measure=measure.name,
+                checkpoint=which,
+                claim=claim,
+                row=row,
+                mean=float(values[row].mean()),
+                std=_std(values[row]),
+                difference=sign * paired.mean,
+                low=low,
+                high=high,
+                p=paired.p_value,
+                p_holm=math.nan,
+                better=paired.better,
+                seeds=shared,
+                finding="not shown",
+            )
+        )
+    return found
+
+
+def _compared(results: Results, table: Mapping[str, Any], treatment: str) -> list[str]:
+    """Return the rows that a claim without a control compares with."""
+    return [row for row in table if row != treatment and (row in results.models or results.owners[row] == treatment)]
 
 
 def _values(by_seed: Mapping[int, Mapping[str, float]], measure: Measure, seeds: Sequence[int]) -> np.ndarray:
@@ -177,19 +192,18 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     declaration = declared.declaration
     every = [effect for which in CHECKPOINTS for effect in effects(results, declaration, test, which, errors)]
     if not every:
-        print(f"\nno effects ({results.title(test)}): no seed that {declaration.treatment} and all other rows have")
+        names = ", ".join(dict.fromkeys(claim.treatment for claim in declaration.claims))
+        print(f"\nno effects ({results.title(test)}): no seed that {names} and the rows compared with it have")
         return []
     lines = [f"{results.protocol}, {results.title(test)}", "", declared.sentence()]
-    seeds = every[0].seeds
+    seeds = min((effect.seeds for effect in every), key=len)
     if set(seeds) != set(declared.seeds):
         lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
-    last = [effect for effect in every if effect.checkpoint == "last"]
-    by_row = [[effect for effect in last if effect.row == row] for row in dict.fromkeys(effect.row for effect in last)]
-    lines += ["", *(f"- {sentence(of_row, declaration)}." for of_row in by_row), ""]
+    lines += ["", *(f"- {text}." for text in findings(every)), ""]
     lines += [
-        f"Difference: {declaration.treatment} minus the row. From, to: 95 % interval over scenes (seeds averaged,",
+        "Difference: the claim's model minus the row. From, to: 95 % interval over scenes (seeds averaged,",
         f"{SAMPLES:,} bootstrap samples; only for ratios of counts). p: two-sided paired t-test over seeds; Holm:",
-        "corrected for the rows of one measure and checkpoint.",
+        "corrected for all differences of one measure and checkpoint.",
     ]
     rows, title = _rows(results, declaration, test, every), "\n".join(lines)
     print("\n" + format_table(rows, title=title, digits=4))
@@ -197,14 +211,25 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     return [save_table(stem, rows, meta, title=title, digits=4)[0]]
 
 
-def sentence(of_row: Sequence[Effect], declaration: Declaration) -> str:
+def findings(every: Sequence[Effect]) -> list[str]:
+    """Return a sentence for each claim and row, about the last checkpoint."""
+    by_row: dict[tuple[Claim, str], list[Effect]] = {}
+    for effect in every:
+        if effect.checkpoint == "last":
+            by_row.setdefault((effect.claim, effect.row), []).append(effect)
+    return [sentence(of_row) for of_row in by_row.values()]
+
+
+def sentence(of_row: Sequence[Effect]) -> str:
     """Return the effects against one row as a sentence: primary measure, then negative control and their difference."""
     primary, *others = of_row
+    claim = primary.claim
     text = (
-        f"**{primary.finding}**: {declaration.treatment} is better than *{primary.row}* in {primary.measure}, "
+        f"**{primary.finding}**: {claim.treatment} is better than *{primary.row}* in {primary.measure}, "
         f"{_numbers(primary)}"
     )
-    return "; ".join([text, *(f"{effect.finding} in the {effect.measure}, {_numbers(effect)}" for effect in others)])
+    text = "; ".join([text, *(f"{effect.finding} in the {effect.measure}, {_numbers(effect)}" for effect in others)])
+    return f"{text}. Claim: {claim.text}" if claim.text else text
 
 
 def _numbers(effect: Effect) -> str:
@@ -216,15 +241,15 @@ def _numbers(effect: Effect) -> str:
 
 
 def _rows(results: Results, declaration: Declaration, test: str, every: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Return the table: for each measure and checkpoint the treatment, then what it is compared with."""
+    """Return the table: for each measure, checkpoint and claim the treatment, then what it is compared with."""
     rows: list[dict[str, Any]] = []
     by_name = {measure.name: measure for measure in measures(declaration)}
-    for _, group in itertools.groupby(every, lambda effect: (effect.checkpoint, effect.measure)):
+    for _, group in itertools.groupby(every, lambda effect: (effect.checkpoint, effect.measure, effect.claim)):
         found = list(group)
-        which, name, seeds = found[0].checkpoint, found[0].measure, found[0].seeds
-        values = _values(results.rows(test, which)[declaration.treatment], by_name[name], seeds)
+        which, name, seeds, treatment = found[0].checkpoint, found[0].measure, found[0].seeds, found[0].claim.treatment
+        values = _values(results.rows(test, which)[treatment], by_name[name], seeds)
         place = {"measure": name, "checkpoint": which}
-        rows.append(place | {"model": declaration.treatment, "mean": float(values.mean()), "std": _std(values)})
+        rows.append(place | {"model": treatment, "mean": float(values.mean()), "std": _std(values)})
         rows += [
             place
             | {"model": effect.row, "mean": effect.mean, "std": effect.std}

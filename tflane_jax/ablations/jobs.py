@@ -38,6 +38,7 @@ class Job:
         threads: thread setting of the process that trains it.
         tests: test sets to evaluate it on, beside the configuration's own test split.
         retrain: whether a run of another configuration in the folder is deleted.
+        label: name for people.
     """
 
     config: RunConfig
@@ -45,6 +46,7 @@ class Job:
     threads: Mapping[str, Any] = field(default_factory=thread_setting)
     tests: Tests = field(default_factory=dict)
     retrain: bool = False
+    label: str = ""
 
     @property
     def log(self) -> Path:
@@ -139,7 +141,9 @@ def plan_jobs(
         plan[name] = []
         for seed in seeds:
             config = replace(configs[name], training=replace(configs[name].training, seeds=(seed,)))
-            plan[name].append(Job(config, out / folder / f"seed_{seed}", threads, tests, retrain))
+            plan[name].append(
+                Job(config, out / folder / f"seed_{seed}", threads, tests, retrain, f"{name}, seed {seed}")
+            )
     differences = [(job, text) for planned in plan.values() for job in planned if (text := job.difference())]
     if differences and not retrain:
         job, text = differences[0]

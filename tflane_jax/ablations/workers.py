@@ -12,13 +12,15 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from tqdm import tqdm
 
 from tflane_jax.ablations.jobs import Failure, Job
+from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import measure_all
+from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.errors import UserError
 from tflane_jax.runs import build_data, train_run
 from tflane_jax.training.provenance import thread_setting
@@ -28,9 +30,14 @@ _POLL_SECONDS = 1.0
 
 
 def train_all(jobs: Sequence[Job], parallel: int) -> list[Failure]:
-    """Train every job that is not complete, in this process or `parallel` at a time in workers; return what failed."""
-    waiting = [job for job in jobs if not job.is_complete()]
-    return _train_here(waiting) if parallel == 1 else _train_in_workers(waiting, jobs, parallel)
+    """Train every job that is not complete, in this process or `parallel` at a time in workers; return what failed.
+
+    Several processes, also of several machines that share a folder, may train the same jobs: each takes those that no
+    other has reserved, and returns when all are complete.
+    """
+    with Reservations() as reservations:
+        queue = Queue(jobs, reservations)
+        return _train_here(queue) if parallel == 1 else _train_in_workers(queue, jobs, parallel)
 
 
 def worker_threads(parallel: int) -> dict[str, Any]:
@@ -69,57 +76,56 @@ def _log(job: Job, text: str) -> None:
         print(text, file=log)
 
 
-def _train_here(waiting: Sequence[Job]) -> list[Failure]:
+def _train_here(queue: Queue) -> list[Failure]:
     failures: list[Failure] = []
-    for job in waiting:
+    while len(queue):
+        if (job := queue.take()) is None:
+            time.sleep(_POLL_SECONDS)
+            continue
         with noted(job, failures):
             if train_run(job.config, job.folder, start=job.start()).stopped_by is not None:
                 raise KeyboardInterrupt  # the same command resumes what was written
+        queue.done(job)
         _tell([failure for failure in failures if failure.job is job])
     return failures
 
 
-def _train_in_workers(waiting: list[Job], jobs: Sequence[Job], parallel: int) -> list[Failure]:
+def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int) -> list[Failure]:
     failures: list[Failure] = []
     built: set[Any] = set()
     with contextlib.ExitStack() as stack:
-        workers = [stack.enter_context(Worker(slot, parallel)) for slot in range(min(parallel, len(waiting)))]
-        total = sum(job.config.training.steps for job in jobs)
-        bar = stack.enter_context(tqdm(total=total, desc=f"train {len(jobs)} runs", unit="step"))
-        while waiting or any(worker.job for worker in workers):
+        workers = [stack.enter_context(Worker(slot, parallel)) for slot in range(min(parallel, len(queue)))]
+        total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
+        bar = stack.enter_context(tqdm(total=total, initial=done, desc=f"train {len(jobs)} runs", unit="step"))
+        while len(queue) or any(worker.job for worker in workers):
             for worker in workers:
-                if worker.job is None and waiting:
-                    others = {task for other in workers if other is not worker for task in other.tasks}
-                    chosen = choose(waiting, worker.tasks, others)
-                    waiting.remove(chosen)
+                others = {task for other in workers if other is not worker for task in other.tasks}
+                if worker.job is None and (chosen := queue.take(worker.tasks, others)) is not None:
                     with noted(chosen, failures):
                         _build(chosen, built)
                         worker.begin(chosen)
+                    if worker.job is None:
+                        queue.done(chosen)
                     _tell([failure for failure in failures if failure.job is chosen])
             time.sleep(_POLL_SECONDS)
+            bar.set_postfix_str(_running(workers, queue), refresh=False)
             bar.update(sum(job.step() for job in jobs) - bar.n)
             for worker in workers:
+                job = worker.job
                 if (failure := worker.check()) is not None:
                     failures.append(failure)
                     _tell([failure])
+                if job is not None and worker.job is None:
+                    queue.done(job)
     return failures
 
 
-def choose(waiting: Sequence[Job], mine: Collection[Any], others: Collection[Any]) -> Job:
-    """Return the job that a worker takes next.
-
-    All models get a seed before any gets the next one, so that a comparison stopped early has pairs. Within a seed, a
-    model that this worker has compiled goes first, then one that no other worker has.
-
-    Args:
-        waiting: in the order of seeds; not empty.
-        mine: tasks that this worker has compiled.
-        others: tasks that other workers have.
-    """
-    first = [job for job in waiting if job.config.training.seeds == waiting[0].config.training.seeds]
-    compiled = (job for job in first if job.config.task in mine)
-    fresh = (job for job in first if job.config.task not in others)
-    return next(compiled, None) or next(fresh, first[0])
+def _running(workers: Sequence[Worker], queue: Queue) -> str:
+    """Return what is being trained, for the progress bar."""
+    names = [worker.job.label for worker in workers if worker.job is not None]
+    if queue.elsewhere:
+        names.append(f"{len(queue.elsewhere)} by other processes")
+    return "; ".join(names)
 
 
 def _build(job: Job, built: set[Any]) -> None:

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from tflane_jax.ablations.declaration import Declaration
+from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.errors import UserError
@@ -67,7 +67,7 @@ def _declaration(options: argparse.Namespace, names: Sequence[str]) -> Declarati
         raise UserError("--treatment NAME: say which configuration's effect --primary tests")
     treatment = names[1] if options.treatment is None else options.treatment
     alpha = 0.05 if options.alpha is None else options.alpha
-    return Declaration(options.primary, treatment, options.negative_control, alpha)
+    return Declaration(options.primary, (Claim(treatment),), options.negative_control, alpha)
 
 
 def _named(argument: str) -> tuple[str, str, list[str]]:

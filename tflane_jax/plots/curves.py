@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import functools
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,42 @@ def save_curves(path: Path, records: Iterable[Mapping[str, Any]]) -> Path:
         _draw_panel(ax, group, {name.removeprefix(f"{group}/"): series[split, name] for name in names})
     hide_unused(axes, len(groups))
     return save_figure(figure, path)
+
+
+def save_comparison_curves(
+    path: Path, records: Mapping[str, Sequence[Iterable[Mapping[str, Any]]]], names: Sequence[str]
+) -> Path | None:
+    """Write a panel for each score with a curve for each model: the mean over its runs, a band from least to most.
+
+    Args:
+        path: .png, .pdf or .svg.
+        records: of the validation split, by model and run; only steps that all runs of a model have are drawn.
+        names: scores, such as "all/recall"; those without records are left out.
+
+    Returns:
+        The path; None if there is nothing to draw.
+    """
+    found = {model: [curves(run) for run in runs] for model, runs in records.items()}
+    panels: dict[str, dict[str, Series]] = {}
+    for name in names:
+        for model, runs in found.items():
+            if runs and all(("val", name) in run for run in runs):
+                panels.setdefault(name, {})[model] = _joined([run["val", name] for run in runs])
+    if not panels:
+        return None
+    columns = min(3, len(panels))
+    figure, axes = new_figure(-(-len(panels) // columns), columns, panel=(4.6, 3.2))
+    for ax, (name, series) in zip(axes.flat, panels.items(), strict=False):
+        ax.set_title(f"validation: {name}", fontsize=9, loc="left")
+        _draw_panel(ax, name, series)
+    hide_unused(axes, len(panels))
+    return save_figure(figure, path)
+
+
+def _joined(runs: Sequence[Series]) -> Series:
+    """Return the values of several runs at the steps that all of them have."""
+    steps = functools.reduce(np.intersect1d, (steps for steps, _ in runs))
+    return steps, np.concatenate([values[np.isin(own, steps)] for own, values in runs], axis=1)
 
 
 def curves(records: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Series]:

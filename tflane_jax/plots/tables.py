@@ -37,6 +37,32 @@ def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, t
     return "\n".join([title, "", *lines] if title else lines)
 
 
+def latex_table(
+    rows: Sequence[Row], columns: Sequence[str] | None = None, *, caption: str = "", digits: int = 3
+) -> str:
+    """Return the rows as a LaTeX table for the package `booktabs`; cells and arguments as in `format_table`."""
+    names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
+    numeric = [all(row.get(name) is None or _is_number(row.get(name)) for row in rows) for name in names]
+    lines = [[_cell(row.get(name), digits).replace("\\|", "|") for name in names] for row in rows]
+    body = [" & ".join(map(_latex, line)) + r" \\" for line in (names, *lines)]
+    return "\n".join(
+        [
+            r"\begin{table}",
+            r"\centering",
+            *([rf"\caption{{{_latex(caption)}}}"] if caption else []),
+            rf"\begin{{tabular}}{{{''.join('r' if right else 'l' for right in numeric)}}}",
+            r"\toprule",
+            body[0],
+            r"\midrule",
+            *body[1:],
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
 def save_table(
     stem: Path,
     rows: Sequence[Row],
@@ -81,6 +107,19 @@ def _cell(value: Any, digits: int) -> str:
         return "n/a" if math.isnan(value) else f"{value:.{digits}f}"
     # A bar would end the cell, a line break the table.
     return str(value).replace("|", "\\|").replace("\n", " ")
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "±": r"$\pm$",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+} | {character: f"\\{character}" for character in "&%$#_{}"}
+
+
+def _latex(text: str) -> str:
+    """Return the text with LaTeX's special characters escaped."""
+    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def _plain(value: Any) -> Any:

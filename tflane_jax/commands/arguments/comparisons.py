@@ -1,4 +1,4 @@
-"""Arguments of the commands that compare and score: compare, sweep, score, demo, bench."""
+"""Arguments of the commands that compare and score: compare, tables, sweep, score, demo, bench."""
 
 from __future__ import annotations
 
@@ -70,6 +70,30 @@ def compare(commands) -> None:
     )
     declared.add_argument("--alpha", type=float, help="level of the corrected tests (default 0.05)")
     parser.set_defaults(takes_overrides=True)
+
+
+def tables(commands) -> None:
+    """Add `tflane tables`."""
+    parser = command(
+        commands,
+        "tables",
+        "train, evaluate and test a table of one of the papers; without a name, list the tables",
+        module="tables",
+        function="run",
+    )
+    parser.add_argument("names", metavar="TABLE", nargs="*", help="tf_lane.1, say")
+    parser.add_argument("--seeds", metavar="N", type=int, help="number of seeds (default: that of the table)")
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="number of trainings at a time, which share the cores (default 1)"
+    )
+    parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
+    parser.add_argument(
+        "--record",
+        metavar="DIR",
+        type=Path,
+        help="copy the summaries to DIR and write DIR.md anew; the repository keeps docs/results",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/tables"), help="default runs/tables")
 
 
 def sweep(commands) -> None:

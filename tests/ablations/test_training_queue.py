@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tflane_jax.ablations.jobs import Job
-from tflane_jax.ablations.workers import choose
+from tflane_jax.ablations.training_queue import choose
 from tflane_jax.config import RunConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask

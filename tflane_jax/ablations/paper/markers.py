@@ -1,0 +1,115 @@
+"""The marker paper's tables (Wu and Hu), on clips of the built-in world with BEV evidence and simulated detections."""
+
+from __future__ import annotations
+
+from tflane_jax.ablations.declaration import Claim
+from tflane_jax.ablations.paper.table import SMALL_WORLD, PaperTable, Quoted, TableRow
+
+_SOURCE = "OpenLane-V2 with added markers, percent; version of the metric not given"
+_OURS = TableRow("TopoNet + markers", "markers/toponet_markers", start="TopoNet host")
+_TOPONET = TableRow("TopoNet host", "markers/host")
+_DETR = TableRow("BEVFormer-DETR host", "markers/host:bevformer_detr")
+_FULL = (36.2, 8.8, 48.5, 22.6, 40.5)
+
+
+def _row(name: str, ablation: str, host: str = "TopoNet host") -> TableRow:
+    return TableRow(name, f"markers/toponet_markers:{ablation}", start=host)
+
+
+def _table(
+    number: str,
+    title: str,
+    rows: tuple[TableRow, ...],
+    claims: tuple[Claim, ...],
+    columns: tuple[str, ...],
+    quoted: dict[str, tuple[float, ...]],
+    hosts: tuple[TableRow, ...] = (_TOPONET,),
+) -> PaperTable:
+    numbers = tuple({"model": name} | dict(zip(columns, row, strict=True)) for name, row in quoted.items())
+    return PaperTable(
+        name=f"markers.{number}",
+        title=title,
+        rows=rows,
+        claims=claims,
+        primary="all/DET_l",
+        columns=("all/DET_l", "all/TOP_ll", "all/recall", "occluded/DET_l", "seen/recall", "gap/recall"),
+        quoted=Quoted(_SOURCE, numbers),
+        seeds=5,
+        hosts=hosts,
+        minutes=4.0,
+        quick=(*SMALL_WORLD, "--data.world.duration-s", "2.8", "--data.world.keyframes", "4"),
+    )
+
+
+_COLUMNS = ("DET_l", "TOP_ll", "DET_t", "TOP_lt", "OLS")
+
+TABLES = (
+    _table(
+        "1",
+        "markers beside other hosts and an SD map",
+        (
+            _row("BEVFormer-DETR", "bevformer_detr", "BEVFormer-DETR host"),
+            _row("TopoNet", "toponet"),
+            _row("TopoNet + SMERF", "toponet_smerf"),
+            _OURS,
+        ),
+        (
+            Claim(_OURS.name, "TopoNet", "markers improve TopoNet (+7.7 DET_l)"),
+            Claim(_OURS.name, "TopoNet + SMERF", "markers are better than an SD map (+2.8 DET_l)"),
+            Claim(_OURS.name, "BEVFormer-DETR", "and than BEVFormer-DETR (+19.2 DET_l)"),
+        ),
+        ("DET_l", "TOP_ll", "TOP_lt", "OLS"),
+        {
+            "BEVFormer-DETR": (17.0, 2.3, 16.2, 30.2),
+            "TopoNet": (28.5, 4.1, 20.6, 34.7),
+            "TopoNet + SMERF": (33.4, 7.5, 23.4, 39.4),
+            _OURS.name: (36.2, 8.8, 22.6, 40.5),
+        },
+        hosts=(_TOPONET, _DETR),
+    ),
+    _table(
+        "2",
+        "confidence-gated fusion",
+        (_row("uniform fusion", "uniform"), _row("hard masking", "hard"), _OURS),
+        (
+            Claim(_OURS.name, "uniform fusion", "gating is better than uniform fusion (+12.9 DET_l)"),
+            Claim(_OURS.name, "hard masking", "gating is better than hard masking (+9.7 DET_l)"),
+        ),
+        _COLUMNS,
+        {
+            "uniform fusion": (23.3, 3.9, 47.8, 18.8, 33.6),
+            "hard masking": (26.5, 4.5, 47.1, 18.6, 34.5),
+            _OURS.name: _FULL,
+        },
+    ),
+    _table(
+        "3",
+        "temporal memory of markers",
+        (_row("no memory", "no_memory"), _row("memory without decay", "no_decay"), _OURS),
+        (
+            Claim(_OURS.name, "no memory", "memory helps (+9.7 DET_l)"),
+            Claim(_OURS.name, "memory without decay", "decay helps (+1.9 DET_l)"),
+        ),
+        _COLUMNS,
+        {
+            "no memory": (26.5, 6.4, 46.7, 21.0, 36.1),
+            "memory without decay": (34.3, 8.8, 48.9, 22.3, 40.0),
+            _OURS.name: _FULL,
+        },
+    ),
+    _table(
+        "4",
+        "encoding of a marker's polyline",
+        (_row("MLP", "mlp"), _row("transformer", "transformer"), _OURS),
+        (
+            Claim("transformer", "MLP", "a transformer is better than an MLP (+7.7 DET_l)"),
+            Claim(_OURS.name, "transformer", "positional encoding helps (+8.0 DET_l)"),
+        ),
+        _COLUMNS,
+        {
+            "MLP": (20.5, 3.2, 45.1, 19.2, 31.8),
+            "transformer": (28.2, 7.2, 47.9, 19.8, 36.9),
+            _OURS.name: _FULL,
+        },
+    ),
+)

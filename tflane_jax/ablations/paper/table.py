@@ -1,0 +1,101 @@
+"""What a table of a paper is: rows, claims, the measure that decides, and the paper's own numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from tflane_jax.ablations.declaration import Claim, Declaration
+from tflane_jax.config import RunConfig, apply_overrides, load_config
+
+SMALL_WORLD = ("--data.train", "24", "--data.val", "4", "--data.test", "6")
+"""Data of a quick run: numbers of scenes, or of images."""
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A model of a table.
+
+    Attributes:
+        name: in the table.
+        config: reference of its configuration, "system/name:ablation".
+        settings: further settings, as on the command line.
+        start: name of the table's host whose run of the same seed this row starts from; "" for a fresh start.
+    """
+
+    name: str
+    config: str
+    settings: tuple[str, ...] = ()
+    start: str = ""
+
+
+@dataclass(frozen=True)
+class Quoted:
+    """Numbers that a paper prints.
+
+    Attributes:
+        source: dataset, split and version of the metric.
+        rows: cells by column, in the order of the paper.
+    """
+
+    source: str
+    rows: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """A table of a paper.
+
+    Attributes:
+        name: "system.number".
+        title: what the paper's table shows.
+        rows: models; the first one is the control of the paired tests.
+        claims: what is tested, fixed before the runs.
+        primary: the score that decides.
+        columns: scores of the table.
+        quoted: the paper's own numbers.
+        negative_control: score on which no treatment should change anything; None for none.
+        alpha: significance level of the corrected tests.
+        seeds: number of seeds.
+        settings: of all rows, as on the command line.
+        hosts: models that rows start from. They are trained first and are no rows.
+        minutes: what a run takes on one core of the machine of docs/benchmarks.md, for estimates.
+        quick: settings of a smoke test.
+    """
+
+    name: str
+    title: str
+    rows: tuple[TableRow, ...]
+    claims: tuple[Claim, ...]
+    primary: str
+    columns: tuple[str, ...]
+    quoted: Quoted
+    negative_control: str | None = None
+    alpha: float = 0.05
+    seeds: int = 8
+    settings: tuple[str, ...] = ()
+    hosts: tuple[TableRow, ...] = ()
+    minutes: float = 6.0
+    quick: tuple[str, ...] = SMALL_WORLD
+
+    @property
+    def declaration(self) -> Declaration:
+        """What is tested."""
+        return Declaration(self.primary, self.claims, self.negative_control, self.alpha)
+
+    def configs(self, rows: Sequence[TableRow], *, quick: bool = False) -> dict[str, RunConfig]:
+        """Return the configuration of each of `rows` or `hosts` by name.
+
+        Args:
+            rows: of this table.
+            quick: with few updates on few data.
+        """
+        more = (*self.settings, *(self.quick if quick else ()))
+        found = {row.name: apply_overrides(load_config(row.config), [*more, *row.settings]) for row in rows}
+        return {name: _shortened(config) if quick else config for name, config in found.items()}
+
+
+def _shortened(config: RunConfig, steps: int = 20) -> RunConfig:
+    training = replace(config.training, steps=steps, eval_every=steps, checkpoint_every=steps, log_every=steps // 2)
+    return replace(config, training=training)

@@ -1,0 +1,100 @@
+"""The page of results: made from the summaries of tables that are kept with the code, never edited by hand."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.ablations.tables import TABLES
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_text
+from tflane_jax.plots.tables import format_table
+
+_WIDTH = 120
+
+
+def record(summaries: Sequence[Path], folder: Path) -> Path:
+    """Copy summaries (see `table_run`) into the folder of results, write its page anew, and return the page.
+
+    The page lies beside the folder: `docs/results` has `docs/results.md`.
+
+    Raises:
+        UserError: a summary is of a quick run.
+    """
+    for path in summaries:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["quick"]:
+            raise UserError(f"{path} is of a quick run, which is a smoke test and no result")
+        write_text(folder / f"{content['table']}.json", json.dumps(content, indent=1) + "\n")
+    return write_text(folder.with_name(f"{folder.name}.md"), page(folder))
+
+
+def page(folder: Path) -> str:
+    """Return the page of a folder of summaries, in the order of the tables."""
+    found = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")}
+    lines = [
+        "# Results",
+        "",
+        "Every table of the papers that was run here, in the built-in world. `tflane tables` writes this page from",
+        "`docs/results/`; do not edit it. The papers' own numbers are of other data and stand there for orientation.",
+        "A claim is *shown* or *contradicted* if the corrected p and the interval say so, else *not shown*",
+        "([how](comparisons.md)).",
+    ]
+    for name in (*TABLES, *sorted(found.keys() - TABLES.keys())):
+        if name in found:
+            lines += ["", *_section(found[name])]
+    if missing := [name for name in TABLES if name not in found]:
+        lines += [
+            "",
+            "## Not run yet",
+            "",
+            *_wrapped(", ".join(f"`{name}` ({TABLES[name].title})" for name in missing)),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _section(summary: Mapping[str, Any]) -> list[str]:
+    minutes = summary["core minutes of a run"]
+    facts = (
+        f"{len(summary['seeds'])} seeds, {_listed(summary['steps'])} updates a run, "
+        f"{_listed(summary['cores of a run'])} core of {_listed(summary['devices'])}, "
+        f"{min(minutes.values()):.0f} to {max(minutes.values()):.0f} minutes a run; "
+        f"code {_listed(summary['commits'])}. "
+        f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
+        f"{summary['declared']}"
+    )
+    lines = [
+        f"## {summary['table']}: {summary['title']}",
+        "",
+        "```",
+        f"tflane tables {summary['table']} --seeds {len(summary['seeds'])} --jobs 2",
+        "```",
+        "",
+        *_wrapped(facts),
+        "",
+        format_table(summary["rows"]),
+        "",
+    ]
+    for finding in summary["findings"]:
+        lines += _wrapped(f"{finding}.", first="- ", rest="  ")
+    quoted = summary["quoted"]
+    return [
+        *lines,
+        "",
+        *_wrapped(f"The paper's own numbers: {quoted['source']}."),
+        "",
+        format_table(quoted["rows"], digits=2),
+    ]
+
+
+def _listed(values: Sequence[Any]) -> str:
+    return ", ".join(map(str, values))
+
+
+def _wrapped(text: str, first: str = "", rest: str = "") -> list[str]:
+    return textwrap.wrap(
+        text, _WIDTH, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
+    )

@@ -1,0 +1,19 @@
+"""Every table of the three papers, by name."""
+
+from __future__ import annotations
+
+import difflib
+
+from tflane_jax.ablations.paper import gtn_lane, markers, tf_lane
+from tflane_jax.ablations.paper.table import PaperTable
+from tflane_jax.errors import UserError
+
+TABLES: dict[str, PaperTable] = {table.name: table for table in (*tf_lane.TABLES, *gtn_lane.TABLES, *markers.TABLES)}
+
+
+def find_table(name: str) -> PaperTable:
+    """Return a table; raises UserError for an unknown name, with the closest ones."""
+    if name in TABLES:
+        return TABLES[name]
+    close = difflib.get_close_matches(name, TABLES, 3) or list(TABLES)
+    raise UserError(f"no table {name}: there is {', '.join(close)} (tflane tables lists all)")

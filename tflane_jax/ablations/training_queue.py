@@ -1,0 +1,79 @@
+"""The runs that a comparison still has to train: those that wait, and those that other processes train."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Sequence
+from typing import Any
+
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.reservations import Reservations
+
+LOOK_SECONDS = 10.0
+
+
+class Queue:
+    """Jobs in the order in which they are to be trained.
+
+    A job that another process has reserved is set aside and looked at again, until it is complete or free.
+    """
+
+    def __init__(self, jobs: Sequence[Job], reservations: Reservations) -> None:
+        self._waiting = [job for job in jobs if not job.is_complete()]
+        self._elsewhere: list[Job] = []
+        self._reservations = reservations
+        self._looked = time.monotonic()
+
+    def __len__(self) -> int:
+        """Return the number of jobs that are neither complete nor taken."""
+        return len(self._waiting) + len(self._elsewhere)
+
+    @property
+    def elsewhere(self) -> Sequence[Job]:
+        """Jobs that other processes train."""
+        return self._elsewhere
+
+    def take(self, mine: Collection[Any] = (), others: Collection[Any] = ()) -> Job | None:
+        """Reserve the next job and return it; None if all that are left are trained by other processes.
+
+        Args:
+            mine, others: see `choose`.
+        """
+        self._look_again()
+        while self._waiting:
+            job = choose(self._waiting, mine, others)
+            self._waiting.remove(job)
+            if not self._reservations.take(job.folder):
+                self._elsewhere.append(job)
+            elif job.is_complete():  # another process has just finished it
+                self._reservations.release(job.folder)
+            else:
+                return job
+        return None
+
+    def done(self, job: Job) -> None:
+        """Release a job that was trained, or failed."""
+        self._reservations.release(job.folder)
+
+    def _look_again(self) -> None:
+        """Let jobs that are free again wait; forget those that other processes have finished."""
+        if time.monotonic() - self._looked > LOOK_SECONDS:
+            self._waiting += [job for job in self._elsewhere if not job.is_complete()]
+            self._elsewhere, self._looked = [], time.monotonic()
+
+
+def choose(waiting: Sequence[Job], mine: Collection[Any], others: Collection[Any]) -> Job:
+    """Return the job that a worker takes next.
+
+    All models get a seed before any gets the next one, so that a comparison stopped early has pairs. Within a seed, a
+    model that this worker has compiled goes first, then one that no other worker has.
+
+    Args:
+        waiting: in the order of seeds; not empty.
+        mine: tasks that this worker has compiled.
+        others: tasks that other workers have.
+    """
+    first = [job for job in waiting if job.config.training.seeds == waiting[0].config.training.seeds]
+    compiled = (job for job in first if job.config.task in mine)
+    fresh = (job for job in first if job.config.task not in others)
+    return next(compiled, None) or next(fresh, first[0])

@@ -1,0 +1,47 @@
+"""`tflane tables`."""
+
+from __future__ import annotations
+
+import argparse
+
+from tflane_jax.ablations.published import record
+from tflane_jax.ablations.tables import TABLES, find_table
+from tflane_jax.errors import UserError
+from tflane_jax.plots.tables import format_table
+from tflane_jax.training.runtime import configure_jax
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the named tables, or list all."""
+    chosen = [find_table(name) for name in options.names]
+    if options.seeds is not None and options.seeds < 1:
+        raise UserError(f"--seeds {options.seeds}: at least one")
+    if options.jobs < 1:
+        raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
+    if not chosen:
+        print(format_table([_listed(name) for name in TABLES], digits=0))
+        return 0
+    configure_jax()
+    from tflane_jax.ablations.table_run import run_table
+
+    written = []
+    for table in chosen:
+        count = options.seeds or (2 if options.quick else table.seeds)
+        written.append(run_table(table, range(count), options.out, jobs=options.jobs, quick=options.quick))
+    if options.record is not None:
+        print("written:", record([path.with_name("summary.json") for path in written], options.record))
+    return 0
+
+
+def _listed(name: str) -> dict[str, str | int | float]:
+    table = TABLES[name]
+    runs = table.seeds * (len(table.rows) + len(table.hosts))
+    hours = f"{runs * table.minutes / 60:.0f} h"
+    return {
+        "table": name,
+        "shows": table.title,
+        "rows": len(table.rows),
+        "seeds": table.seeds,
+        "decided by": table.primary,
+        "one core": hours,
+    }

@@ -7,7 +7,10 @@ import pytest
 from tests.ablations.test_identity import QUICK
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
+from tflane_jax.ablations.declaration import Claim, Declaration, check
 from tflane_jax.cli import main
+from tflane_jax.config import load_config
+from tflane_jax.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("cheap")
 PRIMARY = ["--primary", "all/recall"]
@@ -32,11 +35,8 @@ def test_a_declaration_is_written_first_and_kept(tiny, tmp_path, monkeypatch, ca
     declared = json.loads((out / "declaration.json").read_text())
     assert seen == [declared] * 6
     assert declared["begun"] == 0
-    assert (declared["primary"], declared["negative_control"], declared["treatment"]) == (
-        "all/recall",
-        "all/DET_l",
-        "tfm",
-    )
+    assert (declared["primary"], declared["negative_control"]) == ("all/recall", "all/DET_l")
+    assert declared["claims"] == [{"treatment": "tfm", "control": None, "text": ""}]
     text = (out / "effects.md").read_text()
     assert "Declared before any run" in text
     assert "level 0.01, 3 seeds" in text
@@ -99,3 +99,22 @@ def test_a_row_may_have_settings_of_its_own(tiny, tmp_path, capsys):
         "tfm, traffic of another scene",
         "matched",
     ]
+
+
+def test_declarations_of_an_earlier_form_name_one_treatment(tiny, tmp_path):
+    assert compare(tiny, tmp_path, "01", *PRIMARY) == 0
+    path = tmp_path / "declaration.json"
+    earlier = json.loads(path.read_text())
+    earlier["treatment"] = earlier.pop("claims")[0]["treatment"]
+    path.write_text(json.dumps(earlier))
+    assert compare(tiny, tmp_path, "01", *PRIMARY) == 0
+    assert json.loads(path.read_text()) == earlier
+
+
+def test_a_claim_is_about_models_or_interventions_on_them(tiny):
+    config = load_config(str(tiny))
+    configs = {"base": config, "tfm": config}
+    check(Declaration("all/recall", (Claim("tfm, no traffic flow at inference", "base"),)), configs)
+    for claim in (Claim("tfm", "bse"), Claim("tmf, none", "base")):
+        with pytest.raises(UserError, match=r"which is none of the models \(base, tfm\)"):
+            check(Declaration("all/recall", (claim,)), configs)

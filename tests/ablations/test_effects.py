@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from tflane_jax.ablations.declaration import Declaration, Declared
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared
 from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import Measured
@@ -16,7 +16,7 @@ from tflane_jax.evaluation.results import SceneRatio
 SCENES, SEEDS = 40, (0, 1, 2, 3)
 PRIMARY, CONTROL = "hidden+traffic/recall", "hidden-traffic/recall"
 NEGATIVE, DIFFERENCE = f"negative control {CONTROL}", "difference of the two"
-DECLARED = Declaration(PRIMARY, "+TFM", CONTROL)
+DECLARED = Declaration(PRIMARY, (Claim("+TFM"),), CONTROL)
 LANES = {name: np.random.default_rng([7, i]).integers(0, 20, SCENES) for i, name in enumerate((PRIMARY, CONTROL))}
 
 
@@ -93,7 +93,7 @@ def test_findings(results):
     for row in ("baseline", "+TFM, none", "matched"):
         assert finding[PRIMARY, row] == finding[DIFFERENCE, row] == "shown"
         assert finding[NEGATIVE, row] == "not shown"
-    worse = Declaration(PRIMARY, "matched")
+    worse = Declaration(PRIMARY, (Claim("matched"),))
     assert {e.row: e.finding for e in effects(results, worse, "", "last")} == {
         "baseline": "not shown",
         "+TFM": "contradicted",
@@ -102,7 +102,7 @@ def test_findings(results):
     # The same numbers, read as errors.
     as_errors = {e.row: (e.finding, e.better) for e in effects(results, worse, "", "last", [PRIMARY])}
     assert as_errors["+TFM"] == ("shown", 4)
-    strict = Declaration(PRIMARY, "+TFM", alpha=1e-9)
+    strict = Declaration(PRIMARY, (Claim("+TFM"),), alpha=1e-9)
     assert {e.finding for e in effects(results, strict, "", "last")} == {"not shown"}
 
 
@@ -114,16 +114,16 @@ def test_an_effect_of_few_scenes_is_not_shown():
             ratio = SceneRatio(tuple(hits), (10, 10, 10))
             scores = Measured(1, "a protocol", {"": {PRIMARY: sum(hits) / 30}}, {"": {PRIMARY: ratio}})
             found.add("", "last", model, seed, scores)
-    (effect,) = effects(found, Declaration(PRIMARY, "+TFM"), "", "last")
+    (effect,) = effects(found, Declaration(PRIMARY, (Claim("+TFM"),)), "", "last")
     assert effect.p_holm < 0.01
     assert effect.low == 0.0
     assert effect.finding == "not shown"
 
 
 def test_scores_that_are_no_ratio_have_no_interval(results):
-    found = effects(results, Declaration("all/AP_l", "+TFM"), "", "last")
+    found = effects(results, Declaration("all/AP_l", (Claim("+TFM"),)), "", "last")
     assert all(math.isnan(e.low) and math.isnan(e.high) and not math.isnan(e.p) for e in found)
-    assert "95 %" not in sentence(found[:1], Declaration("all/AP_l", "+TFM"))
+    assert "95 %" not in sentence(found[:1])
 
 
 def test_rows_of_other_scenes_are_refused():
@@ -132,7 +132,7 @@ def test_rows_of_other_scenes_are_refused():
         ratio = SceneRatio((1, 2), lanes)
         found.add("", "last", model, 0, Measured(1, "a protocol", {"": {PRIMARY: 0.3}}, {"": {PRIMARY: ratio}}))
     with pytest.raises(ValueError, match="not measured on the same lanes"):
-        effects(found, Declaration(PRIMARY, "+TFM"), "", "last")
+        effects(found, Declaration(PRIMARY, (Claim("+TFM"),)), "", "last")
 
 
 def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
@@ -164,3 +164,19 @@ def test_without_shared_seeds_nothing_is_written(tmp_path, capsys):
     found.add("", "last", "+TFM", 1, measured(1, own=(0.3, 0.3)))
     assert save_effects(found, Declared(DECLARED, (0, 1), "now", 0), "", (), tmp_path / "effects") == []
     assert "no effects (test split)" in capsys.readouterr().out
+
+
+def test_claims_about_pairs_are_corrected_together(results):
+    """Treatment and control may be interventions; a claim that lacks a row is left out."""
+    claims = (
+        Claim("+TFM", "baseline", "it helps"),
+        Claim("+TFM, none", "matched"),
+        Claim("baseline", "+TFM"),
+        Claim("+TFM", "not measured"),
+    )
+    found = effects(results, Declaration(PRIMARY, claims), "", "last")
+    assert [(e.claim, e.row) for e in found] == [(claim, claim.control) for claim in claims[:3]]
+    assert [e.p_holm for e in found] == holm([e.p for e in found])
+    assert [e.finding for e in found] == ["shown", "contradicted", "contradicted"]
+    assert found[0].difference == pytest.approx(-found[2].difference)
+    assert sentence(found[:1]).endswith("Claim: it helps")

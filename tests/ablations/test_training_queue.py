@@ -1,4 +1,4 @@
-"""Which job a worker takes next."""
+"""Which job a worker takes next, beside other workers and other processes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tflane_jax.ablations.jobs import Job
-from tflane_jax.ablations.training_queue import choose
+from tflane_jax.ablations.training_queue import LOOK_SECONDS, Queue, choose
 from tflane_jax.config import RunConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -39,3 +39,46 @@ def test_a_worker_prefers_what_it_has_compiled_then_what_nobody_has():
     assert choose(waiting, {TASKS[2]}, {TASKS[0]}) is waiting[2]
     assert choose(waiting, set(), {TASKS[0]}) is waiting[1]
     assert choose(waiting, set(), set(TASKS)) is waiting[0]
+
+
+class Everything:
+    """Reservations of which another process holds some."""
+
+    def __init__(self, taken):
+        self.taken, self.released = set(taken), []
+
+    def take(self, run):
+        return run not in self.taken
+
+    def release(self, run):
+        self.released.append(run)
+
+
+def test_jobs_of_other_processes_are_waited_for(monkeypatch):
+    """They are looked at again: one was finished there, the other was given up."""
+    jobs, complete, now = [job(model, 0) for model in range(3)], set(), [0.0]
+    monkeypatch.setattr(Job, "is_complete", lambda self: self.folder in complete)
+    monkeypatch.setattr("tflane_jax.ablations.training_queue.time.monotonic", lambda: now[0])
+    reservations = Everything([jobs[0].folder, jobs[1].folder])
+    queue = Queue(jobs, reservations)
+    assert queue.take() is jobs[2]
+    assert queue.take() is None
+    assert (len(queue), list(queue.elsewhere)) == (2, jobs[:2])
+    complete.add(jobs[0].folder)
+    reservations.taken.clear()
+    assert queue.take() is None  # not yet looked at
+    now[0] += 2 * LOOK_SECONDS
+    assert queue.take() is jobs[1]
+    assert len(queue) == 0
+    queue.done(jobs[1])
+    assert reservations.released == [jobs[1].folder]
+
+
+def test_a_job_that_another_process_has_just_finished_is_not_trained_again(monkeypatch):
+    jobs, complete = [job(0, 0), job(1, 0)], []
+    monkeypatch.setattr(Job, "is_complete", lambda self: self.folder in complete)
+    reservations = Everything([])
+    queue = Queue(jobs, reservations)
+    complete.append(jobs[0].folder)
+    assert queue.take() is jobs[1]
+    assert reservations.released == [jobs[0].folder]

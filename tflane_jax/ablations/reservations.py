@@ -52,6 +52,9 @@ class Reservations:
             _set_aside(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"cannot write to {path.parent}: {error.strerror or error}") from error
+        try:
             with open(path, "x", encoding="utf-8") as file:
                 json.dump(self._me, file)
         except FileExistsError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tflane_jax.ablations.declaration import Claim
-from tflane_jax.ablations.paper.table import SMALL_WORLD, PaperTable, Quoted, TableRow
+from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow
 
 _SOURCE = "OpenLane-V2 with added markers, percent; version of the metric not given"
 _OURS = TableRow("TopoNet + markers", "markers/toponet_markers", start="TopoNet host")
@@ -37,7 +37,6 @@ def _table(
         seeds=5,
         hosts=hosts,
         minutes=4.0,
-        quick=(*SMALL_WORLD, "--data.world.duration-s", "2.8", "--data.world.keyframes", "4"),
     )
 
 

@@ -9,10 +9,6 @@ from typing import Any
 from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 
-SMALL_WORLD = ("--data.train", "24", "--data.val", "4", "--data.test", "6")
-"""Data of a quick run: numbers of scenes, or of images."""
-
-
 @dataclass(frozen=True)
 class TableRow:
     """A model of a table.
@@ -58,10 +54,9 @@ class PaperTable:
         negative_control: score on which no treatment should change anything; None for none.
         alpha: significance level of the corrected tests.
         seeds: number of seeds.
-        settings: of all rows, as on the command line.
+        steps: updates of every run; None for those of the configurations.
         hosts: models that rows start from. They are trained first and are no rows.
         minutes: what a run takes on one core of the machine of docs/benchmarks.md, for estimates.
-        quick: settings of a smoke test.
     """
 
     name: str
@@ -74,10 +69,9 @@ class PaperTable:
     negative_control: str | None = None
     alpha: float = 0.05
     seeds: int = 8
-    settings: tuple[str, ...] = ()
+    steps: int | None = None
     hosts: tuple[TableRow, ...] = ()
     minutes: float = 6.0
-    quick: tuple[str, ...] = SMALL_WORLD
 
     @property
     def declaration(self) -> Declaration:
@@ -91,11 +85,19 @@ class PaperTable:
             rows: of this table.
             quick: with few updates on few data.
         """
-        more = (*self.settings, *(self.quick if quick else ()))
-        found = {row.name: apply_overrides(load_config(row.config), [*more, *row.settings]) for row in rows}
-        return {name: _shortened(config) if quick else config for name, config in found.items()}
+        found = {}
+        for row in rows:
+            config = load_config(row.config)
+            if self.steps is not None:
+                config = replace(config, training=replace(config.training, steps=self.steps))
+            if row.settings:
+                config = apply_overrides(config, row.settings)
+            found[row.name] = _shortened(config) if quick else config
+        return found
 
 
 def _shortened(config: RunConfig, steps: int = 20) -> RunConfig:
-    training = replace(config.training, steps=steps, eval_every=steps, checkpoint_every=steps, log_every=steps // 2)
-    return replace(config, training=training)
+    """Return a smoke test of the configuration."""
+    often = {"eval_every": steps, "checkpoint_every": steps, "log_every": steps // 2}
+    training = replace(config.training, steps=steps, **often)
+    return replace(config, data=replace(config.data, train=24, val=4, test=6), training=training)

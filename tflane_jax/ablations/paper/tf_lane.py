@@ -62,7 +62,7 @@ def _with_and_without(
         alpha=0.01,
         columns=(*columns, *primary),
         quoted=quoted,
-        settings=("--training.steps", str(steps)),
+        steps=steps,
         minutes=minutes,
     )
 
@@ -81,7 +81,7 @@ def _on_lanesegnet(number: int, title: str, rows: tuple[TableRow, ...], claims: 
         columns=(*_SEGMENTS, *_GROUPS),
         quoted=quoted,
         seeds=5,
-        settings=("--training.steps", "2000"),
+        steps=2000,
         minutes=8.0,
     )
 

@@ -1,0 +1,152 @@
+"""Tables of the papers: their data, and a small one from training to summary."""
+
+import json
+import shutil
+
+import pytest
+
+from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations import workers
+from tflane_jax.ablations.declaration import Claim, check
+from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow
+from tflane_jax.ablations.published import page, record
+from tflane_jax.ablations.table_run import run_table
+from tflane_jax.ablations.tables import TABLES
+from tflane_jax.cli import main
+from tflane_jax.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cheap")
+TABLE_FILES = {"table.md", "table.json", "table.tex", "effects.md", "effects.json", "summary.json"}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_table_is_about_its_rows_and_measured_by_its_scores(name):
+    table = TABLES[name]
+    configs = table.configs(table.rows)
+    check(table.declaration, configs)
+    assert all(row.start in {host.name for host in table.hosts} for row in table.rows if row.start)
+    for config in configs.values():
+        known = config.task.score_names(config.data, config.evaluation)
+        assert set(table.columns) <= known
+    quick = table.configs((*table.rows, *table.hosts), quick=True)
+    assert all(config.training.steps == 20 and config.data.train == 24 for config in quick.values())
+    assert len({json.dumps(sorted(row), default=str) for row in table.quoted.rows}) == 1  # the same columns
+
+
+def small(tiny, **changes):
+    settings = {
+        "name": "paper.9",
+        "title": "a small table",
+        "rows": (
+            TableRow("base", f"{tiny}:baseline"),
+            TableRow("tfm", str(tiny)),
+            TableRow("again", str(tiny), ("--optim.lr", "0.02")),
+        ),
+        "claims": (Claim("tfm", "base", "it helps"), Claim("tfm, no traffic flow at inference", "base")),
+        "primary": "all/recall",
+        "columns": ("all/DET_l", "all/recall"),
+        "quoted": Quoted("a dataset", ({"model": "base", "DET_l": 1.5},)),
+        "steps": 4,
+    }
+    return PaperTable(**{**settings, **changes})
+
+
+def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
+    out = tmp_path / "out"
+    path = run_table(small(tiny), range(2), out)
+    folder = out / "paper.9"
+    assert path == folder / "table.md"
+    assert {file.name for file in folder.iterdir()} >= TABLE_FILES | {"declaration.json", "curves.png"}
+    told = capsys.readouterr().out
+    assert "paper.9, a small table: 6 runs, 0 complete; the others take about" in told
+    text = path.read_text()
+    assert "tfm, traffic of another scene" in text
+    assert "The paper's own numbers, not comparable with these: a dataset" in text
+    assert r"\begin{tabular}" in (folder / "table.tex").read_text()
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["seeds"] == [0, 1]
+    assert summary["cores of a run"]
+    assert len(summary["findings"]) == 2
+    assert "Claim: it helps" in summary["findings"][0]
+
+    # Another table with one of its rows trains only what is new, and the same table nothing.
+    before = {name: (folder / name).read_bytes() for name in TABLE_FILES}
+    trained = [file for file in (out / "runs").glob("*/config.json")]
+    assert len(trained) == 6
+    run_table(small(tiny, name="paper.10"), range(2), out)
+    assert len(list((out / "runs").glob("*/config.json"))) == 6
+    for name in ("table.md", "summary.json"):
+        (folder / name).unlink()
+    run_table(small(tiny), range(2), out)
+    assert {name: (folder / name).read_bytes() for name in TABLE_FILES} == before
+
+    record([folder / "summary.json"], tmp_path / "results")
+    written = (tmp_path / "results.md").read_text()
+    assert "## paper.9: a small table" in written
+    assert "tflane tables paper.9 --seeds 2 --jobs 2" in written
+    assert max(map(len, (line for line in written.splitlines() if not line.startswith("|")))) <= 120
+    assert written == page(tmp_path / "results")
+
+
+def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monkeypatch):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    run_table(small(tiny), range(2), whole)
+    train_run, count = workers.train_run, []
+
+    def stopped(config, folder, **options):
+        count.append(folder)
+        if len(count) == 3:
+            raise KeyboardInterrupt
+        return train_run(config, folder, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "train_run", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run_table(small(tiny), range(2), parts)
+    assert not list(parts.rglob("*.reserved"))
+    run_table(small(tiny), range(2), parts)
+    for name in ("table.md", "table.json", "table.tex"):
+        assert (parts / "paper.9" / name).read_bytes() == (whole / "paper.9" / name).read_bytes()
+
+
+def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
+    rows = (TableRow("base", f"{tiny}:baseline", start="host"),)
+    claims = (Claim("base", "base"),)
+    table = small(tiny, rows=rows, claims=claims, hosts=(TableRow("host", f"{tiny}:baseline", ("--optim.lr", "0.1")),))
+    run_table(table, range(2), tmp_path)
+    configs = [json.loads(path.read_text()) for path in (tmp_path / "runs").glob("*/config.json")]
+    starts = {c["training"]["init_from"]: c["training"]["seeds"] for c in configs if c["training"]["init_from"]}
+    hosts = {path.parent for path in (tmp_path / "runs").glob("*/config.json")}
+    assert len(starts) == 2
+    for start, seeds in starts.items():
+        assert tmp_path / "runs" in [*(tmp_path / "runs" / "x").parents]
+        assert next(host for host in hosts if str(host) == start)
+        assert json.loads((type(tmp_path)(start) / "config.json").read_text())["training"]["seeds"] == seeds
+
+
+def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch):
+    run_table(small(tiny), range(2), tmp_path, quick=True)
+    path = tmp_path / "quick" / "paper.9" / "table.md"
+    assert "SMOKE TEST" in path.read_text()
+    with pytest.raises(UserError, match="smoke test and no result"):
+        record([path.with_name("summary.json")], tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+
+
+def test_the_command_lists_tables_and_names_mistakes(capsys):
+    assert main(["tables"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in TABLES)
+    for arguments, message in (
+        (["tf_lane1"], "no table tf_lane1: there is tf_lane.1"),
+        (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),
+        (["tf_lane.1", "--jobs", "0"], "at least one training"),
+    ):
+        assert main(["tables", *arguments]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_the_page_of_results_is_what_its_summaries_give():
+    from tests.shared import ROOT
+
+    assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results")

@@ -1,7 +1,7 @@
 """Runs by identity: equal runs share a folder, wherever the store is."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +9,7 @@ import pytest
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.store import remaining_seconds, run_key, stored_jobs
 from tflane_jax.config import RunConfig
+from tflane_jax.training.loop import TrainingConfig
 
 THREADS = {"cores": 1}
 CONFIG = RunConfig()
@@ -19,9 +20,7 @@ def changed(**settings):
 
 
 def test_rows_of_one_configuration_share_their_runs(tmp_path):
-    plan = stored_jobs(
-        {"abla5": CONFIG, "abla7": CONFIG, "other": changed(steps=7)}, [3, 4], tmp_path, threads=THREADS
-    )
+    plan = stored_jobs({"abla5": CONFIG, "abla7": CONFIG, "other": changed(steps=7)}, [3, 4], tmp_path, threads=THREADS)
     folders = {name: [job.folder for job in jobs] for name, jobs in plan.items()}
     assert folders["abla5"] == folders["abla7"]
     assert len({*folders["abla5"], *folders["other"]}) == 4
@@ -64,3 +63,31 @@ def test_remaining_time_is_measured_where_it_can_be(tmp_path, monkeypatch, recor
         folder.mkdir()
         (folder / "metrics.jsonl").write_text(json.dumps({"step": step, "split": "train", "seconds": seconds}) + "\n")
     assert remaining_seconds(plan, 2.0) == expected
+
+
+def test_a_new_setting_with_its_default_finds_earlier_runs():
+    @dataclass(frozen=True)
+    class Part:
+        size: int = 1
+
+    @dataclass(frozen=True)
+    class Config:
+        training: TrainingConfig
+        part: Part = Part()
+
+    earlier = run_key(Config(TrainingConfig(steps=3), Part(2)), THREADS)
+
+    @dataclass(frozen=True)
+    class Part:
+        size: int = 1
+        new: tuple[int, ...] = (1, 2)
+
+    @dataclass(frozen=True)
+    class Config:
+        training: TrainingConfig
+        other: Part = field(default_factory=Part)
+        part: Part = Part()
+
+    assert run_key(Config(TrainingConfig(steps=3), part=Part(2)), THREADS) == earlier
+    for changed in (Part(3), Part(), Part(2, (1,))):
+        assert run_key(Config(TrainingConfig(steps=3), part=changed), THREADS) != earlier

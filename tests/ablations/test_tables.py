@@ -1,7 +1,6 @@
 """Tables of the papers: their data, and a small one from training to summary."""
 
 import json
-import shutil
 
 import pytest
 
@@ -30,7 +29,7 @@ def test_every_table_is_about_its_rows_and_measured_by_its_scores(name):
         assert set(table.columns) <= known
     quick = table.configs((*table.rows, *table.hosts), quick=True)
     assert all(config.training.steps == 20 and config.data.train == 24 for config in quick.values())
-    assert len({json.dumps(sorted(row), default=str) for row in table.quoted.rows}) == 1  # the same columns
+    assert len({tuple(row) for row in table.quoted.rows}) <= 1  # the same columns
 
 
 def small(tiny, **changes):
@@ -71,8 +70,7 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
 
     # Another table with one of its rows trains only what is new, and the same table nothing.
     before = {name: (folder / name).read_bytes() for name in TABLE_FILES}
-    trained = [file for file in (out / "runs").glob("*/config.json")]
-    assert len(trained) == 6
+    assert len(list((out / "runs").glob("*/config.json"))) == 6
     run_table(small(tiny, name="paper.10"), range(2), out)
     assert len(list((out / "runs").glob("*/config.json"))) == 6
     for name in ("table.md", "summary.json"):

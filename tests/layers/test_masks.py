@@ -8,7 +8,15 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.layers.masks import SpatialMask, key_mask, pair_mask, radius_mask
+from tflane_jax.layers.masks import (
+    SpatialMask,
+    causal_mask,
+    key_mask,
+    nearest_mask,
+    pair_mask,
+    radius_mask,
+    track_distance,
+)
 
 
 def random_bool(seed, *shape):
@@ -60,7 +68,7 @@ def test_spatial_mask_works_under_vmap_and_takes_custom_quadrants():
 def test_unused_quadrants_are_not_built():
     """4,000 x 4,000 lanes without a mask of the host's own must not cost 16 MB."""
     mask = SpatialMask.from_validity(4000, random_bool(6, 30))
-    assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 2 * 30
+    assert sum(leaf.size for leaf in jax.tree.leaves(mask)) <= 30 * 30 + 3 * 30  # quadrants, and the validity itself
 
 
 @settings(deadline=None)
@@ -81,3 +89,49 @@ def test_a_line_without_length_is_a_point():
     mask = radius_mask(jnp.array([[3.0, 0.0], [3.1, 0.0]]), jnp.zeros((1, 2, 2)), jnp.ones(1, bool), 3.05)
     np.testing.assert_array_equal(mask, [[True], [False]])
     assert radius_mask(jnp.zeros((2, 2)), jnp.zeros((0, 2, 2)), jnp.ones(0, bool), 1.0).shape == (2, 0)
+
+
+@pytest.mark.parametrize("points", [1, 2, 5])
+def test_distance_of_lanes_and_tracks_against_shapely(points):
+    """The nearest valid position of a track counts; what is not valid may hold NaN."""
+    rng = np.random.default_rng(points)
+    lanes, tracks = rng.uniform(-20, 20, (6, points, 2)), rng.uniform(-20, 20, (4, 7, 2))
+    valid = rng.random((4, 7)) < 0.6
+    valid[2] = False
+    holes = jnp.asarray(np.where(valid[..., None], tracks, np.nan))
+    found = np.asarray(track_distance(jnp.asarray(lanes), holes, jnp.asarray(valid)))
+    for i, lane in enumerate(lanes):
+        shape = shapely.Point(lane[0]) if points == 1 else shapely.LineString(lane)
+        for j, track in enumerate(tracks):
+            own = [shape.distance(shapely.Point(place)) for place in track[valid[j]]]
+            assert found[i, j] == pytest.approx(min(own, default=np.inf), rel=1e-4)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 9])
+def test_nearest_keys_first_ones_of_equal_distance(count):
+    distance = np.array([[3.0, 1.0, 1.0, np.inf, 2.0], [np.inf] * 5, [1.0] * 5])
+    found = np.asarray(nearest_mask(jnp.asarray(distance), count))
+    for row, own in zip(distance, found, strict=True):
+        order = [i for i in np.argsort(row, kind="stable") if np.isfinite(row[i])][:count]
+        assert set(np.flatnonzero(own)) == set(order)
+
+
+@pytest.mark.parametrize("heads", [(), (2,)])
+def test_restrictions_are_composed_entry_by_entry(heads):
+    valid, one, other = random_bool(7, 3), random_bool(8, *heads, 4, 3), random_bool(9, 4, 3)
+    lane_mask = random_bool(10, 4, 4)
+    mask = SpatialMask.from_validity(4, valid, lane_mask).restricted(one).restricted(other)
+    dense, free = np.asarray(mask.dense()), np.asarray(SpatialMask.from_validity(4, valid, lane_mask).dense())
+    assert dense.shape == (*heads, 7, 7)
+    pairs = np.broadcast_to(np.asarray(one) & np.asarray(other), (*heads, 4, 3)).reshape(-1, 4, 3)
+    for own, allowed in zip(dense.reshape(-1, 7, 7), pairs, strict=True):
+        expected = free.copy()
+        expected[:4, 4:] &= allowed
+        expected[4:, :4] &= allowed.T
+        np.testing.assert_array_equal(own, expected)
+
+
+@pytest.mark.parametrize("frames", [0, 1, 4])
+def test_a_frame_sees_itself_and_earlier_ones(frames):
+    expected = [[j <= i for j in range(frames)] for i in range(frames)]
+    assert np.asarray(causal_mask(frames)).tolist() == expected

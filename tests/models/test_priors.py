@@ -130,7 +130,8 @@ def test_the_hosts_own_mask_keeps_groups_of_queries_apart():
         def __call__(self, features, mask):
             bound = PriorsConfig(traffic_flow=FLOW).build(spec)
             tokens = encode(bound, observation, deterministic=True)
-            return fuse_into_queries(bound, tokens, 0, HostQueries(features, jnp.zeros_like(features), mask))
+            queries = HostQueries(features, jnp.zeros_like(features), jnp.zeros((len(features), 1, 2)), mask)
+            return fuse_into_queries(bound, tokens, 0, queries)
 
     features = jax.random.normal(jax.random.key(1), (6, 16))
     host = Host()

@@ -44,8 +44,8 @@ class ToyHost(Host):
         config = self.config
         queries = self.param("queries", nn.initializers.normal(1.0), (config.queries, config.query_dim))
         queries = queries + nn.Dense(config.query_dim, name="context")(bev.mean((0, 1)))[None]
-        position = jnp.zeros_like(queries)
-        queries = fuse_into_queries(self.priors.by_name, tokens, 0, HostQueries(queries, position))
+        position, reference = jnp.zeros_like(queries), jnp.full((config.queries, 1, 2), 0.5)
+        queries = fuse_into_queries(self.priors.by_name, tokens, 0, HostQueries(queries, position, reference))
         points = nn.Dense(config.points * 3, name="points")(queries).reshape(config.queries, config.points, 3)
         logits = nn.Dense(4, name="class")(queries)
         points = config.encoder.bev_range.denormalise(nn.sigmoid(points))

@@ -81,13 +81,10 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
     for finding in summary["findings"]:
         lines += _wrapped(f"{finding}.", first="- ", rest="  ")
     quoted = summary["quoted"]
-    return [
-        *lines,
-        "",
-        *_wrapped(f"The paper's own numbers: {quoted['source']}."),
-        "",
-        format_table(quoted["rows"], digits=2),
-    ]
+    if quoted["rows"]:
+        lines += ["", *_wrapped(f"The paper's own numbers: {quoted['source']}."), ""]
+        lines.append(format_table(quoted["rows"], digits=2))
+    return lines
 
 
 def _listed(values: Sequence[Any]) -> str:

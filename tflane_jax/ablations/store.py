@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -50,17 +51,36 @@ def stored_jobs(
 def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = None) -> str:
     """Return the name of a run's folder: a hash of its configuration, its thread setting and the run it starts from.
 
+    Only settings that differ from their defaults count, so that a version with a new setting finds the runs of
+    earlier ones. Where a default was changed, `Job.difference` tells that the folder holds another run.
+
     Args:
         config: with one seed.
         threads: see `training.provenance.thread_setting`.
         origin: key of the run that this one starts from, in place of `training.init_from`, so that the name does not
             depend on where the store is.
     """
-    content = to_json(config)
     if origin is not None:
-        content["training"]["init_from"] = origin
-    text = json.dumps([content, dict(threads)], sort_keys=True)
+        config = replace(config, training=replace(config.training, init_from=origin))
+    text = json.dumps([_chosen(config), dict(threads)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:NAME_LENGTH]
+
+
+def _chosen(config: Any) -> dict[str, Any]:
+    """Return the settings of a configuration that are not their defaults, as plain JSON with the names of classes."""
+    plain, found = to_json(config), {"class": type(config).__name__}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if value == _default(field):
+            continue
+        found[field.name] = _chosen(value) if dataclasses.is_dataclass(value) else plain[field.name]
+    return found
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
 
 
 def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: float) -> tuple[float, int]:

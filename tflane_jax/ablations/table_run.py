@@ -14,6 +14,7 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -128,18 +129,20 @@ def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
 
 def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bool) -> Path:
     """Print the table and the paper's own numbers, and save both as Markdown, JSON and LaTeX."""
-    rows, quoted = _rows(table, results), list(table.quoted.rows)
+    rows = _rows(table, results)
     title = f"{table.name}: {table.title}. {results.protocol}, test split, percent (mean ± std over seeds)"
     if quick:
         title = f"SMOKE TEST, a few updates on a few scenes: no result. {title}"
-    paper = f"The paper's own numbers, not comparable with these: {table.quoted.source}"
-    print("\n" + format_table(rows, title=title) + "\n\n" + format_table(quoted, title=paper))
     meta = {"table": table.name, "protocol": results.protocol, "seeds": list(results.seeds), "quick": quick}
-    path, _ = save_table(
-        folder / "table", rows, meta | {"quoted": {"source": table.quoted.source, "rows": quoted}}, title=title
-    )
-    write_text(path, path.read_text(encoding="utf-8") + "\n" + format_table(quoted, title=paper) + "\n")
-    write_text(folder / "table.tex", latex_table(rows, caption=title) + "\n" + latex_table(quoted, caption=paper))
+    path, _ = save_table(folder / "table", rows, meta | {"quoted": asdict(table.quoted)}, title=title)
+    text, tex = path.read_text(encoding="utf-8"), latex_table(rows, caption=title)
+    if table.quoted.rows:
+        paper = f"The paper's own numbers, not comparable with these: {table.quoted.source}"
+        text += "\n" + format_table(table.quoted.rows, title=paper) + "\n"
+        tex += "\n" + latex_table(table.quoted.rows, caption=paper)
+    write_text(path, text)
+    write_text(folder / "table.tex", tex)
+    print("\n" + text)
     return path
 
 
@@ -187,7 +190,7 @@ def _save_summary(
             "core minutes of a run": _minutes(trained),
             "rows": _rows(table, results),
             "findings": findings(every),
-            "quoted": {"source": table.quoted.source, "rows": [dict(row) for row in table.quoted.rows]},
+            "quoted": asdict(table.quoted),
         },
     )
 

@@ -8,7 +8,9 @@ from tflane_jax.ablations.paper import gtn_lane, markers, tf_lane
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.errors import UserError
 
-TABLES: dict[str, PaperTable] = {table.name: table for table in (*tf_lane.TABLES, *gtn_lane.TABLES, *markers.TABLES)}
+TABLES: dict[str, PaperTable] = {
+    table.name: table for table in (*tf_lane.TABLES, tf_lane.MASKING, *gtn_lane.TABLES, *markers.TABLES)
+}
 
 
 def find_table(name: str) -> PaperTable:

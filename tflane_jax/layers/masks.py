@@ -28,14 +28,48 @@ def radius_mask(
         radius: largest distance.
     """
     lines = jnp.where(valid[:, None, None], lines, 0.0)
+    return (squared_line_distance(places, lines) <= radius**2) & valid[None, :]
+
+
+def squared_line_distance(places: Float[Array, "q 2"], lines: Float[Array, "n p 2"]) -> Float[Array, "q n"]:
+    """Return the squared distance of every place to every line, of at least two points."""
     start, step = lines[:, :-1], lines[:, 1:] - lines[:, :-1]
     # Coordinates apart: arrays whose last axis is 2 are slow on a CPU.
     dx, dy = (places[:, None, None, i] - start[None, ..., i] for i in (0, 1))
     sx, sy = (step[None, ..., i] for i in (0, 1))
     square = sx**2 + sy**2
     fraction = jnp.clip((dx * sx + dy * sy) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
-    distance = (dx - fraction * sx) ** 2 + (dy - fraction * sy) ** 2
-    return (distance.min(-1) <= radius**2) & valid[None, :]
+    return ((dx - fraction * sx) ** 2 + (dy - fraction * sy) ** 2).min(-1)
+
+
+def track_distance(
+    lanes: Float[Array, "l p 2"], tracks: Float[Array, "t n 2"], valid: Bool[Array, "t n"]
+) -> Float[Array, "l t"]:
+    """Return the least distance between every lane and the valid positions of every track; infinity without any.
+
+    Args:
+        lanes: lines, or single points.
+        tracks: positions in the same unit; invalid ones may hold anything.
+        valid: of the positions.
+    """
+    lines = jnp.repeat(lanes, 2, 1) if lanes.shape[1] == 1 else lanes
+    places = jnp.where(valid[..., None], tracks, 0.0).reshape(-1, 2)
+    square = squared_line_distance(places, lines).reshape(*valid.shape, len(lanes))
+    return jnp.sqrt(jnp.where(valid[..., None], square, jnp.inf).min(1)).T
+
+
+def nearest_mask(distance: Float[Array, "q k"], count: int) -> Bool[Array, "q k"]:
+    """Return the mask by which a query attends to the `count` nearest keys at a finite distance.
+
+    Of keys at equal distances, the first ones count.
+    """
+    rank = jnp.argsort(jnp.argsort(distance, -1, stable=True), -1, stable=True)
+    return (rank < count) & jnp.isfinite(distance)
+
+
+def causal_mask(frames: int) -> Bool[Array, "n n"]:
+    """Return the mask by which a frame attends to itself and to earlier frames."""
+    return jnp.tril(jnp.ones((frames, frames), bool))
 
 
 @struct.dataclass
@@ -43,20 +77,22 @@ class SpatialMask:
     """M_s of TF-Lane (Fig. 5): which of L lane queries and T traffic instances attend to which.
 
     Each fusion module needs one quadrant, which attention broadcasts to its full size; the whole (L+T) x (L+T) matrix
-    exists only if `dense` is called. Rows are queries.
+    exists only if `dense` is called. Rows are queries. `restricted` composes further masks of lanes and instances.
 
     Attributes:
         lanes: L.
+        valid: (T,) of the instances.
         lane_lane: (L, L) the host's own mask; None allows all pairs of lanes.
-        lane_traffic: (1, T) lanes attend to valid instances.
-        traffic_lane: (T, 1) valid instances attend to all lanes.
+        lane_traffic: (1, T) lanes attend to valid instances; (L, T), or (H, L, T) by head, if restricted.
+        traffic_lane: (T, 1) valid instances attend to all lanes; (T, L) or (H, T, L) if restricted.
         traffic_traffic: (T, T) valid instances attend to valid instances.
     """
 
     lanes: int = struct.field(pytree_node=False)
+    valid: Bool[Array, " t"]
     lane_lane: Bool[Array, "l l"] | None
-    lane_traffic: Bool[Array, "1 t"]
-    traffic_lane: Bool[Array, "t 1"]
+    lane_traffic: Bool[Array, "*h #l t"]
+    traffic_lane: Bool[Array, "*h t #l"]
     traffic_traffic: Bool[Array, "t t"]
 
     @classmethod
@@ -66,19 +102,31 @@ class SpatialMask:
         """Return M_s from the validity of instances and the host's L->L mask, None for all lanes (section 3.3)."""
         return cls(
             lanes=lanes,
+            valid=traffic_valid,
             lane_lane=lane_mask,
             lane_traffic=key_mask(traffic_valid),
             traffic_lane=traffic_valid[:, None],
             traffic_traffic=pair_mask(traffic_valid, traffic_valid),
         )
 
-    def dense(self) -> Bool[Array, "l+t l+t"]:
-        """Return the whole matrix, lanes first."""
-        lanes, traffic = self.lanes, self.lane_traffic.shape[1]
+    def restricted(self, pairs: Bool[Array, "*h l t"]) -> SpatialMask:
+        """Return the mask in which lanes and instances see each other only where `pairs` allows it as well.
+
+        Args:
+            pairs: [..., i, j] lane i and instance j; with a leading axis, each head has its own.
+        """
+        return self.replace(
+            lane_traffic=_both(self.lane_traffic, pairs),
+            traffic_lane=_both(self.traffic_lane, jnp.swapaxes(pairs, -1, -2)),
+        )
+
+    def dense(self) -> Bool[Array, "*h l+t l+t"]:
+        """Return the whole matrix, lanes first; one for each head if a restriction has heads."""
+        lanes, traffic, heads = self.lanes, self.lane_traffic.shape[-1], self.lane_traffic.shape[:-2]
         lane_lane = jnp.ones((1, 1), bool) if self.lane_lane is None else self.lane_lane
 
         def full(quadrant, rows, columns):
-            return jnp.broadcast_to(quadrant, (rows, columns))
+            return jnp.broadcast_to(quadrant, (*heads, rows, columns))
 
         return jnp.block(
             [
@@ -86,3 +134,10 @@ class SpatialMask:
                 [full(self.traffic_lane, traffic, lanes), full(self.traffic_traffic, traffic, traffic)],
             ]
         )
+
+
+def _both(one: Bool[Array, "*h #q #k"], other: Bool[Array, "*h #q #k"]) -> Bool[Array, "*h q k"]:
+    """Return where both masks allow a pair; one without heads holds for all heads of the other."""
+    rank = max(one.ndim, other.ndim)
+    one, other = (mask.reshape((1,) * (rank - mask.ndim) + mask.shape) for mask in (one, other))
+    return one & other

@@ -107,7 +107,7 @@ class BevFormerDetr(Host):
         outputs = []
         for i in range(config.layers):
             last = i == config.layers - 1
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, position))
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, position, reference))
             layer = LaneDecoderLayer(config, name=f"layer_{i}")
             around = attention_reference(reference, config)
             queries = layer(queries, position, around, bev, None, deterministic=deterministic)

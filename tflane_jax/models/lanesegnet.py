@@ -165,7 +165,7 @@ class LaneSegNet(Host):
         outputs = []
         for i in range(config.layers):
             placed = lane_position(config, i, position, reference)
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed))
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed, reference))
             layer = LaneDecoderLayer(config, "star", name=f"layer_{i}")
             queries = layer(queries, placed, around, bev, None, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)

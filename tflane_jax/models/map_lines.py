@@ -222,7 +222,7 @@ def decode_line_layers(
     for i in range(config.layers):
         placed = point_position(config, i, position, reference).reshape(-1, config.dim)
         if fuse is not None:
-            queries = fuse(i, HostQueries(queries, placed))
+            queries = fuse(i, HostQueries(queries, placed, reference.reshape(queries.shape[0], 1, -1)))
         around = reference[..., :2].reshape(-1, 1, 2)
         layer = LaneDecoderLayer(config, name=f"layer_{i}")
         queries = layer(queries, placed, around, bev, None, deterministic=deterministic)

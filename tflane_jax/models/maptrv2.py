@@ -124,7 +124,8 @@ class MapTrV2(MapTr):
         every = None if groups is None else jnp.repeat(jnp.repeat(groups, points, 0), points, 1)
         for i in range(config.layers):
             placed = point_position(config, i, position, reference)
-            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), every)
+            points_alone = reference.reshape(-1, 1, reference.shape[-1])
+            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
             layer = DecoupledLayer(config, name=f"layer_{i}")
             queries = layer(queries, placed, reference, bev, groups, deterministic=deterministic)

@@ -108,7 +108,7 @@ class TopoNet(Host):
         outputs = []
         for i in range(config.layers):
             placed = lane_position(config, i, position, reference)
-            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed))
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed, reference))
             embedded = nodes = None
             if elements is not None and element_edges is not None:
                 embed = ElementEmbedding(config, name=f"element_embedding_{i}")

@@ -23,6 +23,7 @@ from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
+from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
 from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig, TrafficFlowTokens, select_traffic_flow
 from tflane_jax.priors.traffic_raster import rasterise_traffic_flow
@@ -54,6 +55,7 @@ class TrafficFlowModuleConfig:
         bands: frequencies per coordinate of the sine encoding.
         width: channels inside the temporal encoder.
         heads: attention heads in both encoders.
+        masking: restrictions of the masks.
     """
 
     fusions: tuple[Fusion, ...] = LANE_FUSIONS
@@ -65,6 +67,7 @@ class TrafficFlowModuleConfig:
     bands: int = 7
     width: int = 32
     heads: int = 4
+    masking: TrafficMaskConfig = TrafficMaskConfig()
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,7 @@ class TrafficFlowConfig:
             raise UserError(
                 "traffic flow enters nowhere: choose traffic_flow.insert or traffic_flow.bev, or leave traffic_flow out"
             )
+        self.module.masking.check(self.module.heads)
         return TrafficFlowPrior(self, host)
 
 
@@ -153,9 +157,12 @@ class TrafficFlowPrior(Prior):
         """Return L'_Feat before the layers selected by `insert`."""
         if tokens.features is None or (layer > 0 and self.config.insert == "before_decoder"):
             return queries.features
-        mask = SpatialMask.from_validity(len(queries.features), tokens.tracks.valid, queries.mask)
+        config = self.config
+        mask = spatial_mask(
+            config.module.masking, queries, tokens.tracks, config.prior.coordinates, self.host.bev_range
+        )
         name = f"spatial_encoder_{layer}"
-        spatial = SpatialEncoder(self.config.module, self.host.dim, self.host.query_type, name=name)
+        spatial = SpatialEncoder(config.module, self.host.dim, self.host.query_type, name=name)
         return spatial(queries.features, queries.position, tokens.features, mask)
 
 
@@ -177,7 +184,8 @@ class TemporalEncoder(nn.Module):
         """Return TF_Feat; rows of invalid instances are finite but meaningless."""
         x = self._embed(tokens)
         for i in range(self.config.depth):
-            x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, tokens.frame_valid)
+            mask = temporal_mask(self.config.masking, tokens.frame_valid)
+            x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, mask)
         x = nn.LayerNorm(name="norm")(x)
         weight = tokens.frame_valid.astype(x.dtype)
         mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
@@ -215,16 +223,16 @@ class TemporalLayer(nn.Module):
     heads: int
 
     @nn.compact
-    def __call__(self, x: Float[Array, "t n c"], frame_valid: Bool[Array, "t n"]) -> Float[Array, "t n c"]:
-        """Return the frames after masked self-attention and a feed-forward block."""
-        # One instance at a time; the mask is the temporal mask of Fig. 4.
+    def __call__(self, x: Float[Array, "t n c"], mask: Bool[Array, "t #n n"]) -> Float[Array, "t n c"]:
+        """Return the frames after self-attention under the temporal mask (Fig. 4) and a feed-forward block."""
+        # One instance at a time.
         attend = nn.vmap(
             MultiHeadAttention,
             variable_axes={"params": None, "intermediates": 0},
             split_rngs={"params": False},
         )
         y = nn.LayerNorm(name="attention_norm")(x)
-        x = x + attend(self.width, self.heads, name="attention")(y, y, y, frame_valid[:, None, :])
+        x = x + attend(self.width, self.heads, name="attention")(y, y, y, mask)
         y = nn.LayerNorm(name="mlp_norm")(x)
         return x + Mlp((2 * self.width, self.width), name="mlp")(y)
 
@@ -270,14 +278,17 @@ class SpatialEncoder(nn.Module):
             norm = nn.LayerNorm(name=f"{label}_norm")
             if config.residual == "fusion":
                 return norm(x + found)
-            return norm(found) if quadrant is None else jnp.where(quadrant.any(-1, keepdims=True), norm(found), x)
+            return norm(found) if quadrant is None else jnp.where(sees_any(quadrant), norm(found), x)
 
-        # An instance that no lane may attend to is padding and may hold anything, NaN included.
-        traffic = jnp.where(mask.lane_traffic.any(0)[:, None], traffic, 0.0)
+        # Padding may hold anything, NaN included.
+        traffic = jnp.where(mask.valid[:, None], traffic, 0.0)
         # A traffic token carries its own position already.
         none = jnp.zeros_like(traffic)
         fused = lanes
         for i in range(config.spatial_depth):
+            if config.masking.softmax == "joint":
+                fused, traffic = self._joint(i, fused, lane_position, traffic, mask)
+                continue
             traffic = fuse("T->T", i, traffic, none, traffic, none, mask.traffic_traffic)
             traffic = fuse("T->L", i, traffic, none, fused, lane_position, mask.traffic_lane)
             fused = fuse("L->T", i, fused, lane_position, traffic, none, mask.lane_traffic)
@@ -287,3 +298,16 @@ class SpatialEncoder(nn.Module):
         transformed = fused + Mlp((2 * self.dim, self.dim), name="transform")(fused)
         transformed = nn.LayerNorm(name="transform_norm")(transformed)
         return transformed + lanes if self.query_type == "point" else transformed
+
+    def _joint(self, layer, lanes, lane_position, traffic, mask: SpatialMask):
+        """Return lanes and traffic after one attention over both; traffic is renewed only with the T modules."""
+        config, count = self.config, len(lanes)
+        tokens, whole = jnp.concatenate([lanes, traffic]), mask.dense()
+        placed = tokens + jnp.concatenate([lane_position, jnp.zeros_like(traffic)])
+        rows = count if config.fusions == LANE_FUSIONS else len(tokens)
+        label = "joint" + (f"_{layer}" if layer else "")
+        attend = MultiHeadAttention(self.dim, config.heads, name=label)
+        found, own = attend(placed[:rows], placed, tokens, whole[..., :rows, :]), tokens[:rows]
+        fused = nn.LayerNorm(name=f"{label}_norm")(own + found if config.residual == "fusion" else found)
+        fused = jnp.where(sees_any(whole[..., :rows, :]), fused, own)
+        return fused[:count], traffic if rows == count else fused[count:]

@@ -9,6 +9,7 @@ from typing import Any
 from tflane_jax.ablations.declaration import Claim, Declaration
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 
+
 @dataclass(frozen=True)
 class TableRow:
     """A model of a table.

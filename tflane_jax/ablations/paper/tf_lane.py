@@ -249,3 +249,31 @@ TABLES = (
         ),
     ),
 )
+
+_MASKS = {
+    "quadrants, All": "all",
+    "joint softmax, LT/LL": "joint",
+    "joint softmax, All": "joint_all",
+    "windows by head": "heads",
+    "window of 6 m": "window",
+    "4 nearest instances": "nearest",
+    "causal in time": "causal",
+}
+
+MASKING = PaperTable(
+    name="tf_lane.masking",
+    title="which lanes may attend to which road users: masking variants of the TFM",
+    rows=(
+        TableRow("TopoNet", "tf_lane/toponet:street"),
+        TableRow("quadrants, LT/LL", "tf_lane/masking"),
+        *(TableRow(name, f"tf_lane/masking:{ablation}") for name, ablation in _MASKS.items()),
+    ),
+    claims=tuple(Claim(name, "quadrants, LT/LL") for name in _MASKS),
+    primary=_GROUPS[0],
+    negative_control=_GROUPS[1],
+    columns=("all/DET_l", "all/TOP_ll", "all/recall", *_GROUPS),
+    quoted=Quoted("no numbers: the paper compares All with LT/LL only (Table 5)", ()),
+    seeds=3,
+    steps=2500,
+    minutes=5.0,
+)

@@ -1,0 +1,44 @@
+"""Masking variants of the traffic-flow module's attention, on TopoNet and the preset `street`.
+
+    tflane train --config tf_lane/masking:window
+    tflane tables tf_lane.masking --jobs 2
+
+Everything but the masks is that of `toponet_tfm.py:street`, the paper's LT/LL with one softmax for each quadrant.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.traffic_flow_module import ALL_FUSIONS
+from tflane_jax.models.traffic_masks import TrafficMaskConfig
+
+FAR = 1000.0
+
+
+def get_config() -> RunConfig:
+    """Return the paper's best masks: lanes attend to all valid instances, then to lanes (LT/LL)."""
+    return load_config(str(Path(__file__).with_name("toponet_tfm.py:street")))
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the variants by name; distances are between the reference of a lane query and a track."""
+    return {
+        "all": _masked(TrafficMaskConfig(), "all"),
+        "joint": _masked(TrafficMaskConfig(softmax="joint")),
+        "joint_all": _masked(TrafficMaskConfig(softmax="joint"), "all"),
+        "heads": _masked(TrafficMaskConfig(head_windows=(4.0, 8.0, 16.0, FAR))),
+        "window": _masked(TrafficMaskConfig(window=6.0)),
+        "nearest": _masked(TrafficMaskConfig(nearest=4)),
+        "causal": _masked(TrafficMaskConfig(temporal="causal")),
+    }
+
+
+def _masked(masking: TrafficMaskConfig, pipe: str = "lanes") -> RunConfig:
+    config = get_config()
+    flow = config.task.model.priors.traffic_flow
+    module = replace(flow.module, masking=masking)
+    module = replace(module, fusions=ALL_FUSIONS) if pipe == "all" else module
+    priors = PriorsConfig(traffic_flow=replace(flow, module=module))
+    return replace(config, task=replace(config.task, model=replace(config.task.model, priors=priors)))

@@ -1,0 +1,103 @@
+"""Variants of TF-Lane's masks: which lanes see which road users, and which frames of a track see each other.
+
+The paper's M_s (Fig. 5) lets every lane attend to every valid instance. The restrictions here are composed with it by
+"and"; each is a setting of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.layers.masks import SpatialMask, causal_mask, key_mask, nearest_mask, track_distance
+from tflane_jax.models.prior import HostQueries
+from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+
+
+@dataclass(frozen=True)
+class TrafficMaskConfig:
+    """Restrictions of the TFM's attention; the defaults are the paper's masks.
+
+    Distances are those between the reference line of a lane query and the nearest valid position of a track.
+
+    Attributes:
+        softmax: "quadrants" has one softmax for each fusion module; "joint" one for lanes and traffic together, under
+            the whole M_s, in place of the fusion modules.
+        window: metres; lanes and instances further apart do not see each other. None: no limit.
+        nearest: a lane sees only so many nearest instances. None: all.
+        head_windows: metres, one for each head, infinity allowed; () for none.
+        temporal: "all": a frame of a track attends to all valid frames, as in Fig. 4; "causal": to itself and earlier
+            ones.
+    """
+
+    softmax: Literal["quadrants", "joint"] = "quadrants"
+    window: float | None = None
+    nearest: int | None = None
+    head_windows: tuple[float, ...] = ()
+    temporal: Literal["all", "causal"] = "all"
+
+    def check(self, heads: int) -> None:
+        """Raise UserError for windows that do not fit the number of heads, or that nothing can be in."""
+        if self.head_windows and len(self.head_windows) != heads:
+            raise UserError(
+                f"masking.head_windows has {len(self.head_windows)} windows for {heads} heads: give one for each"
+            )
+        windows = (*self.head_windows, *(() if self.window is None else (self.window,)))
+        if any(window <= 0 for window in windows):
+            raise UserError(f"masking: a window of {min(windows):g} m holds nothing")
+        if self.nearest is not None and self.nearest < 1:
+            raise UserError(f"masking.nearest is {self.nearest}: a lane sees at least one instance")
+
+    @property
+    def local(self) -> bool:
+        """Whether the spatial mask depends on distances."""
+        return self.window is not None or self.nearest is not None or bool(self.head_windows)
+
+
+def spatial_mask(
+    config: TrafficMaskConfig,
+    queries: HostQueries,
+    tracks: TrafficFlowTokens,
+    coordinates: Literal["normalised", "metres"],
+    bev_range: PerceptionRange,
+) -> SpatialMask:
+    """Return M_s with the restrictions of `config`.
+
+    Args:
+        config: restrictions.
+        queries: of the host.
+        tracks: selected instances.
+        coordinates: of the tracks' positions.
+        bev_range: the box that normalised coordinates span.
+    """
+    mask = SpatialMask.from_validity(len(queries.features), tracks.valid, queries.mask)
+    if not config.local:
+        return mask
+    position = tracks.position if coordinates == "metres" else bev_range.denormalise(tracks.position)
+    lanes = bev_range.denormalise(jax.lax.stop_gradient(queries.reference))
+    distance = track_distance(lanes[..., :2], position[..., :2], tracks.frame_valid)
+    if config.window is not None:
+        mask = mask.restricted(distance <= config.window)
+    if config.nearest is not None:
+        mask = mask.restricted(nearest_mask(distance, config.nearest))
+    if config.head_windows:
+        mask = mask.restricted(distance[None] <= jnp.asarray(config.head_windows)[:, None, None])
+    return mask
+
+
+def temporal_mask(config: TrafficMaskConfig, frame_valid: Bool[Array, "t n"]) -> Bool[Array, "t #n n"]:
+    """Return the temporal mask of every instance (Fig. 4): frames attend to valid frames."""
+    mask = jax.vmap(key_mask)(frame_valid)
+    return mask if config.temporal == "all" else mask & causal_mask(frame_valid.shape[1])[None]
+
+
+def sees_any(quadrant: Bool[Array, "*h q k"]) -> Bool[Array, "q 1"]:
+    """Return whether a query sees any key in any head."""
+    seen = quadrant.any(-1, keepdims=True)
+    return seen.any(0) if seen.ndim == 3 else seen

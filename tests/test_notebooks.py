@@ -9,8 +9,10 @@ from tests.shared import ROOT
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 600_000
 
-# Follows the cell of parameters: models that are too small to be any good and have random weights.
-SMALL = """
+# Each follows the cell of parameters. Models that are too small to be any good: one notebook gets random weights, the
+# other a training of two updates.
+SMALL = {
+    "traffic_flow": """
 from tests.parameters import random_params
 from tflane_jax.runs import save_weights
 
@@ -20,35 +22,45 @@ settings = "--task.model.decoder.layers 1 --task.model.encoder.levels 32"
 
 def train_run(config, folder):
     save_weights(config, random_params(config.task.init, config.task.shapes(config.data)), folder)
-"""
+""",
+    "masking": """
+folder, scenes, rounds = Path({folder!r}), 2, 2
+settings = "--training.steps 2 --training.log-every 1 --training.eval-every 2 --optim.warmup-steps 1"
+settings += " --evaluation.pictures 0 --data.train 2 --data.val 1 --task.model.decoder.layers 1 --task.model.encoder.levels 32"
+runs = {{"joint": "tf_lane/masking:joint"}}
+""",
+}
+PICTURES = {"traffic_flow": 6, "masking": 4}
 
 
 @pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
 def notebook(request):
     nbformat = pytest.importorskip("nbformat")
-    return nbformat.read(request.param, as_version=4)
+    return request.param.stem, nbformat.read(request.param, as_version=4)
 
 
 @pytest.mark.filterwarnings("default")
 def test_notebook_runs(notebook, tmp_path, monkeypatch):
-    nbformat, client = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    (name, notebook), client = notebook, pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
     (place,) = [i for i, cell in enumerate(notebook.cells) if "parameters" in cell.metadata.get("tags", [])]
-    small = SMALL.format(folder=str(tmp_path / "runs"))
+    small = SMALL[name].format(folder=str(tmp_path / "runs"))
     notebook.cells.insert(place + 1, nbformat.v4.new_code_cell(small))
     for cell in notebook.cells:
         if cell.cell_type == "code":
             cell.outputs = []
     client.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
-    assert pictures(notebook) >= 6
+    assert pictures(notebook) >= PICTURES[name]
     assert "8 validation frames of 2 scenes" in printed(notebook)
 
 
 def test_outputs_are_stored(notebook):
     """They are of the whole notebook, run once from top to bottom."""
+    name, notebook = notebook
     codes = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in codes] == list(range(1, len(codes) + 1))
-    assert pictures(notebook) >= 6
+    assert pictures(notebook) >= PICTURES[name]
     assert "validation frames" in printed(notebook)
     kinds = {output.get("name", output.output_type) for cell in codes for output in cell.outputs}
     assert kinds <= {"stdout", "execute_result"}

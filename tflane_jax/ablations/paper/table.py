@@ -101,4 +101,5 @@ def _shortened(config: RunConfig, steps: int = 20) -> RunConfig:
     """Return a smoke test of the configuration."""
     often = {"eval_every": steps, "checkpoint_every": steps, "log_every": steps // 2}
     training = replace(config.training, steps=steps, **often)
-    return replace(config, data=replace(config.data, train=24, val=4, test=6), training=training)
+    optim = replace(config.optim, warmup_steps=min(config.optim.warmup_steps, steps // 4))
+    return replace(config, data=replace(config.data, train=24, val=4, test=6), optim=optim, training=training)

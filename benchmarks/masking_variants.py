@@ -1,0 +1,123 @@
+"""What each masking variant of the traffic-flow module costs: the whole module, forward with gradient.
+
+    python -m benchmarks.masking_variants --out runs/bench
+
+The module (temporal and spatial encoder) of `configs/tf_lane/masking.py` on random tracks, for the number of lane
+queries of the small host and of the papers. A variant's time includes making its mask from the distances between
+lanes and tracks. Ratios are to the paper's masks (LT/LL), in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.timing import compile_jax, interleave, machine, markdown_table, save, summarise
+from tflane_jax.config import load_ablations, load_config
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.models.prior import HostQueries, HostSpec
+from tflane_jax.models.traffic_flow_module import SpatialEncoder, TemporalEncoder, TrafficFlowConfig
+from tflane_jax.models.traffic_masks import spatial_mask
+from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+
+PAPER = "LT/LL"
+QUERIES, BATCH, DIM, POINTS = (48, 200), 4, 64, 11
+RANGE = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
+
+
+def variants() -> dict[str, TrafficFlowConfig]:
+    """Return the prior of each configuration of `configs/tf_lane/masking.py`, the paper's first."""
+    configs = {PAPER: load_config("tf_lane/masking"), **load_ablations("tf_lane/masking")}
+    return {name: config.task.model.priors.traffic_flow for name, config in configs.items()}
+
+
+def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, TrafficFlowTokens]:
+    """Return seeded random queries and tracks of a batch; about two thirds of the instances are valid."""
+    rng = np.random.default_rng(queries)
+    instances, frames = prior.prior.max_instances, prior.prior.frames
+    features, position = (rng.standard_normal((BATCH, queries, DIM), np.float32) for _ in range(2))
+    asked = HostQueries(features, position, rng.random((BATCH, queries, POINTS, 3), np.float32))
+    valid = rng.random((BATCH, instances)) < 2 / 3
+    heading = rng.standard_normal((BATCH, instances, frames, 2), np.float32)
+    tracks = TrafficFlowTokens(
+        position=rng.random((BATCH, instances, frames, 3), np.float32),
+        heading=heading / np.linalg.norm(heading, axis=-1, keepdims=True),
+        size=rng.random((BATCH, instances, 3), np.float32),
+        category=np.zeros((BATCH, instances), np.int32),
+        frame_valid=valid[..., None] & (rng.random((BATCH, instances, frames)) < 0.8),
+        valid=valid,
+        weight=valid.astype(np.float32),
+        index=np.zeros((BATCH, instances), np.int32),
+    )
+    return jax.tree.map(jnp.asarray, (asked, tracks))
+
+
+def program(config: TrafficFlowConfig, queries: HostQueries, tracks: TrafficFlowTokens) -> tuple[Any, Any]:
+    """Return the gradient of the module's squared output, and its parameters."""
+    spec, module = HostSpec(DIM, RANGE, RANGE), config.module
+    temporal, spatial = TemporalEncoder(module, DIM, config.prior.coordinates), SpatialEncoder(module, DIM)
+
+    def one(params, asked: HostQueries, flow: TrafficFlowTokens):
+        tokens = temporal.apply(params["temporal"], flow)
+        mask = spatial_mask(module.masking, asked, flow, config.prior.coordinates, spec.bev_range)
+        return spatial.apply(params["spatial"], asked.features, asked.position, tokens, mask)
+
+    def total(params, asked, flow):
+        return (jax.vmap(one, (None, 0, 0))(params, asked, flow) ** 2).sum()
+
+    asked, flow = jax.tree.map(lambda leaf: leaf[0], (queries, tracks))
+    keys = jax.random.split(jax.random.key(0))
+    start = {"temporal": jax.jit(temporal.init)(keys[0], flow)}
+    tokens = temporal.apply(start["temporal"], flow)
+    mask = spatial_mask(module.masking, asked, flow, config.prior.coordinates, spec.bev_range)
+    start["spatial"] = jax.jit(spatial.init)(keys[1], asked.features, asked.position, tokens, mask)
+    return jax.grad(total), start
+
+
+def run(out: Path, *, queries: tuple[int, ...] = QUERIES, seconds: float = 8.0) -> dict[str, Any]:
+    """Run the benchmark, print its table and write `masking_variants.json` and `.md` into `out`; return the record.
+
+    Args:
+        out: folder.
+        queries: numbers of lane queries.
+        seconds: at least that long for each number of queries.
+    """
+    record: dict[str, Any] = machine() | {"batch": BATCH, "channels": DIM, "queries": {}}
+    for count in queries:
+        compiled = {}
+        for name, config in variants().items():
+            inputs = make_inputs(count, config)
+            gradient, params = program(config, *inputs)
+            compiled[name] = compile_jax(gradient, params, *inputs)
+        timings = summarise(interleave({name: c.program for name, c in compiled.items()}, seconds), PAPER)
+        record["queries"][str(count)] = timings
+    names = list(variants())
+    header = ["masks", *(f"{count} queries" for count in queries)]
+    cells = [[record["queries"][str(count)][name] for count in queries] for name in names]
+    shown = [
+        [name, *(f"{c['median_ms']:.2f} ms" if name == PAPER else f"{c['ratio']:.2f}" for c in row)]
+        for name, row in zip(names, cells, strict=True)
+    ]
+    text = markdown_table(header, shown)
+    print(text)
+    save(out, "masking_variants", record, text)
+    return record
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser.add_argument("--queries", type=int, nargs="+", default=QUERIES, help="numbers of lane queries")
+    parser.add_argument("--seconds", type=float, default=8.0, help="time for each number of queries")
+    options = parser.parse_args()
+    run(options.out, queries=tuple(options.queries), seconds=options.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -165,6 +165,19 @@ def test_evaluation_with_other_traffic(trained, capsys):
         assert json.loads(stem.with_suffix(".json").read_text())["meta"]["traffic"] == traffic
 
 
+def test_evaluation_with_geometric_topology(trained):
+    assert main(["eval", str(trained), "--checkpoint", "last", "--topology", "geometric"]) == 0
+    assert main(["eval", str(trained), "--checkpoint", "last"]) == 0
+    stem = trained / "evaluations" / "procedural-test-step4"
+    scores = {}
+    for suffix, topology in (("", "learned"), ("-topology_geometric", "geometric")):
+        content = json.loads(stem.with_name(f"{stem.name}{suffix}.json").read_text())
+        assert content["meta"]["topology"] == topology
+        scores[topology] = next(row for row in content["rows"] if row["lanes of"] == "all")
+    changed = {name for name, score in scores["learned"].items() if scores["geometric"][name] != score}
+    assert changed <= {"TOP_ll", "OLS"}
+
+
 def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
     out = tmp_path / "predictions"
     assert main(["predict", str(trained), "--count", "2", "--out", str(out), "--threshold", "0"]) == 0

@@ -26,7 +26,8 @@ def train_run(config, folder):
     "masking": """
 folder, scenes, rounds = Path({folder!r}), 2, 2
 settings = "--training.steps 2 --training.log-every 1 --training.eval-every 2 --optim.warmup-steps 1"
-settings += " --evaluation.pictures 0 --data.train 2 --data.val 1 --task.model.decoder.layers 1 --task.model.encoder.levels 32"
+settings += " --evaluation.pictures 0 --data.train 2 --data.val 1"
+settings += " --task.model.decoder.layers 1 --task.model.encoder.levels 32"
 runs = {{"joint": "tf_lane/masking:joint"}}
 """,
 }

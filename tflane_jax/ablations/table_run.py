@@ -14,9 +14,11 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 from tflane_jax.ablations.compare import (
     draw_models,
@@ -32,7 +34,7 @@ from tflane_jax.ablations.effects import effects, findings, save_effects
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST
+from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
 from tflane_jax.ablations.store import remaining_seconds, stored_jobs
 from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.config import RunConfig
@@ -42,7 +44,9 @@ from tflane_jax.plots.tables import format_table, latex_table, save_table
 from tflane_jax.training.provenance import read_provenance
 from tflane_jax.training.records import read_records
 
-Plan = dict[str, list[Job]]
+TOPOLOGY = {"all/TOP_ll", "all/TOP_lsls"}
+GEOMETRIC = ", geometric"
+"""Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
 
 
 def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False) -> Path:
@@ -78,6 +82,7 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
     failures += train_all(_by_seed(plan), jobs)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
+    _add_geometric(without_failures(plan, failures), results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
         raise UserError(summary_of(failures, len(_by_seed(plan))))
@@ -121,10 +126,23 @@ def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
     rows = []
     for which in CHECKPOINTS:
         for name, by_seed in results.rows(OWN_TEST, which).items():
-            columns = [column for column in table.columns if all(column in scores for scores in by_seed.values())]
+            wanted = [name for column in table.columns for name in (column, column + GEOMETRIC)]
+            columns = [column for column in wanted if all(column in scores for scores in by_seed.values())]
             (cells,) = compact([Variant(name, tuple(by_seed.values()))], columns)
             rows.append({"model": name, "checkpoint": which, "seeds": len(by_seed)} | cells)
     return rows
+
+
+def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> None:
+    """Add to every row that predicts topology its score with the geometric topology, at the last checkpoint."""
+    pairs = [(name, job) for name, jobs in trained.items() for job in jobs]
+    for name, job in tqdm(pairs, desc="evaluate with geometric topology", unit="run"):
+        scores = results.scores[OWN_TEST, "last"][name][job.config.training.seeds[0]]
+        for score in TOPOLOGY & scores.keys():
+            evaluation = replace(job.config.evaluation, topology="geometric")
+            measured = measure(job, replace(job.config, evaluation=evaluation), "last")
+            if measured is not None:
+                scores[score + GEOMETRIC] = measured.ways[""][score]
 
 
 def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bool) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from tflane_jax.commands.sources import chosen_source, limited_task, opened, with_chosen_traffic
+from tflane_jax.commands.sources import chosen_source, limited_task, opened, with_chosen_topology, with_chosen_traffic
 from tflane_jax.config_io import to_json
 from tflane_jax.datasets.sources import source_name
 from tflane_jax.errors import UserError
@@ -20,7 +20,7 @@ def run(options: argparse.Namespace) -> int:
     trained, rest = opened(options)
     if rest:
         raise UserError(f"tflane eval takes one run: leave {rest[0]} out")
-    trained = with_chosen_traffic(trained, options)
+    trained = with_chosen_topology(with_chosen_traffic(trained, options), options)
     source = chosen_source(trained.config, options)
     protocol, rows = evaluate_run(trained, source, task=limited_task(trained, options))
 
@@ -29,6 +29,8 @@ def run(options: argparse.Namespace) -> int:
         name += f"-max_instances{options.max_instances}"
     if (traffic := trained.config.evaluation.traffic) != "own":
         name += f"-traffic_{traffic.replace('-', '_')}"
+    if (topology := trained.config.evaluation.topology) != "learned":
+        name += f"-topology_{topology}"
     title = f"{trained.name}, {name}: {protocol}"
     print(format_table(rows, title=title))
     meta = {
@@ -37,6 +39,7 @@ def run(options: argparse.Namespace) -> int:
         "protocol": protocol,
         "max_instances": options.max_instances,
         "traffic": traffic,
+        "topology": topology,
         "source": to_json(source),
     }
     folder = Path("runs" if options.config else trained.name) / "evaluations"

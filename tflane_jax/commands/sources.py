@@ -56,6 +56,16 @@ def with_chosen_traffic(run: Run, options: argparse.Namespace) -> Run:
     return replace(run, config=replace(run.config, evaluation=evaluation))
 
 
+def with_chosen_topology(run: Run, options: argparse.Namespace) -> Run:
+    """Return the run evaluated with the edges of --topology; raise UserError for a model that predicts none."""
+    if options.topology is None:
+        return run
+    if not isinstance(run.config.task, LaneGraphTask):
+        raise UserError("--topology is about which lane follows which, and this model does not predict it")
+    evaluation = replace(run.config.evaluation, topology=options.topology)
+    return replace(run, config=replace(run.config, evaluation=evaluation))
+
+
 def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split | None = None) -> Any:
     """Return the data selected by --split, --data, --root and --openlane: a configuration of `datasets.sources`.
 

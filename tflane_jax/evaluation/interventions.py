@@ -45,7 +45,7 @@ def traffic_interventions(arrays: Example | Streamed, config: EvaluationConfig) 
 
     Empty for an evaluation that is an intervention itself.
     """
-    if config.traffic != "own":
+    if config.traffic != "own" or config.topology != "learned":
         return {}
     found = {"no traffic flow at inference": replace(config, traffic="none")}
     if len(np.unique(scene_numbers(arrays))) > 1:

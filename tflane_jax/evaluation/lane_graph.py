@@ -21,6 +21,7 @@ from jaxtyping import Bool
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
+from tflane_jax.evaluation.geometric_topology import with_geometric_topology
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups, line_groups
 from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_truth
@@ -226,6 +227,8 @@ def evaluate_lanes(
             )
         for row in range(len(indices)):
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
+            if config.topology == "geometric":
+                prediction = with_geometric_topology(prediction)
             group = None
             if batch.markers is not None:
                 group = sightings.next(batch.markers.valid[row].any(), batch.has_previous[row])

@@ -12,6 +12,9 @@ from tflane_jax.metrics.vector_map import Measure
 Traffic = Literal["own", "none", "other-scene"]
 """Traffic flow at inference: that of the frame, none, or that of a frame of another scene."""
 
+Topology = Literal["learned", "geometric"]
+"""Edges between lanes at evaluation: as predicted, or with TopoLogic's geometric score added."""
+
 
 @dataclass(frozen=True)
 class EvaluationConfig:
@@ -23,6 +26,8 @@ class EvaluationConfig:
         versions: versions of OpenLane-V2's metrics. Columns of the first one have no version in their names; the others
             add columns for metrics that differ, such as "OLS_v1.0".
         traffic: traffic flow that the model sees: that of the frame, none, or that of a frame of another scene.
+        topology: which lane follows which: as predicted ("learned"), or that plus the geometry of the predicted lanes
+            ("geometric", see `evaluation.geometric_topology`).
         map_measures: of the lines of vector maps: MapTR's AP by "chamfer" distance, always measured; "iou" adds its
             optional AP by overlap as the group "lines IoU" (slow, needs shapely).
     """
@@ -31,6 +36,7 @@ class EvaluationConfig:
     pictures: int = 4
     versions: tuple[Version, ...] = ("v2.1",)
     traffic: Traffic = "own"
+    topology: Topology = "learned"
     map_measures: tuple[Measure, ...] = ("chamfer",)
 
 

@@ -46,6 +46,12 @@ def evaluate(commands) -> None:
         help="traffic flow that the model sees: of the frame, none, or of another scene (default: the configuration's)",
     )
     parser.add_argument(
+        "--topology",
+        choices=("learned", "geometric"),
+        help="which lane follows which: as predicted, or with TopoLogic's score of end and start points added "
+        "(default: the configuration's)",
+    )
+    parser.add_argument(
         "--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
     )
 

@@ -339,6 +339,14 @@ def test_data_stats_counts_lanes_and_traffic(capsys):
     assert 0.0 < min(driven) <= max(driven) < 1.0
 
 
+def test_data_stats_counts_map_lines(capsys):
+    assert main(["data", "stats", "--config", "tf_lane/maptr:street", "--split", "val", "--count", "2"]) == 0
+    printed = capsys.readouterr().out
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
+    assert float(rows["lines, boundary"][0]) >= 1.0
+    assert float(rows["metres of boundary"][0]) > 30.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [(["--count", "0"], "nothing to count"), (["--data", "front-views"], "are no lane graphs")],

@@ -1,4 +1,4 @@
-"""`tflane data stats`: how many lanes a split has, by evidence and traffic, and how much traffic."""
+"""`tflane data stats`: how many lanes and map lines a split has, by evidence and traffic, and how much traffic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tflane_jax.evaluation.lane_groups import HALF, driven_fraction, lane_groups
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.plots import format_table
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
-from tflane_jax.scene import Example, LaneGraph, RoadImage, RoadUser, TrafficFlow
+from tflane_jax.scene import Example, LaneGraph, LineClass, MapLines, RoadImage, RoadUser, TrafficFlow
 from tflane_jax.tasks import spread
 
 # A lane is out of sight below this visibility, as in the metrics.
@@ -58,6 +58,18 @@ def example_stats(example: Example, config: ExampleConfig) -> dict[str, float]:
         found |= {f"lanes {name}": members.sum() for name, members in groups.items()}
     if flow is not None and driven is not None:
         found |= _traffic_stats(flow, config)
+    return found if example.map_lines is None else found | _line_stats(example.map_lines)
+
+
+def _line_stats(lines: MapLines) -> dict[str, float]:
+    """Return the number and the length of the lines of a vector map by class."""
+    valid, category = np.asarray(lines.valid), np.asarray(lines.category)
+    points = np.where(valid[:, None, None], np.asarray(lines.points), 0.0)[..., :2]
+    metres = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
+    found = {}
+    for kind in LineClass:
+        chosen, name = valid & (category == kind), kind.name.lower()
+        found |= {f"lines, {name}": chosen.sum(), f"metres of {name}": metres[chosen].sum()}
     return found
 
 

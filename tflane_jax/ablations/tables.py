@@ -1,16 +1,15 @@
-"""Every table of the three papers, by name."""
+"""Every table of the three papers, and of the small host, by name."""
 
 from __future__ import annotations
 
 import difflib
 
-from tflane_jax.ablations.paper import gtn_lane, markers, tf_lane
+from tflane_jax.ablations.paper import gtn_lane, markers, small_host, tf_lane
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.errors import UserError
 
-TABLES: dict[str, PaperTable] = {
-    table.name: table for table in (*tf_lane.TABLES, tf_lane.MASKING, *gtn_lane.TABLES, *markers.TABLES)
-}
+_ALL = (*tf_lane.TABLES, tf_lane.MASKING, *gtn_lane.TABLES, *markers.TABLES, *small_host.TABLES)
+TABLES: dict[str, PaperTable] = {table.name: table for table in _ALL}
 
 
 def find_table(name: str) -> PaperTable:

@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup demo test test-slow lint same-losses bench clean
+.PHONY: help setup demo test test-slow lint types same-losses bench clean
 
 help:
 	@echo "make demo         set up, train with and without traffic flow on the built-in world, table and picture"
@@ -23,14 +23,22 @@ $(STAMP): pyproject.toml setup.py constraints.txt
 
 setup: $(STAMP)
 
-# pyright needs Node.js; its Python package fetches one where none is installed.
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	@$(MAKE) --no-print-directory types
+
+# pyright needs Node.js; its Python package fetches one where none is installed.
+types: $(STAMP)
 	@if $(BIN)/pyright --version >/dev/null 2>&1; then $(BIN)/pyright; else echo "pyright skipped: it needs Node.js"; fi
 
-test: lint
-	$(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations=15
+# Types are checked beside the tests, on whichever core has time; what they say comes last.
+test: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@said=$$(mktemp); $(MAKE) --no-print-directory types >$$said 2>&1 & types=$$!; \
+	$(BIN)/python -m pytest -q --numprocesses 2 --dist loadfile --no-loadscope-reorder --durations=15; tests=$$?; \
+	wait $$types; typed=$$?; cat $$said; rm -f $$said; exit $$((tests > typed ? tests : typed))
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow --durations=15

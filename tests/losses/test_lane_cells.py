@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.losses.lane_cells import lane_cell_loss, lane_cells
+from tflane_jax.losses import lane_cells as losses
+from tflane_jax.losses.lane_cells import lane_cell_loss
 from tflane_jax.models.auxiliary import CELL_CHANNELS
 from tflane_jax.scene import LaneGraph
 
 RANGE = PerceptionRange((0.0, 8.0), (0.0, 4.0), (-1.0, 1.0))
 SHAPE = (4, 8)  # cells of one metre
+lane_cells = jax.jit(losses.lane_cells, static_argnums=(1, 2))
 
 
 def graph(*lines, capacity=3, garbage=np.nan):

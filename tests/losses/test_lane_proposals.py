@@ -5,12 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from tflane_jax.geometry import PerceptionRange
-from tflane_jax.losses.lane_proposals import heat_target, lane_proposal_sums
+from tflane_jax.losses import lane_proposals as losses
 from tflane_jax.models.auxiliary import LaneProposalOutputs
 from tflane_jax.scene import LaneGraph
 
 RANGE = PerceptionRange((0.0, 16.0), (0.0, 8.0), (-1.0, 1.0))
 SHAPE = (4, 8, 8)  # cells of two metres, bins of 45 degrees
+heat_target = jax.jit(losses.heat_target, static_argnums=(1, 2))
+lane_proposal_sums = jax.jit(losses.lane_proposal_sums, static_argnums=2)
 
 
 def graph(*ends, capacity=3, garbage=np.nan):

@@ -30,13 +30,14 @@ def predictions(seed=1, batch=2):
     return CurvePrediction(jnp.asarray(logits, jnp.float32), jnp.asarray(curves, jnp.float32))
 
 
+@jax.jit
 def value_and_gradient(prediction, truth):
     config = LaneShapeLossConfig()
 
-    def loss(prediction, truth):
+    def loss(prediction):
         return lane_shape_loss(prediction, lane_shape_targets(truth, shared_horizon=config.shared_horizon), config)
 
-    (value, terms), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(prediction, truth)
+    (value, terms), gradient = jax.value_and_grad(loss, has_aux=True)(prediction)
     return value, terms, gradient
 
 

@@ -12,11 +12,14 @@ from tests.fakes import fake_views
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.cameras import project
-from tflane_jax.losses.map_masks import bev_line_mask, depth_targets, view_line_masks
+from tflane_jax.losses import map_masks
+from tflane_jax.losses.map_masks import depth_targets
 from tflane_jax.scene import MapLines, stack_examples
 
 RANGE = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
 SHAPE = (50, 100)
+bev_line_mask = jax.jit(map_masks.bev_line_mask, static_argnums=(1, 2))
+view_line_masks = jax.jit(map_masks.view_line_masks, static_argnums=2)
 
 
 def lines(*rows, padding=np.nan):

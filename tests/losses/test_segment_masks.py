@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
-from tflane_jax.losses.segment_masks import segment_masks
+from tflane_jax.losses import segment_masks as losses
 
 RANGE = PerceptionRange((-10.0, 10.0), (-5.0, 5.0), (-1.0, 1.0))
+segment_masks = jax.jit(losses.segment_masks, static_argnames=("shape", "range_", "raster"))
 
 
 def make_boundaries(seed, count, length=12.0, width=3.0):

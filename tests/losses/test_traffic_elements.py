@@ -162,4 +162,4 @@ def test_overlap_of_boxes(shift):
 def test_missing_truth_is_an_error():
     prediction, lanes, _ = make_elements(5, (1, 1, 1), related=LAYERS)
     with pytest.raises(ValueError, match="needs the true ones"):
-        lane_graph_loss(prediction, lanes, TopoNetLossConfig())
+        jax.eval_shape(lambda p, t: lane_graph_loss(p, t, TopoNetLossConfig()), prediction, lanes)

@@ -235,9 +235,13 @@ def sentence(of_row: Sequence[Effect]) -> str:
 def _numbers(effect: Effect) -> str:
     """Return a difference in points of percent, with its uncertainties."""
     parts = [] if math.isnan(effect.low) else [f"95 % {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
-    parts += [] if math.isnan(effect.p) else [f"p {effect.p_holm:.4f}"]
+    parts += [] if math.isnan(effect.p) else [_p_value(effect.p_holm)]
     parts.append(f"better in {effect.better} of {len(effect.seeds)} seeds")
     return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
+
+
+def _p_value(p: float) -> str:
+    return f"p {p:.4f}" if p >= 1e-4 else "p < 0.0001"
 
 
 def _rows(results: Results, declaration: Declaration, test: str, every: Sequence[Effect]) -> list[dict[str, Any]]:

@@ -58,11 +58,11 @@ def page(folder: Path) -> str:
 
 def _section(summary: Mapping[str, Any]) -> list[str]:
     minutes = summary["core minutes of a run"]
+    cores = _listed(summary["cores of a run"])
     facts = (
-        f"{len(summary['seeds'])} seeds, {_listed(summary['steps'])} updates a run, "
-        f"{_listed(summary['cores of a run'])} core of {_listed(summary['devices'])}, "
-        f"{min(minutes.values()):.0f} to {max(minutes.values()):.0f} minutes a run; "
-        f"code {_listed(summary['commits'])}. "
+        f"{len(summary['seeds'])} seeds, {_listed(summary['steps'])} updates a run, each on {cores} "
+        f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}) in {min(minutes.values()):.0f} to "
+        f"{max(minutes.values()):.0f} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
         f"{summary['declared']}"
     )

@@ -18,6 +18,7 @@ from typing import Any
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.runs import current_form
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origins
@@ -39,6 +40,7 @@ class Job:
         tests: test sets to evaluate it on, beside the configuration's own test split.
         retrain: whether a run of another configuration in the folder is deleted.
         label: name for people.
+        further: evaluations of the last checkpoint beside the configuration's own.
     """
 
     config: RunConfig
@@ -47,6 +49,7 @@ class Job:
     tests: Tests = field(default_factory=dict)
     retrain: bool = False
     label: str = ""
+    further: tuple[EvaluationConfig, ...] = ()
 
     @property
     def log(self) -> Path:

@@ -74,6 +74,8 @@ def measure_all(job: Job) -> None:
     for settings in ((), *job.tests.values()):
         for which in CHECKPOINTS:
             measure(job, with_test_set(job.config, settings), which)
+    for evaluation in job.further:
+        measure(job, replace(job.config, evaluation=evaluation), "last")
 
 
 def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:

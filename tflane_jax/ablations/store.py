@@ -16,6 +16,7 @@ from tflane_jax.config_io import to_json
 from tflane_jax.training.records import read_records
 
 NAME_LENGTH = 16
+TOPOLOGY = {"all/TOP_ll", "all/TOP_lsls"}
 
 
 def stored_jobs(
@@ -44,8 +45,14 @@ def stored_jobs(
             key = run_key(seeded, threads, origin[i].folder.name if origin else None)
             if origin:
                 seeded = replace(seeded, training=replace(seeded.training, init_from=str(origin[i].folder)))
-            plan[name].append(Job(seeded, store / key, threads, label=f"{name}, seed {seed}"))
+            further = (replace(config.evaluation, topology="geometric"),) if predicts_topology(config) else ()
+            plan[name].append(Job(seeded, store / key, threads, label=f"{name}, seed {seed}", further=further))
     return plan
+
+
+def predicts_topology(config: RunConfig) -> bool:
+    """Return whether a model is measured by `TOPOLOGY`, to which the geometry of its lanes can be added."""
+    return bool(TOPOLOGY & config.task.score_names(config.data, config.evaluation))
 
 
 def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = None) -> str:
@@ -89,12 +96,13 @@ def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: float) -> tupl
     A run's rate is that of complete runs of the same row, or its own so far. Where there is none, a run takes
     `minutes`.
     """
-    seconds, guesses = 0.0, 0
+    seconds, guesses, seen = 0.0, 0, set()
     for jobs in plan.values():
         rates = [rate for job in jobs if (rate := _seconds_per_step(job)) is not None]
         for job in jobs:
-            if job.is_complete():
+            if job.folder in seen or job.is_complete():
                 continue
+            seen.add(job.folder)
             left = job.config.training.steps - job.step()
             if rates:
                 seconds += left * sum(rates) / len(rates)

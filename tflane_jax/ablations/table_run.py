@@ -35,7 +35,7 @@ from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
-from tflane_jax.ablations.store import remaining_seconds, stored_jobs
+from tflane_jax.ablations.store import TOPOLOGY, remaining_seconds, stored_jobs
 from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
@@ -44,7 +44,6 @@ from tflane_jax.plots.tables import format_table, latex_table, save_table
 from tflane_jax.training.provenance import read_provenance
 from tflane_jax.training.records import read_records
 
-TOPOLOGY = {"all/TOP_ll", "all/TOP_lsls"}
 GEOMETRIC = ", geometric"
 """Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
 
@@ -75,7 +74,8 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
     host_plan = stored_jobs(hosts, seeds, store, threads=threads)
     origins = {row.name: host_plan[row.start] for row in table.rows if row.start}
     plan = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
-    declared = declare(table.declaration, plan, seeds, folder)
+    # Fewer seeds than the table has are an interim look at it.
+    declared = declare(table.declaration, plan, range(max(len(seeds), 0 if quick else table.seeds)), folder)
     _tell_work({**host_plan, **plan} if hosts else plan, table, jobs)
 
     failures = train_all(_by_seed(host_plan), jobs)
@@ -100,14 +100,15 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
 
 
 def _by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
-    """Return all jobs, seed by seed, so that a table stopped early has pairs."""
-    return [job for of_seed in zip(*plan.values(), strict=True) for job in of_seed]
+    """Return every run once, seed by seed, so that a table stopped early has pairs."""
+    every = [job for of_seed in zip(*plan.values(), strict=True) for job in of_seed]
+    return list({job.folder: job for job in every}.values())
 
 
 def _tell_work(plan: Mapping[str, Sequence[Job]], table: PaperTable, jobs: int) -> None:
     """Print how many runs are complete, and how long the others will take."""
-    every = {job.folder: job for planned in plan.values() for job in planned}
-    complete = sum(job.is_complete() for job in every.values())
+    every = _by_seed(plan)
+    complete = sum(job.is_complete() for job in every)
     text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
     if complete < len(every):
         seconds, guesses = remaining_seconds(plan, table.minutes)
@@ -126,8 +127,8 @@ def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
     rows = []
     for which in CHECKPOINTS:
         for name, by_seed in results.rows(OWN_TEST, which).items():
-            wanted = [name for column in table.columns for name in (column, column + GEOMETRIC)]
-            columns = [column for column in wanted if all(column in scores for scores in by_seed.values())]
+            wanted = [score for column in table.columns for score in (column, column + GEOMETRIC)]
+            columns = [score for score in wanted if all(score in scores for scores in by_seed.values())]
             (cells,) = compact([Variant(name, tuple(by_seed.values()))], columns)
             rows.append({"model": name, "checkpoint": which, "seeds": len(by_seed)} | cells)
     return rows
@@ -138,11 +139,11 @@ def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> No
     pairs = [(name, job) for name, jobs in trained.items() for job in jobs]
     for name, job in tqdm(pairs, desc="evaluate with geometric topology", unit="run"):
         scores = results.scores[OWN_TEST, "last"][name][job.config.training.seeds[0]]
-        for score in TOPOLOGY & scores.keys():
-            evaluation = replace(job.config.evaluation, topology="geometric")
+        for evaluation in job.further:
             measured = measure(job, replace(job.config, evaluation=evaluation), "last")
             if measured is not None:
-                scores[score + GEOMETRIC] = measured.ways[""][score]
+                for score in TOPOLOGY & scores.keys():
+                    scores[score + GEOMETRIC] = measured.ways[""][score]
 
 
 def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bool) -> Path:

@@ -39,7 +39,7 @@ def thread_setting(cores: int | None = None) -> dict[str, Any]:
 
 
 def provenance() -> dict[str, Any]:
-    """Return code version, package versions, machine and command of this process, as plain JSON."""
+    """Return code version, package versions, machine, cores and command of this process, as plain JSON."""
     device = jax.devices()[0]
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -50,6 +50,7 @@ def provenance() -> dict[str, Any]:
         "platform": platform.platform(),
         "device": f"{device.platform}: {device.device_kind} x {jax.device_count()}",
         "threads": thread_setting(),
+        "pinned_to": sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
     }
 
 

@@ -22,7 +22,9 @@ STEPS, BATCH = 1500, 4
     [
         ("tf_lane/toponet", "all", "DET_l@1.0"),
         ("tf_lane/toponet:street", "all", "DET_l@1.0"),
+        ("tf_lane/lanesegnet:street", "all", "AP_ls@1.0"),
         ("tf_lane/maptr:street", "lines", "mAP@1.0"),
+        ("tf_lane/maptrv2:street", "lines", "mAP@1.0"),
     ],
 )
 def test_twenty_frames_are_learned_to_a_metre(name, group, score):

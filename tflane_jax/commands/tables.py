@@ -16,8 +16,9 @@ def run(options: argparse.Namespace) -> int:
     chosen = [find_table(name) for name in options.names]
     if options.seeds is not None and options.seeds < 1:
         raise UserError(f"--seeds {options.seeds}: at least one")
-    if options.jobs < 1:
-        raise UserError(f"--jobs {options.jobs}: at least one training runs at a time")
+    jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs
+    if jobs < 1:
+        raise UserError(f"--jobs {jobs}: at least one training runs at a time")
     if not chosen:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         return 0
@@ -27,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
     written = []
     for table in chosen:
         count = options.seeds or (2 if options.quick else table.seeds)
-        written.append(run_table(table, range(count), options.out, jobs=options.jobs, quick=options.quick))
+        written.append(run_table(table, range(count), options.out, jobs=jobs, quick=options.quick))
     if options.record is not None:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     return 0

@@ -97,7 +97,7 @@ class PaperTable:
         return found
 
 
-def _shortened(config: RunConfig, steps: int = 20) -> RunConfig:
+def _shortened(config: RunConfig, steps: int = 8) -> RunConfig:
     """Return a smoke test of the configuration."""
     often = {"eval_every": steps, "checkpoint_every": steps, "log_every": steps // 2}
     training = replace(config.training, steps=steps, **often)

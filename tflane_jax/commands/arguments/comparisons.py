@@ -84,7 +84,9 @@ def tables(commands) -> None:
     parser.add_argument("names", metavar="TABLE", nargs="*", help="tf_lane.1, say")
     parser.add_argument("--seeds", metavar="N", type=int, help="number of seeds (default: that of the table)")
     parser.add_argument(
-        "--jobs", type=int, default=1, help="number of trainings at a time, which share the cores (default 1)"
+        "--jobs",
+        type=int,
+        help="number of trainings at a time, which share the cores (default 1; with --quick, one for each of 2 cores)",
     )
     parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
     parser.add_argument(

@@ -24,6 +24,7 @@ from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.traffic_flow_module import SpatialEncoder, TemporalEncoder, TrafficFlowConfig
 from tflane_jax.models.traffic_masks import spatial_mask
 from tflane_jax.priors.traffic_flow import TrafficFlowTokens
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 PAPER = "LT/LL"
 QUERIES, BATCH, DIM, POINTS = (48, 200), 4, 64, 11
@@ -33,28 +34,32 @@ RANGE = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
 def variants() -> dict[str, TrafficFlowConfig]:
     """Return the prior of each configuration of `configs/tf_lane/masking.py`, the paper's first."""
     configs = {PAPER: load_config("tf_lane/masking"), **load_ablations("tf_lane/masking")}
-    return {name: config.task.model.priors.traffic_flow for name, config in configs.items()}
+    found = {}
+    for name, config in configs.items():
+        assert isinstance(config.task, LaneGraphTask)
+        found[name] = config.task.model.priors.traffic_flow
+    return found
 
 
 def make_inputs(queries: int, prior: TrafficFlowConfig) -> tuple[HostQueries, TrafficFlowTokens]:
     """Return seeded random queries and tracks of a batch; about two thirds of the instances are valid."""
     rng = np.random.default_rng(queries)
     instances, frames = prior.prior.max_instances, prior.prior.frames
-    features, position = (rng.standard_normal((BATCH, queries, DIM), np.float32) for _ in range(2))
-    asked = HostQueries(features, position, rng.random((BATCH, queries, POINTS, 3), np.float32))
+    features, position = (jnp.asarray(rng.standard_normal((BATCH, queries, DIM), np.float32)) for _ in range(2))
+    asked = HostQueries(features, position, jnp.asarray(rng.random((BATCH, queries, POINTS, 3), np.float32)))
     valid = rng.random((BATCH, instances)) < 2 / 3
     heading = rng.standard_normal((BATCH, instances, frames, 2), np.float32)
     tracks = TrafficFlowTokens(
-        position=rng.random((BATCH, instances, frames, 3), np.float32),
-        heading=heading / np.linalg.norm(heading, axis=-1, keepdims=True),
-        size=rng.random((BATCH, instances, 3), np.float32),
-        category=np.zeros((BATCH, instances), np.int32),
-        frame_valid=valid[..., None] & (rng.random((BATCH, instances, frames)) < 0.8),
-        valid=valid,
-        weight=valid.astype(np.float32),
-        index=np.zeros((BATCH, instances), np.int32),
+        position=jnp.asarray(rng.random((BATCH, instances, frames, 3), np.float32)),
+        heading=jnp.asarray(heading / np.linalg.norm(heading, axis=-1, keepdims=True)),
+        size=jnp.asarray(rng.random((BATCH, instances, 3), np.float32)),
+        category=jnp.zeros((BATCH, instances), jnp.int32),
+        frame_valid=jnp.asarray(valid[..., None] & (rng.random((BATCH, instances, frames)) < 0.8)),
+        valid=jnp.asarray(valid),
+        weight=jnp.asarray(valid, jnp.float32),
+        index=jnp.zeros((BATCH, instances), jnp.int32),
     )
-    return jax.tree.map(jnp.asarray, (asked, tracks))
+    return asked, tracks
 
 
 def program(config: TrafficFlowConfig, queries: HostQueries, tracks: TrafficFlowTokens) -> tuple[Any, Any]:
@@ -65,7 +70,7 @@ def program(config: TrafficFlowConfig, queries: HostQueries, tracks: TrafficFlow
     def one(params, asked: HostQueries, flow: TrafficFlowTokens):
         tokens = temporal.apply(params["temporal"], flow)
         mask = spatial_mask(module.masking, asked, flow, config.prior.coordinates, spec.bev_range)
-        return spatial.apply(params["spatial"], asked.features, asked.position, tokens, mask)
+        return jnp.asarray(spatial.apply(params["spatial"], asked.features, asked.position, tokens, mask))
 
     def total(params, asked, flow):
         return (jax.vmap(one, (None, 0, 0))(params, asked, flow) ** 2).sum()

@@ -13,6 +13,7 @@ from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.traffic_flow_module import ALL_FUSIONS
 from tflane_jax.models.traffic_masks import TrafficMaskConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 FAR = 1000.0
 
@@ -37,7 +38,9 @@ def ablations() -> dict[str, RunConfig]:
 
 def _masked(masking: TrafficMaskConfig, pipe: str = "lanes") -> RunConfig:
     config = get_config()
+    assert isinstance(config.task, LaneGraphTask)
     flow = config.task.model.priors.traffic_flow
+    assert flow is not None
     module = replace(flow.module, masking=masking)
     module = replace(module, fusions=ALL_FUSIONS) if pipe == "all" else module
     priors = PriorsConfig(traffic_flow=replace(flow, module=module))

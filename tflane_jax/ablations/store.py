@@ -75,7 +75,8 @@ def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = 
 
 def _chosen(config: Any) -> dict[str, Any]:
     """Return the settings of a configuration that are not their defaults, as plain JSON with the names of classes."""
-    plain, found = to_json(config), {"class": type(config).__name__}
+    plain = to_json(config)
+    found: dict[str, Any] = {"class": type(config).__name__}
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if value == _default(field):

@@ -6,6 +6,8 @@ follows the first.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 from scipy.special import expit, logit
@@ -33,11 +35,11 @@ def with_geometric_topology(prediction: Prediction) -> Prediction:
     Lanes without predicted topology, and vector maps, stay as they are.
     """
     changed = {
-        name: part.replace(successor_logits=_added(part.points, part.successor_logits))
+        name: replace(part, successor_logits=_added(part.points, part.successor_logits))
         for name in ("centerlines", "segments")
         if (part := getattr(prediction, name)) is not None and part.successor_logits is not None
     }
-    return prediction.replace(**changed)
+    return replace(prediction, **changed)
 
 
 def _added(points: Float[np.ndarray, "q p 3"], logits: Float[np.ndarray, "q q"]) -> Float[np.ndarray, "q q"]:

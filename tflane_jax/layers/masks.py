@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
@@ -115,7 +117,8 @@ class SpatialMask:
         Args:
             pairs: [..., i, j] lane i and instance j; with a leading axis, each head has its own.
         """
-        return self.replace(
+        return replace(
+            self,
             lane_traffic=_both(self.lane_traffic, pairs),
             traffic_lane=_both(self.traffic_lane, jnp.swapaxes(pairs, -1, -2)),
         )

@@ -21,7 +21,7 @@ _SEGMENTS = ("all/mAP", "all/AP_ls", "all/AP_ped", "all/TOP_lsls")
 _LINES = ("lines/mAP", "lines/AP_divider", "lines/AP_ped_crossing", "lines/AP_boundary")
 
 
-def _quoted(source: str, columns: tuple[str, ...], **rows: tuple[float, ...]) -> Quoted:
+def _quoted(source: str, columns: tuple[str, ...], **rows: tuple[str | float, ...]) -> Quoted:
     cells = ({"model": name} | dict(zip(columns, numbers, strict=True)) for name, numbers in rows.items())
     return Quoted(source, tuple(cells))
 

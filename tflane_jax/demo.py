@@ -1,8 +1,8 @@
 """`tflane demo`: a small comparison on the built-in world, for two cores and ten minutes.
 
 The small host of docs/small_models.md is trained twice on the preset `street`, on BEV evidence alone and with traffic
-flow. Both are evaluated on unseen scenes. One training of each is no evidence: `tflane compare` trains several seeds
-and tests the difference.
+flow. Both are evaluated on unseen scenes. One training of each is no evidence: the papers' tables (`tflane tables`)
+have several seeds, controls and tests.
 """
 
 from __future__ import annotations
@@ -22,11 +22,7 @@ from tflane_jax.plots.tables import format_table
 from tflane_jax.training.loop import TrainingConfig
 
 STEPS = 1500
-EXPERIMENT = """\
-tflane compare baseline=tf_lane/toponet:street +TFM=tf_lane/toponet_tfm:street \\
-    +TFM+BEV=tf_lane/toponet_tfm:street_bev matched=tf_lane/toponet_tfm:street_control \\
-    --treatment +TFM --primary hidden+traffic/recall --negative-control hidden-traffic/recall --alpha 0.01 \\
-    --seeds 0 1 2 3 4 5 6 7 --training.steps 2500 --jobs 2 --out runs/street"""
+EXPERIMENT = "tflane tables tf_lane.2 --jobs 2"
 _INTRODUCTION = """\
 Lanes around a vehicle on the built-in world, preset `street`, learned twice:
   baseline  from what the sensor shows (BEV evidence)
@@ -65,7 +61,7 @@ def main(out: Path) -> int:
     print(_INTRODUCTION)
     compare(configs(), (0,), out, jobs=2, summary=summary)
     print(f"\nWhere the two differ, with the lanes that only one of them finds: {out / 'comparison.png'}")
-    print(f"The experiment with eight seeds and controls, hours on two cores (docs/comparisons.md):\n\n{EXPERIMENT}")
+    print(f"With eight seeds and controls, hours on two cores (docs/tf_lane.md has its results):\n\n{EXPERIMENT}")
     return 0
 
 

@@ -123,7 +123,7 @@ def _duration(seconds: float) -> str:
 
 
 def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
-    """Return the rows of the table: our scores at the last and the best checkpoint, then the paper's numbers."""
+    """Return the rows of the table: mean and spread of the scores, at the last and at the best checkpoint."""
     rows = []
     for which in CHECKPOINTS:
         for name, by_seed in results.rows(OWN_TEST, which).items():

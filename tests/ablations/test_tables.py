@@ -32,6 +32,8 @@ def test_every_table_is_about_its_rows_and_measured_by_its_scores(name):
     for config in quick.values():
         assert (config.training.steps, config.data.train) == (8, 24)
         make_optimizer(config.optim, config.training.steps)  # raises where the schedule does not fit
+    rows = table.configs(table.rows, quick=True)
+    assert len(set(map(repr, rows.values()))) == len(rows)  # a smoke test tests every row
     assert len({tuple(row) for row in table.quoted.rows}) <= 1  # the same columns
 
 

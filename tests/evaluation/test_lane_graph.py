@@ -154,6 +154,31 @@ def test_nothing_to_measure_is_an_error():
 
 
 @dataclass(frozen=True)
+class Unlinked:
+    """Predicts the true lanes and no edge."""
+
+    streams: bool = False
+
+    def predict(self, params, example):
+        lanes = jax.tree.map(jnp.asarray, example.lanes)
+        edges = jnp.full(lanes.successor.shape, -9.0)
+        return Prediction(centerlines=CenterlinePrediction(lanes.points, jnp.zeros((5, 1)), edges))
+
+
+def test_the_geometric_topology_finds_the_edges_of_lanes_that_meet():
+    example = fake_example()
+    lanes = example.lanes
+    lanes.points[1] += lanes.points[0, -1] - lanes.points[1, 0]
+    found = {}
+    for topology in ("learned", "geometric"):
+        config = EvaluationConfig(batch_size=1, topology=topology)
+        found[topology] = evaluate_lanes(Unlinked(), {}, stack_examples([example]), config).compute()["all"]
+    assert found["learned"]["TOP_ll"] < found["geometric"]["TOP_ll"] == 1.0
+    changed = {name for name, score in found["learned"].items() if found["geometric"][name] != score}
+    assert changed == {"TOP_ll"}  # no OLS without traffic elements
+
+
+@dataclass(frozen=True)
 class Follower:
     """Predicts the true lanes, raised by the height of the first road user; without road users far too high."""
 

@@ -8,6 +8,7 @@ import pytest
 
 from tests.ablations.test_compare import CONFIG
 from tests.models.cases import BASELINE
+from tests.parameters import random_params
 from tflane_jax.ablations.sweep import runs_below, sweep
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
@@ -23,7 +24,7 @@ def folder(tmp_path_factory):
     example = jax.tree.map(jax.numpy.zeros_like, CONFIG.task.shapes(CONFIG.data))
     for path, model, seed in (("one/seed_0", BASELINE, 0), ("one/seed_1", BASELINE, 1), ("other", other, 0)):
         config = dataclasses.replace(CONFIG, task=LaneGraphTask(model))
-        save_weights(config, config.task.init(jax.random.key(seed), example), root / path)
+        save_weights(config, random_params(config.task.init, example, spread=0.2 + 0.1 * seed), root / path)
     return root
 
 

@@ -19,6 +19,8 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 RANGE = PerceptionRange()
 QUIET = DenoisingConfig(2, shift=0.0, turn=0.0, stretch=0.0, straighten=0.0)
 KEY = jax.random.key(3)
+noised = jax.jit(noised_lanes, static_argnums=(2, 3, 4))
+denoising_losses = jax.jit(lane_denoising_losses, static_argnums=2)
 
 
 def curve(count=3, capacity=5, garbage=np.nan):
@@ -32,7 +34,7 @@ def curve(count=3, capacity=5, garbage=np.nan):
 
 
 def test_without_noise_lanes_stay_and_other_queries_lie_in_the_range():
-    lines = np.asarray(noised_lanes(KEY, curve(), 6, RANGE, QUIET))
+    lines = np.asarray(noised(KEY, curve(), 6, RANGE, QUIET))
     np.testing.assert_allclose(lines[:3], curve().points[:3], atol=1e-5)
     middle = lines[3:].mean(1)
     assert RANGE.contains(middle).all()
@@ -51,7 +53,7 @@ def test_without_noise_lanes_stay_and_other_queries_lie_in_the_range():
 )
 def test_each_kind_of_noise_leaves_something_as_it_was(change, same):
     truth = curve().points[:3]
-    lines = np.asarray(noised_lanes(KEY, curve(), 3, RANGE, replace(QUIET, **change)))
+    lines = np.asarray(noised(KEY, curve(), 3, RANGE, replace(QUIET, **change)))
     assert np.abs(lines - truth).max((1, 2)).min() > 0.01
     for line, true in zip(lines, truth, strict=True):
         np.testing.assert_allclose(same(line), same(true), atol=1e-3)
@@ -59,10 +61,10 @@ def test_each_kind_of_noise_leaves_something_as_it_was(change, same):
 
 def test_padding_may_hold_nan_and_sizes_may_differ():
     noise = DenoisingConfig()
-    clean, dirty = (noised_lanes(KEY, curve(garbage=value), 4, RANGE, noise) for value in (0.0, np.nan))
+    clean, dirty = (noised(KEY, curve(garbage=value), 4, RANGE, noise) for value in (0.0, np.nan))
     np.testing.assert_array_equal(clean, dirty)
     for count, capacity, queries in ((0, 0, 2), (0, 3, 2), (3, 3, 1), (1, 1, 4)):
-        lines = noised_lanes(KEY, curve(count, capacity), queries, RANGE, noise)
+        lines = noised(KEY, curve(count, capacity), queries, RANGE, noise)
         assert lines.shape == (queries, 11, 3)
         assert np.isfinite(lines).all()
 
@@ -76,11 +78,11 @@ def test_a_query_belongs_to_its_own_lane():
         logits=jnp.where(jnp.arange(4) < 3, 20.0, -20.0)[None, None, None, :, None],
         successor_logits=jnp.where(lanes.successor[:, None, None, :4, :4], 20.0, -20.0),
     )
-    losses = lane_denoising_losses(perfect, lanes, TopoNetLossConfig())
+    losses = denoising_losses(perfect, lanes, TopoNetLossConfig())
     assert all(float(term.sum()) < 1e-6 for term in losses.values())
     swapped = perfect.replace(points=perfect.points[:, :, :, [1, 0, 2, 3]])
     # Lanes 0 and 1 lie three metres apart, and there are three.
-    points = lane_denoising_losses(swapped, lanes, TopoNetLossConfig(points_weight=1.0))["points"]
+    points = denoising_losses(swapped, lanes, TopoNetLossConfig(points_weight=1.0))["points"]
     np.testing.assert_allclose(points, 2 * 33.0 / 3, rtol=1e-5)
 
 

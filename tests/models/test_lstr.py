@@ -162,7 +162,7 @@ def check_losses(case):
         *(jnp.stack([case.inputs[f"{layer}.pred_{part}"] for layer in layers], 1) for part in ("logits", "curves"))
     )
     lane_weight = lane_weights(targets, targets.valid)
-    cost = jax.vmap(lambda p, t, w: matching_cost(p, t, w, config))(prediction, targets, lane_weight)
+    cost = jax.jit(jax.vmap(lambda p, t, w: matching_cost(p, t, w, config)))(prediction, targets, lane_weight)
     assignment = match(cost, targets.valid[:, None])
     for b, count in enumerate(np.asarray(targets.valid).sum(1).tolist()):
         for i, layer in enumerate(layers):
@@ -172,7 +172,7 @@ def check_losses(case):
             source = case.outputs[f"{layer}.match_src.{b}"][by_target]
             np.testing.assert_array_equal(assignment.query[b, i, :count], source)
 
-    total, terms = lane_shape_loss(prediction, targets, config)
+    total, terms = jax.jit(lane_shape_loss, static_argnums=2)(prediction, targets, config)
     names = ("ce", "curves", "lowers", "uppers")
     scale = {name: case.meta["weight_dict"][f"loss_{name}"] for name in names}
     wanted = {name: scale[name] * case.outputs[f"loss_{name}"] for name in names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -30,18 +31,25 @@ def radius_mask(
         radius: largest distance.
     """
     lines = jnp.where(valid[:, None, None], lines, 0.0)
-    return (squared_line_distance(places, lines) <= radius**2) & valid[None, :]
+    return (squared_line_distance(places, lines) <= radius**2).T & valid[None, :]
 
 
-def squared_line_distance(places: Float[Array, "q 2"], lines: Float[Array, "n p 2"]) -> Float[Array, "q n"]:
-    """Return the squared distance of every place to every line, of at least two points."""
-    start, step = lines[:, :-1], lines[:, 1:] - lines[:, :-1]
-    # Coordinates apart: arrays whose last axis is 2 are slow on a CPU.
-    dx, dy = (places[:, None, None, i] - start[None, ..., i] for i in (0, 1))
-    sx, sy = (step[None, ..., i] for i in (0, 1))
+def squared_line_distance(places: Float[Array, "q 2"], lines: Float[Array, "n p 2"]) -> Float[Array, "n q"]:
+    """Return the squared distance of every line, of at least two points, to every place."""
+    # Segment by segment, coordinates apart: a CPU vectorises the minimum of arrays, not that over an axis of segments.
+    x, y = places[None, :, 0], places[None, :, 1]
+    segments = [_squared_segment_distance(x, y, lines[:, i], lines[:, i + 1]) for i in range(lines.shape[1] - 1)]
+    return functools.reduce(jnp.minimum, segments)
+
+
+def _squared_segment_distance(
+    x: Float[Array, "1 q"], y: Float[Array, "1 q"], start: Float[Array, "n 2"], end: Float[Array, "n 2"]
+) -> Float[Array, "n q"]:
+    sx, sy = (end[:, i, None] - start[:, i, None] for i in (0, 1))
+    dx, dy = x - start[:, 0, None], y - start[:, 1, None]
     square = sx**2 + sy**2
     fraction = jnp.clip((dx * sx + dy * sy) / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
-    return ((dx - fraction * sx) ** 2 + (dy - fraction * sy) ** 2).min(-1)
+    return (dx - fraction * sx) ** 2 + (dy - fraction * sy) ** 2
 
 
 def track_distance(
@@ -55,9 +63,10 @@ def track_distance(
         valid: of the positions.
     """
     lines = jnp.repeat(lanes, 2, 1) if lanes.shape[1] == 1 else lanes
-    places = jnp.where(valid[..., None], tracks, 0.0).reshape(-1, 2)
-    square = squared_line_distance(places, lines).reshape(*valid.shape, len(lanes))
-    return jnp.sqrt(jnp.where(valid[..., None], square, jnp.inf).min(1)).T
+    # Tracks are the last axis, so that the minimum over positions vectorises as well.
+    places = jnp.where(valid[..., None], tracks, 0.0).swapaxes(0, 1).reshape(-1, 2)
+    square = squared_line_distance(places, lines).reshape(len(lanes), *valid.T.shape)
+    return jnp.sqrt(jnp.where(valid.T[None], square, jnp.inf).min(1))
 
 
 def nearest_mask(distance: Float[Array, "q k"], count: int) -> Bool[Array, "q k"]:

@@ -64,6 +64,13 @@ def test_two_workers_train_all_runs_and_name_the_one_that_failed(tmp_path, monke
     (start,) = read_provenance(out / "one" / "seed_0")
     assert start["threads"] == worker_threads(2)
 
+    # Scores that are gone, as after a change of the code, are measured by the workers.
+    (out / "one" / "seed_1.scores.json").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(LaneGraphTask, "evaluate", None)  # of this process
+        compare(configs, (0, 1, 2), out, jobs=2)
+    assert json.loads((out / "scores.json").read_text()) == scores
+
     broken = {"one": dataclasses.replace(CONFIG, optim=OptimConfig(warmup_steps=1000))}
     with pytest.raises(UserError, match=r"seed_0 failed: its messages are in .*seed_0\.log"):
         compare(broken, (0, 1), tmp_path / "broken", jobs=2)

@@ -9,6 +9,8 @@ from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, check
 from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow
 from tflane_jax.ablations.published import page, record
+from tflane_jax.ablations.scores import is_measured
+from tflane_jax.ablations.store import stored_jobs
 from tflane_jax.ablations.table_run import run_table
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.cli import main
@@ -72,6 +74,13 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert summary["cores of a run"]
     assert len(summary["findings"]) == 2
     assert "Claim: it helps" in summary["findings"][0]
+
+    rows = small(tiny).configs(small(tiny).rows)
+    (job, *_), *_ = stored_jobs(rows, range(2), out / "runs", threads=workers.worker_threads(1)).values()
+    assert job.is_complete()
+    assert is_measured(job)
+    job.folder.with_name(f"{job.folder.name}.scores.json").unlink()
+    assert not is_measured(job)
 
     # Another table with one of its rows trains only what is new, and the same table nothing.
     before = {name: (folder / name).read_bytes() for name in TABLE_FILES}

@@ -57,10 +57,9 @@ class Everything:
 def test_jobs_of_other_processes_are_waited_for(monkeypatch):
     """They are looked at again: one was finished there, the other was given up."""
     jobs, complete, now = [job(model, 0) for model in range(3)], set(), [0.0]
-    monkeypatch.setattr(Job, "is_complete", lambda self: self.folder in complete)
     monkeypatch.setattr("tflane_jax.ablations.training_queue.time.monotonic", lambda: now[0])
     reservations = Everything([jobs[0].folder, jobs[1].folder])
-    queue = Queue(jobs, reservations)
+    queue = Queue(jobs, reservations, lambda each: each.folder in complete)
     assert queue.take() is jobs[2]
     assert queue.take() is None
     assert (len(queue), list(queue.elsewhere)) == (2, jobs[:2])
@@ -74,11 +73,10 @@ def test_jobs_of_other_processes_are_waited_for(monkeypatch):
     assert reservations.released == [jobs[1].folder]
 
 
-def test_a_job_that_another_process_has_just_finished_is_not_trained_again(monkeypatch):
+def test_a_job_that_another_process_has_just_finished_is_not_trained_again():
     jobs, complete = [job(0, 0), job(1, 0)], []
-    monkeypatch.setattr(Job, "is_complete", lambda self: self.folder in complete)
     reservations = Everything([])
-    queue = Queue(jobs, reservations)
+    queue = Queue(jobs, reservations, lambda each: each.folder in complete)
     complete.append(jobs[0].folder)
     assert queue.take() is jobs[1]
     assert reservations.released == [jobs[0].folder]

@@ -71,11 +71,26 @@ def _changed(config: RunConfig, settings: tuple[str, ...]) -> RunConfig:
 
 def measure_all(job: Job) -> None:
     """Evaluate a finished run on all of its test sets, so that the scores are at hand afterwards."""
+    for config, which in _evaluations(job):
+        measure(job, config, which)
+
+
+def is_measured(job: Job) -> bool:
+    """Return whether a run is complete and its file holds everything that `measure_all` would measure."""
+    if not job.is_complete():
+        return False
+    kept = dict(_read(_file(job)))
+    checkpoints = (_checkpoint(job, config, which) for config, which in _evaluations(job))
+    return all(mark in kept for _, mark in filter(None, checkpoints))
+
+
+def _evaluations(job: Job) -> Iterator[tuple[RunConfig, Which]]:
+    """Yield everything that a run is to be evaluated by: configuration and checkpoint."""
     for settings in ((), *job.tests.values()):
         for which in CHECKPOINTS:
-            measure(job, with_test_set(job.config, settings), which)
+            yield with_test_set(job.config, settings), which
     for evaluation in job.further:
-        measure(job, replace(job.config, evaluation=evaluation), "last")
+        yield replace(job.config, evaluation=evaluation), "last"
 
 
 def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
@@ -89,17 +104,9 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
     Returns:
         None for "best" if no evaluation gave a finite best metric.
     """
-    checkpoints = Checkpoints(job.folder / "checkpoints", best_metric=config.training.best_metric)
-    step = checkpoints.best_step() if which == "best" else checkpoints.find("last")
-    if step is None:
+    if (checkpoint := _checkpoint(job, config, which)) is None:
         return None
-    mark = _mark(
-        checkpoint=checkpoints.content(step),
-        source=repr(config.data.source("test")),
-        evaluation=to_json(config.evaluation),
-        code=code_digest(),
-    )
-    path = job.folder.with_name(f"{job.folder.name}.scores.json")
+    (step, mark), path = checkpoint, _file(job)
     kept = {name: entry for name, entry in _read(path) if entry["code"] == code_digest()}
     if mark not in kept:
         run = open_run(job.folder, step)
@@ -121,6 +128,24 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
         for way, of_way in entry["ratios"].items()
     }
     return Measured(entry["step"], entry["protocol"], entry["ways"], ratios)
+
+
+def _file(job: Job) -> Path:
+    return job.folder.with_name(f"{job.folder.name}.scores.json")
+
+
+def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, str] | None:
+    """Return step and mark of an evaluation, the name of its entry; None if the run has no such checkpoint."""
+    checkpoints = Checkpoints(job.folder / "checkpoints", best_metric=config.training.best_metric)
+    step = checkpoints.best_step() if which == "best" else checkpoints.find("last")
+    if step is None:
+        return None
+    return step, _mark(
+        checkpoint=checkpoints.content(step),
+        source=repr(config.data.source("test")),
+        evaluation=to_json(config.evaluation),
+        code=code_digest(),
+    )
 
 
 def _counts(ratios: Mapping[str, SceneRatio]) -> dict[str, list[list[int]]]:

@@ -1,9 +1,9 @@
-"""The runs that a comparison still has to train: those that wait, and those that other processes train."""
+"""The runs that a comparison still has to train or measure: those that wait, and those that other processes have."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from tflane_jax.ablations.jobs import Job
@@ -13,28 +13,29 @@ LOOK_SECONDS = 10.0
 
 
 class Queue:
-    """Jobs in the order in which they are to be trained.
+    """Jobs in the order in which they are to be done.
 
-    A job that another process has reserved is set aside and looked at again, until it is complete or free.
+    A job that another process has reserved is set aside and looked at again, until it is done or free.
     """
 
-    def __init__(self, jobs: Sequence[Job], reservations: Reservations) -> None:
-        self._waiting = [job for job in jobs if not job.is_complete()]
+    def __init__(self, jobs: Sequence[Job], reservations: Reservations, is_done: Callable[[Job], bool]) -> None:
+        self._is_done = is_done
+        self._waiting = [job for job in jobs if not is_done(job)]
         self._elsewhere: list[Job] = []
         self._reservations = reservations
         self._looked = time.monotonic()
 
     def __len__(self) -> int:
-        """Return the number of jobs that are neither complete nor taken."""
+        """Return the number of jobs that are neither done nor taken."""
         return len(self._waiting) + len(self._elsewhere)
 
     @property
     def elsewhere(self) -> Sequence[Job]:
-        """Jobs that other processes train."""
+        """Jobs that other processes have."""
         return self._elsewhere
 
     def take(self, mine: Collection[Any] = (), others: Collection[Any] = ()) -> Job | None:
-        """Reserve the next job and return it; None if all that are left are trained by other processes.
+        """Reserve the next job and return it; None if other processes have all that are left.
 
         Args:
             mine, others: see `choose`.
@@ -45,20 +46,20 @@ class Queue:
             self._waiting.remove(job)
             if not self._reservations.take(job.folder):
                 self._elsewhere.append(job)
-            elif job.is_complete():  # another process has just finished it
+            elif self._is_done(job):  # another process has just finished it
                 self._reservations.release(job.folder)
             else:
                 return job
         return None
 
     def done(self, job: Job) -> None:
-        """Release a job that was trained, or failed."""
+        """Release a job that is done, or failed."""
         self._reservations.release(job.folder)
 
     def _look_again(self) -> None:
         """Let jobs that are free again wait; forget those that other processes have finished."""
         if time.monotonic() - self._looked > LOOK_SECONDS:
-            self._waiting += [job for job in self._elsewhere if not job.is_complete()]
+            self._waiting += [job for job in self._elsewhere if not self._is_done(job)]
             self._elsewhere, self._looked = [], time.monotonic()
 
 

@@ -1,6 +1,6 @@
 """Training many runs, one after the other in this process, or several at a time in worker processes.
 
-A training that fails is noted, and the others go on.
+Workers also evaluate the runs. A training that fails is noted, and the others go on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
-from tflane_jax.ablations.scores import measure_all
+from tflane_jax.ablations.scores import is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.errors import UserError
 from tflane_jax.runs import build_data, train_run
@@ -32,12 +32,15 @@ _POLL_SECONDS = 1.0
 def train_all(jobs: Sequence[Job], parallel: int) -> list[Failure]:
     """Train every job that is not complete, in this process or `parallel` at a time in workers; return what failed.
 
+    Workers also measure runs that are complete, but not measured by this state of the code.
+
     Several processes, also of several machines that share a folder, may train the same jobs: each takes those that no
     other has reserved, and returns when all are complete.
     """
     with Reservations() as reservations:
-        queue = Queue(jobs, reservations)
-        return _train_here(queue) if parallel == 1 else _train_in_workers(queue, jobs, parallel)
+        if parallel == 1:
+            return _train_here(Queue(jobs, reservations, lambda job: job.is_complete()))
+        return _train_in_workers(Queue(jobs, reservations, is_measured), jobs, parallel)
 
 
 def worker_threads(parallel: int) -> dict[str, Any]:
@@ -96,7 +99,9 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int) -> list[
     with contextlib.ExitStack() as stack:
         workers = [stack.enter_context(Worker(slot, parallel)) for slot in range(min(parallel, len(queue)))]
         total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
-        bar = stack.enter_context(tqdm(total=total, initial=done, desc=f"train {len(jobs)} runs", unit="step"))
+        bar = stack.enter_context(
+            tqdm(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
+        )
         while len(queue) or any(worker.job for worker in workers):
             for worker in workers:
                 others = {task for other in workers if other is not worker for task in other.tasks}
@@ -196,8 +201,17 @@ def _death(code: int) -> str:
     return f"its worker process was killed by {name}{hint}"
 
 
+def _train(job: Job) -> None:
+    result = train_run(job.config, job.folder, start=job.start(), progress=False)
+    if result.stopped_by is not None:
+        raise UserError(f"stopped by {signal.Signals(result.stopped_by).name} after step {result.step}")
+
+
 def _train_jobs(pipe: Any, cores: list[int]) -> None:
-    """Train the jobs that come through the pipe; answer None for each, or why it failed. Messages go to its log."""
+    """Train and measure the jobs that come through the pipe; answer None for each, or why it failed.
+
+    Messages go to the job's log.
+    """
     if cores:
         os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this
     with contextlib.suppress(EOFError):  # the comparison is gone
@@ -206,8 +220,7 @@ def _train_jobs(pipe: Any, cores: list[int]) -> None:
                 configure_jax()
                 failures: list[Failure] = []
                 with noted(job, failures):
-                    result = train_run(job.config, job.folder, start=job.start(), progress=False)
-                    if result.stopped_by is not None:
-                        raise UserError(f"stopped by {signal.Signals(result.stopped_by).name} after step {result.step}")
+                    if not job.is_complete():
+                        _train(job)
                     measure_all(job)
             pipe.send(failures[0].reason if failures else None)

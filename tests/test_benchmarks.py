@@ -1,9 +1,12 @@
 """The arithmetic of the benchmarks; no test asserts a time."""
 
 import numpy as np
+import pytest
 
-from benchmarks import metrics
+from benchmarks import metrics, paper_sizes
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
+from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.training.schedule import make_optimizer
 
 
 def test_ratio_is_taken_round_by_round():
@@ -48,3 +51,12 @@ def test_frames_of_the_metrics_hold_hits_and_misses(tmp_path):
 def test_table_is_aligned():
     lines = markdown_table(["name", "ms"], [["a", "1.0"], ["longer", "12.0"]]).splitlines()
     assert len({len(line) for line in lines}) == 1
+
+
+@pytest.mark.parametrize("name", paper_sizes.CONFIGS)
+def test_a_paper_size_is_trained_briefly_on_data_that_are_there(name, tmp_path):
+    config = load_config(name)
+    short = apply_overrides(config, paper_sizes.settings(config, tmp_path))
+    assert (short.training.steps, short.training.batch_size) == (paper_sizes.UPDATES, 1)
+    make_optimizer(short.optim, short.training.steps)  # raises where the schedule does not fit
+    assert short.task == config.task

@@ -1,0 +1,130 @@
+"""Updates at the papers' sizes: does each run, how long does it take, and how much memory does it need?
+
+    python -m benchmarks.paper_sizes --out runs/bench
+    python -m benchmarks.paper_sizes --out runs/bench --names tf_lane/lanesegnet_r50
+
+Each configuration trains a few updates of one frame in a process of its own, with evaluation and checkpoint, on scenes
+of the built-in world: those of OpenLane-V2 on a folder in its layout, with the tracks as Argoverse 2 logs, written to
+`OUT/paper_sizes`. Needs up to 24 GiB and some ten minutes a configuration on two cores. A configuration that fails, for
+want of memory for example, gets a row that says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.timing import machine, markdown_table, save
+from tflane_jax.cli import main as tflane
+from tflane_jax.config import OpenLaneV2Data, RunConfig, apply_overrides, load_config
+from tflane_jax.runs import train_run
+from tflane_jax.training.records import read_records
+
+CONFIGS = (
+    "camera/toponet_r50",
+    "tf_lane/toponet_tfm_r50",
+    "tf_lane/lanesegnet_r50",
+    "tf_lane/lanesegnet_tfm_r50",
+    "tf_lane/maptr_r50",
+    "tf_lane/maptrv2_r50",
+)
+UPDATES = 3
+_MEASURED = "measured: "
+
+
+def settings(config: RunConfig, folder: Path) -> list[str]:
+    """Return the settings of a short training of one frame a step on the data in `folder`."""
+    count = str(UPDATES)
+    short = {
+        "training.batch_size": "1",
+        "training.steps": count,
+        "training.log_every": "1",
+        "training.eval_every": count,
+        "training.checkpoint_every": count,
+        "optim.epoch_steps": "0",
+        "optim.warmup_steps": "0",
+        "evaluation.batch_size": "1",
+        "evaluation.pictures": "0",
+    }
+    if isinstance(config.data, OpenLaneV2Data):
+        short["data.root"] = str(folder / "openlane_v2")
+        if config.data.tracks is not None:
+            short["data.tracks"] = str(folder / "argoverse2")
+    else:
+        short |= {"data.train": "1", "data.val": "1", "data.test": "1"}
+    return [part for name, value in short.items() for part in (f"--{name}", value)]
+
+
+def train(name: str, folder: Path) -> dict[str, Any]:
+    """Train a configuration in this process and return what it took."""
+    config = load_config(name)
+    run = folder / "runs" / name.replace("/", "_")
+    result = train_run(apply_overrides(config, settings(config, folder)), run, start="overwrite")
+    records = [record for record in read_records(run / "metrics.jsonl") if record["split"] == "train"]
+    seconds = [record["seconds"] for record in records]
+    return {
+        "compile_s": result.compile_seconds,
+        "update_s": (seconds[-1] - seconds[0]) / (len(seconds) - 1),  # the first touches fresh memory
+        "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+        "loss": [record["loss"] for record in records],
+        "grad_norm": [record["grad_norm"] for record in records],
+    }
+
+
+def measured(name: str, folder: Path) -> dict[str, Any]:
+    """Train a configuration in a process of its own; return what it took, or why it failed."""
+    command = [sys.executable, "-m", "benchmarks.paper_sizes", "--out", str(folder), "--child", name]
+    child = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    found = [line for line in child.stdout.splitlines() if line.startswith(_MEASURED)]
+    if child.returncode or not found:
+        killed = child.returncode < 0
+        return {"failed": f"killed by signal {-child.returncode}" if killed else f"code {child.returncode}"}
+    return json.loads(found[-1].removeprefix(_MEASURED))
+
+
+def run(out: Path, names: Sequence[str] = CONFIGS) -> dict[str, Any]:
+    """Measure the configurations, print the table, and write `paper_sizes.json` and `.md` into `out`."""
+    folder = out / "paper_sizes"
+    if any(isinstance(load_config(name).data, OpenLaneV2Data) for name in names):
+        written = ["--out", str(folder / "openlane_v2"), "--tracks", str(folder / "argoverse2")]
+        if not (folder / "openlane_v2").exists() and tflane(["data", "export", "--config", _WORLD, *written]):
+            raise SystemExit(2)
+    record = machine() | {"updates": UPDATES, "configs": {name: measured(name, folder) for name in names}}
+    header = ["configuration", "compile s", "s an update", "peak GiB", "loss"]
+    text = markdown_table(header, [_row(name, found) for name, found in record["configs"].items()])
+    print(text)
+    save(out, "paper_sizes", record, text)
+    return record
+
+
+_WORLD = "camera/native_ring"
+
+
+def _row(name: str, found: dict[str, Any]) -> list[str]:
+    if "failed" in found:
+        return [name, "", "", "", found["failed"]]
+    shown = (found["compile_s"], found["update_s"], found["peak_gib"], found["loss"][-1])
+    return [name, *(f"{value:.1f}" for value in shown)]
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser.add_argument("--names", nargs="+", default=CONFIGS, help="configurations")
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child is not None:
+        print(_MEASURED + json.dumps(train(options.child, options.out)))
+    else:
+        run(options.out, options.names)
+
+
+if __name__ == "__main__":
+    main()

@@ -51,7 +51,8 @@ class RecordedDataset:
 
     def __init__(self, config: RecordedConfig):
         self.config = config
-        self.logs = tuple(one.log() for one in chosen_maps(config.root, config.logs, config.without))
+        found = chosen_maps(config.root, config.logs, config.without)
+        self.logs = tuple(one.log() for one in found if one.recorded or config.logs)
         self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
         self._giver = chosen_maps(config.root, (config.traffic,))[0].log() if config.traffic else None
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
 from tflane_jax.datasets.argoverse2_map import MAP_PATTERN
+from tflane_jax.datasets.geojson_lanes import read_lanes
 from tflane_jax.datasets.nuscenes_scene_files import read_scene_file
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
@@ -44,6 +45,11 @@ class MapFile:
     files: tuple[Path, ...]
     kind: str
 
+    @property
+    def recorded(self) -> bool:
+        """Whether somebody drove here: the map is that of a log."""
+        return self.kind != "geojson"
+
     def content(self) -> str:
         """Return the hash of all that the map depends on."""
         digest = hashlib.sha256()
@@ -55,25 +61,29 @@ class MapFile:
         return digest.hexdigest()
 
     def log(self) -> Log:
-        """Read the log; raise UserError if a file is missing or damaged."""
+        """Read the log; raise UserError if a file is missing or damaged, or if the map is not that of a log."""
+        if not self.recorded:
+            raise UserError(f"{self.files[0]} is a map without a recording: name a log")
         return load_log(self.files[0].parent) if self.kind == "argoverse2" else read_scene_file(self.files[0])
 
     def read(self) -> RoadMap:
         """Read the map; raise UserError if a file is missing or damaged."""
-        return road_map_of(self.log())
+        return read_lanes(self.files[0]) if not self.recorded else road_map_of(self.log())
 
 
 def find_maps(root: Path) -> list[MapFile]:
     """Return the maps below a folder, or that of a single log, by name.
 
-    Known are logs of Argoverse 2 (annotations.feather with its map) and scene files of nuScenes (npz).
+    Known are logs of Argoverse 2 (annotations.feather with its map), scene files of nuScenes (npz), and lanes as
+    GeoJSON (`geojson_lanes`).
 
     Raises UserError if there is none, or if two have the same name.
     """
     root = Path(root)
     found = sorted(_found(root), key=lambda one: one.name)
     if not found:
-        raise UserError(f"{root} holds no map: expected Argoverse 2 logs ({ANNOTATIONS}) or nuScenes scene files (npz)")
+        formats = f"Argoverse 2 logs ({ANNOTATIONS}), nuScenes scene files (npz) or lanes (geojson)"
+        raise UserError(f"{root} holds no map: expected {formats}")
     names = [one.name for one in found]
     if twice := {name for name in names if names.count(name) > 1}:
         raise UserError(f"{root} holds two maps with the name {min(twice)}: take one out")
@@ -98,6 +108,8 @@ def _found(root: Path) -> Iterator[MapFile]:
     for file in [root] if root.suffix == ".npz" else sorted(root.rglob("*.npz")):
         if _may_hold_lanes(file):
             yield MapFile(file.stem, (file,), "nuscenes-scenes")
+    for file in [root] if root.suffix == ".geojson" else sorted(root.rglob("*.geojson")):
+        yield MapFile(file.stem, (file,), "geojson")
     for boxes in sorted(root.rglob(ANNOTATIONS)):
         folder = boxes.parent
         yield MapFile(folder.name, (boxes, folder / POSES, *sorted((folder / "map").glob(MAP_PATTERN))), "argoverse2")

@@ -19,6 +19,7 @@ from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.overlap import Drive
 from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
@@ -200,6 +201,13 @@ class RealMapData:
         )
 
 
+def _drives(config: RealMapConfig) -> list[Drive]:
+    """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated."""
+    found = chosen_maps(config.maps, config.logs, config.without) if config.generated < 1.0 else []
+    maps = [_read(one) for one in found]
+    return [Drive(one.name, one.area or one.source, one.places) for one in maps]
+
+
 # Scenes of --data real-maps where the configuration has other data.
 _SCENES = 100
 
@@ -251,5 +259,6 @@ SOURCE = DataSource(
     # Not from the cache: one example is made sooner than all of them.
     sample=lambda config: RealMapDataset(config).example(0),
     build=lambda config, progress: len(_open(config, progress)),
+    drives=_drives,
     check=check_real_maps,
 )

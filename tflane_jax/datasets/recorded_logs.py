@@ -13,6 +13,7 @@ from pathlib import Path
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.procedural import CITY_EXAMPLE
 from tflane_jax.datasets.road_maps import chosen_maps
 from tflane_jax.scene import Example
@@ -72,7 +73,7 @@ class RecordedDataset:
         """Return log, time and pose of one example."""
         log, number = self._frames[index]
         moment = log.keyframes[number]
-        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego)
+        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego, log.area)
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
@@ -117,5 +118,6 @@ SOURCE = DataSource(
     dataset=RecordedDataset,
     choose=_choose,
     title=lambda config: "-".join(("recorded", *config.logs[:1])),
+    drives=lambda config: frame_drives(RecordedDataset(config)),
     root="a folder of logs of any known format",
 )

@@ -128,7 +128,7 @@ def road_map_of(log: Log) -> RoadMap:
     """Return the map of a log as a place for the built-in world."""
     places = log.global_from_ego[:, :2, 3]
     complete = _SCENE_FILE if log.source == "nuscenes-scenes" else _cut_at(log)
-    return RoadMap(log.name, log.source, log.map, places, complete, _parked(log))
+    return RoadMap(log.name, log.source, log.map, places, complete, _parked(log), log.area)
 
 
 def _cut_at(log: Log) -> float:

@@ -24,6 +24,7 @@ class RoadMap:
         places: (n, 2) where somebody drove or could drive, metres.
         complete: distance from each place up to which every lane is in the map, metres.
         parked: (p, 3) x, y, yaw of places where vehicles were seen parked.
+        area: place, such as a city, in whose coordinates the map is; "" if the source does not tell.
     """
 
     name: str
@@ -32,6 +33,7 @@ class RoadMap:
     places: Float[np.ndarray, "n 2"]
     complete: float
     parked: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    area: str = ""
 
 
 def traffic_lanes(segments: dict[int, LaneSegment]) -> dict[int, LaneSegment]:

@@ -62,10 +62,10 @@ REAL_MAPS = replace(
     CITY,
     traffic=replace(
         CITY.traffic,
-        vehicles_per_metre=0.035,
-        bicycles_per_metre=0.008,
-        pedestrians_per_metre=0.012,
-        crossers_per_minute=3.0,
+        vehicles_per_metre=0.05,
+        bicycles_per_metre=0.01,
+        pedestrians_per_metre=0.028,
+        crossers_per_minute=5.0,
         early_s=90.0,
     ),
 )

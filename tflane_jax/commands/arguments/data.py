@@ -31,6 +31,14 @@ def data(commands) -> None:
     stats.add_argument("--config", metavar="FILE[:NAME]", help="config file whose data to count")
     split_arguments(stats, "test")
     stats.add_argument("--count", type=int, default=400, help="examples, spread evenly (default 400)")
+    stats.add_argument(
+        "--beside",
+        metavar="NAME[=PATH]",
+        action="append",
+        default=[],
+        help="lay the distributions of these data beside; PATH is their folder. May be repeated",
+    )
+    stats.add_argument("--out", metavar="STEM", type=Path, help="with --beside: write STEM.md, STEM.json and STEM.png")
     stats.set_defaults(takes_overrides=True)
     check = command(
         inner, "check", "count the content of a dataset's folder and list its faults", module="data", function="check"

@@ -2,9 +2,12 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from tests.datasets.test_nuscenes_scenes import content
 from tests.datasets.test_road_maps import crossroads_features, write
+from tests.fakes import FakeConfig, FakeDataset
 from tflane_jax.cli import main
 
 
@@ -75,3 +78,24 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
 def test_data_that_cannot_be_laid_beside_are_refused(arguments, message, capsys):
     assert main(["data", "stats", "--data", "street", "--count", "1", *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_recorded_frames_are_drawn_beside_simulated_ones(tmp_path, monkeypatch, capsys):
+    np.savez(tmp_path / "scene-0061.npz", **content())
+    shown = []
+
+    def draw(dataset, count, out, **_):
+        shown.extend((dataset.info(i).source, dataset.info(i).scene) for i in range(count))
+        return out
+
+    # The map of this scene is too small to drive on, and drawing takes time.
+    monkeypatch.setattr("tflane_jax.commands.data_maps.show_dataset", draw)
+    monkeypatch.setattr("tflane_jax.commands.data_maps.RealMapDataset", lambda config: FakeDataset(FakeConfig(2)))
+    assert main(["data", "maps", str(tmp_path), "--out", str(tmp_path / "maps.png")]) == 0
+    assert shown == [("nuscenes-scenes", "scene-0061"), ("fake", FakeDataset(FakeConfig(2)).info(1).scene)]
+    assert "maps.png" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["data", "maps", str(tmp_path), "--moment", "1.0"])
+    write(tmp_path / "town.geojson", crossroads_features())
+    assert main(["data", "maps", str(tmp_path), "--logs", "town"]) == 2
+    assert "maps without recordings" in capsys.readouterr().err

@@ -101,7 +101,7 @@ def _values(source: Any, count: int) -> dict[str, Float[np.ndarray, " n"]]:
 def _cell(values: Float[np.ndarray, " n"]) -> str:
     if not len(values):
         return "-"
-    low, _, high = np.quantile(values, _QUANTILES)
+    low, _, high = np.quantile(values, _QUANTILES).round(3)
     return f"{values.mean():.3g} ({low:.3g} to {high:.3g})"
 
 

@@ -160,6 +160,7 @@ class RealMapData:
         maps: folder of logs: Argoverse 2, nuScenes scene files, lanes as GeoJSON.
         train, val, test: number of scenes of each split.
         val_logs, test_logs: names of the logs of these splits.
+        without: names of logs that no split takes.
         test_on: whether the test split is simulated on maps, or is what was recorded: the logs' own key frames and
             tracks, see `recorded_logs`.
         test_traffic: name of a log whose recorded tracks replace those of the test split's logs, which is a check of
@@ -176,6 +177,7 @@ class RealMapData:
     test: int = 100
     val_logs: tuple[str, ...] = ()
     test_logs: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
     test_on: Literal["maps", "recordings"] = "maps"
     test_traffic: str = ""
     generated: float = 0.0
@@ -186,12 +188,13 @@ class RealMapData:
     def source(self, split: Split) -> RealMapConfig | RecordedConfig:
         """Return the dataset of a split."""
         if split == "test" and self.test_on == "recordings":
-            return RecordedConfig(self.maps, self.test_logs, traffic=self.test_traffic, example=self.example)
+            without = () if self.test_logs else self.without
+            return RecordedConfig(self.maps, self.test_logs, without, self.test_traffic, self.example)
         logs = {"train": (), "val": self.val_logs, "test": self.test_logs}[split]
         return RealMapConfig(
             self.maps,
             logs=logs,
-            without=() if logs else tuple(sorted({*self.val_logs, *self.test_logs})),
+            without=() if logs else tuple(sorted({*self.val_logs, *self.test_logs, *self.without})),
             split=split,
             scenes=getattr(self, split),
             generated=self.generated if split == "train" else 0.0,

@@ -62,9 +62,9 @@ REAL_MAPS = replace(
     CITY,
     traffic=replace(
         CITY.traffic,
-        vehicles_per_metre=0.05,
-        bicycles_per_metre=0.01,
-        pedestrians_per_metre=0.028,
+        vehicles_per_metre=0.06,
+        bicycles_per_metre=0.015,
+        pedestrians_per_metre=0.034,
         crossers_per_minute=5.0,
         early_s=90.0,
     ),

@@ -174,7 +174,7 @@ def _drive_on(
             return network, traffic, complete
     raise UserError(
         f"{place.road_map.source} {place.road_map.name} is too small a map: in {_DRIVES} drives, no {needed} frames "
-        f"saw {place.sees:.0f} m of it in every direction. Leave it out, or perceive a smaller range"
+        f"saw {place.sees:.0f} m of it in every direction. Leave it out (data.without), or perceive a smaller range"
     )
 
 

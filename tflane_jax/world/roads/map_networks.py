@@ -36,7 +36,7 @@ _PACE = 0.95
 _ROUTE_TRIES = 12
 _DENSITY = (0.3, 0.95)
 # Intersections that a vehicle passes on its way through a map: each of them takes up its share of the inflow.
-_PASSED = 3.0
+_PASSED = 1.5
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,14 @@ from tflane_jax.world.roads.config import RoadConfig
 from tflane_jax.world.roads.map_junctions import find_junctions, merging_lanes
 from tflane_jax.world.roads.map_networks import build_map_network, prepare_roads
 from tflane_jax.world.roads.map_roads import road_lines_of
-from tflane_jax.world.roads.map_roadside import clip_border, facing_lanes, kerbs_of, lane_points, parking_places
+from tflane_jax.world.roads.map_roadside import (
+    clip_border,
+    facing_lanes,
+    kerbs_of,
+    lane_points,
+    parking_places,
+    walking_lines,
+)
 from tflane_jax.world.roads.movements import LEFT, RIGHT, THROUGH
 from tflane_jax.world.roads.road_map import RoadMap, traffic_lanes
 from tflane_jax.world.simulate import Place, simulate
@@ -136,6 +143,17 @@ def test_kerbs_leave_out_what_crosses_a_lane_and_islands():
     assert not any(
         ((kerb[:, 0] > 49) & (kerb[:, 0] < 59) & (kerb[:, 1] < 4.5) & (kerb[:, 1] > 2)).all() for kerb in kerbs
     )
+
+
+def test_nobody_walks_on_a_narrow_median_or_on_a_lane():
+    # Two carriageways with a median of 2.5 m between them, and a wide block to the right of the upper one.
+    lanes = np.concatenate([np.stack([np.linspace(0.0, 100.0, 80), np.full(80, y)], -1) for y in (-3.0, 3.0)])
+    x = np.linspace(0.0, 100.0, 67)
+    median = [np.stack([x, np.full(67, -1.25)], -1)[::-1], np.stack([x, np.full(67, 1.25)], -1)]
+    block = np.stack([x, np.full(67, -5.0)], -1)
+    (line,) = walking_lines([*median, block], 1.8, lanes)
+    np.testing.assert_allclose(line[:, 1], -6.8)
+    assert walking_lines([], 1.8, lanes) == []
 
 
 def test_cars_park_where_there_is_room_and_where_they_were_seen():

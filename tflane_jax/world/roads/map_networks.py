@@ -50,7 +50,7 @@ class PreparedRoads:
         junctions: intersections.
         merges: lane -> lane into whose traffic it merges.
         border: oriented lines at the edge of the road.
-        kerbs: parts of them beside lanes.
+        kerbs: parts of them beside lanes; sidewalks: lines behind them on which pedestrians walk.
         walks: start and end of the walk over each crossing; crossings: their rings.
         parking: x, y, yaw.
         roads: centre lines.
@@ -66,6 +66,7 @@ class PreparedRoads:
     merges: dict[int, tuple[int, ...]]
     border: list[Float[np.ndarray, "_ 2"]]
     kerbs: list[Float[np.ndarray, "_ 2"]]
+    sidewalks: list[Float[np.ndarray, "_ 2"]]
     crossings: list[Float[np.ndarray, "_ 3"]]
     walks: list[Float[np.ndarray, "2 2"]]
     parking: Float[np.ndarray, "p 3"]
@@ -106,6 +107,7 @@ def prepare_roads(road_map: RoadMap, sidewalk: float, sees: float) -> PreparedRo
         merges=merging_lanes(lanes),
         border=border,
         kerbs=kerbs,
+        sidewalks=map_roadside.walking_lines(kerbs, sidewalk, points),
         crossings=crossings,
         walks=[crossing_walk(ring[:, :2], sidewalk) for ring in crossings],
         parking=map_roadside.parking_places(segments, kerbs, crossings, road_map.parked),
@@ -165,7 +167,7 @@ def build_map_network(
         speed_limit=dict.fromkeys(lanes, speed),
         yield_to=yields,
         signal_phase=phase,
-        sidewalks=tuple(map_roadside.walking_lines(kerbs, config.sidewalk)),
+        sidewalks=tuple(line for line in roads.sidewalks if _near(line, spot, _ROADSIDE)),
         walk_across=tuple(walk for walk in roads.walks if _near(walk, spot, _ROADSIDE)),
         parking=roads.parking[np.linalg.norm(roads.parking[:, :2] - spot, axis=-1) < _ROADSIDE],
         ego_routes=(way,),

@@ -16,6 +16,8 @@ _BESIDE, _PARALLEL = 6.5, 0.9
 # Fraction of the shorter lane beside the other one.
 _SHARED = 0.5
 _SPACING = 4.0
+# Samples before and after each one over which the middle of a road is averaged.
+_SMOOTH = 5
 # A road ends in the middle of an intersection whose border is nearer than this, metres.
 _MEETS = 12.0
 
@@ -85,8 +87,11 @@ def _middle(lines: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 2
         across = cross(ahead, offset[rows, nearest])
         beside = (along[rows, nearest] < _SPACING) & (np.abs(across) < 4.0 * _BESIDE)
         low, high = np.where(beside, np.minimum(low, across), low), np.where(beside, np.maximum(high, across), high)
+    # Where a lane begins or ends, the middle moves over within a few samples, as a mapped road does.
+    middle = np.pad(0.5 * (low + high), _SMOOTH, mode="edge")
+    middle = np.convolve(middle, np.full(2 * _SMOOTH + 1, 1.0 / (2 * _SMOOTH + 1)), mode="valid")
     left = np.stack([-ahead[:, 1], ahead[:, 0]], -1)
-    return axis + (0.5 * (low + high))[:, None] * left
+    return axis + middle[:, None] * left
 
 
 def _extended(

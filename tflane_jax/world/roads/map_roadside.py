@@ -24,6 +24,8 @@ _SPACING = 1.5
 # the end of the map; farther, it belongs to something else.
 _NEAREST_LANE, _FARTHEST_LANE = 1.4, 25.0
 _SHORTEST_KERB = 8.0
+# A walking line is nearer than this fraction of its distance to no kerb, its own one included.
+_OWN_KERB = 0.8
 # A smaller ring inside the road is an island, square metres.
 _ISLAND = 400.0
 # Room for a parked car beside a lane, metres: at least, at most; and from its middle to the kerb.
@@ -110,9 +112,24 @@ def _runs(points: Float[np.ndarray, "n 2"], keep: Bool[np.ndarray, " n"], least:
     return [points[a:b] for a, b in zip(edge[::2], edge[1::2], strict=True) if b - a >= least]
 
 
-def walking_lines(kerbs: Sequence[Float[np.ndarray, "_ 2"]], behind: float) -> list[Float[np.ndarray, "_ 2"]]:
-    """Return the lines on which pedestrians walk, `behind` metres to the right of the kerbs."""
-    return [offset_polyline(kerb, behind) for kerb in kerbs]
+def walking_lines(
+    kerbs: Sequence[Float[np.ndarray, "_ 2"]], behind: float, lanes: Float[np.ndarray, "p 2"]
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """Return the lines on which pedestrians walk, `behind` metres to the right of the kerbs.
+
+    They leave out narrow medians, behind whose kerb the other carriageway begins.
+    """
+    from scipy.spatial import KDTree
+
+    if not kerbs:
+        return []
+    every, tree = KDTree(np.concatenate(kerbs)), KDTree(lanes)
+    found = []
+    for kerb in kerbs:
+        line = offset_polyline(kerb, behind)
+        free = (every.query(line)[0] > _OWN_KERB * behind) & (tree.query(line)[0] > _CLEAR_OF_LANE)
+        found += _runs(line, np.asarray(free), int(_SHORTEST_KERB / _SPACING))
+    return found
 
 
 def parking_places(

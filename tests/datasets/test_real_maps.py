@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.datasets.small_argoverse2 import write_log
+from tests.datasets.test_nuscenes_scenes import content
 from tests.datasets.test_road_maps import crossroads_features, write
 from tests.shared import shared_path
 from tflane_jax.datasets.base import ExampleConfig
@@ -163,3 +165,18 @@ def test_traffic_of_another_log_replaces_the_own_and_nothing_else():
     ):
         wanted = example_leaves(given)[leaf] if leaf.startswith("traffic_flow") else mine
         np.testing.assert_array_equal(theirs, wanted, err_msg=leaf)
+
+
+def test_maps_on_which_nobody_can_drive_are_named(tmp_path):
+    pytest.importorskip("pyarrow")
+    pytest.importorskip("shapely")
+    write_log(tmp_path / "log-a")  # its only lane is for bicycles
+    with pytest.raises(UserError, match=r"argoverse2 log-a has no lane open to motor vehicles: .*data\.without"):
+        RealMapDataset(config(tmp_path)).example(0)
+
+
+def test_a_map_of_one_short_lane_gives_a_scene_or_is_named(tmp_path):
+    np.savez(tmp_path / "scene-0061.npz", **content())
+    example = RealMapDataset(config(tmp_path)).example(0)
+    assert example.lanes.valid.sum() == 1
+    assert np.isfinite(example.lanes.points[example.lanes.valid]).all()

@@ -14,7 +14,7 @@ from tflane_jax.plots import show_dataset
 from tflane_jax.scene import Example
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Chosen:
     """Examples of several datasets, as a dataset."""
 

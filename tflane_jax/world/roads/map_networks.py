@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads import map_roadside, roadside
 from tflane_jax.world.roads.config import RoadConfig
@@ -83,9 +84,15 @@ def prepare_roads(road_map: RoadMap, sidewalk: float, sees: float) -> PreparedRo
         road_map: the map.
         sidewalk: distance of the walking line behind the kerb, metres.
         sees: distance up to which an example must be complete, metres.
+
+    Raises UserError for a map without a lane open to motor vehicles.
     """
     segments = {i: _flat(segment) for i, segment in road_map.map.segments.items()}
     lanes = traffic_lanes(segments)
+    if not any(lane.vehicle for lane in lanes.values()):
+        raise UserError(
+            f"{road_map.source} {road_map.name} has no lane open to motor vehicles: leave it out (data.without)"
+        )
     before: dict[int, list[int]] = {i: [] for i in lanes}
     for i, lane in lanes.items():
         for j in lane.successors:

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from tests.datasets.nuscenes_small import write_nuscenes
 from tests.datasets.small_argoverse2 import write_log
 from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tests.datasets.test_nuscenes_scenes import content
@@ -77,6 +78,29 @@ def test_every_known_format_below_a_folder_is_found_by_name(folder):
     assert [one.name for one in find_maps(folder / "scenes" / "scene-0061.npz")] == ["scene-0061"]
     with pytest.raises(UserError, match="a map without a recording"):
         found[2].log()
+
+
+def test_scenes_of_the_nuscenes_folder_have_the_map_around_them(tmp_path):
+    pytest.importorskip("shapely")
+    write_nuscenes(tmp_path)
+    (tmp_path / "samples" / "v1.0").mkdir(parents=True)
+    (tmp_path / "samples" / "v1.0" / "scene.json").write_text("not looked at")
+    one, other = find_maps(tmp_path)
+    assert [(x.name, x.kind) for x in (one, other)] == [("scene-0061", "nuscenes"), ("scene-0103", "nuscenes")]
+    found = one.read()
+    assert found.area == "singapore-onenorth"
+    assert len(found.map.segments) == 2
+    np.testing.assert_allclose(found.places[:, 1], [1100.0, 1105.0, 1110.0, 1115.0], atol=0.5)
+    before = one.content()
+    path = tmp_path / "maps" / "expansion" / "singapore-onenorth.json"
+    path.write_text(path.read_text() + " ")
+    assert one.content() != before
+    path.unlink()
+    with pytest.raises(UserError, match=r"singapore-onenorth\.json"):
+        one.content()
+    (tmp_path / "v1.0-mini" / "log.json").write_text("[]")
+    with pytest.raises(UserError, match=r"names a log that is not in .*log\.json"):
+        find_maps(tmp_path)
 
 
 def test_logs_are_chosen_by_name(folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import zipfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
 from tflane_jax.datasets.argoverse2_map import MAP_PATTERN
 from tflane_jax.datasets.geojson_lanes import read_lanes
+from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_files
 from tflane_jax.datasets.nuscenes_scene_files import read_scene_file
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
@@ -25,8 +27,9 @@ from tflane_jax.world.roads.road_map import RoadMap
 # Distance from the drive up to which the lanes of a scene file are complete, metres: it holds the lanes around the
 # drive whole, so most reach farther.
 _SCENE_FILE = 72.0
-# The same for a map whose border is not known to cut any lane, metres.
-_UNCUT = 100.0
+# The same for a map that cuts no lane, and the most that is believed, metres.
+_UNCUT, _MOST = 100.0, 120.0
+_SENSOR_FOLDERS = ("samples", "sweeps", "sensors")
 # A vehicle that moves less for at least this long, off every centerline, is parked: metres, seconds, metres.
 _STANDS, _LONG, _OFF_LANE = 1.0, 4.0, 1.2
 
@@ -52,7 +55,7 @@ class MapFile:
 
     def content(self) -> str:
         """Return the hash of all that the map depends on."""
-        digest = hashlib.sha256()
+        digest = hashlib.sha256(self.name.encode())
         for file in self.files:
             try:
                 digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
@@ -64,6 +67,8 @@ class MapFile:
         """Read the log; raise UserError if a file is missing or damaged, or if the map is not that of a log."""
         if not self.recorded:
             raise UserError(f"{self.files[0]} is a map without a recording: name a log")
+        if self.kind == "nuscenes":
+            return read_scene(self.files[0].parent, self.name)
         return load_log(self.files[0].parent) if self.kind == "argoverse2" else read_scene_file(self.files[0])
 
     def read(self) -> RoadMap:
@@ -74,15 +79,15 @@ class MapFile:
 def find_maps(root: Path) -> list[MapFile]:
     """Return the maps below a folder, or that of a single log, by name.
 
-    Known are logs of Argoverse 2 (annotations.feather with its map), scene files of nuScenes (npz), and lanes as
-    GeoJSON (`geojson_lanes`).
+    Known are logs of Argoverse 2 (annotations.feather with its map), scenes of the nuScenes folder with its map
+    expansion and scene files of nuScenes (npz), and lanes as GeoJSON (`geojson_lanes`).
 
     Raises UserError if there is none, or if two have the same name.
     """
     root = Path(root)
     found = sorted(_found(root), key=lambda one: one.name)
     if not found:
-        formats = f"Argoverse 2 logs ({ANNOTATIONS}), nuScenes scene files (npz) or lanes (geojson)"
+        formats = f"Argoverse 2 logs ({ANNOTATIONS}), nuScenes (scene.json, or scene files npz) or lanes (geojson)"
         raise UserError(f"{root} holds no map: expected {formats}")
     names = [one.name for one in found]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -105,14 +110,24 @@ def chosen_maps(root: Path, logs: Collection[str], without: Collection[str] = ()
 
 
 def _found(root: Path) -> Iterator[MapFile]:
-    for file in [root] if root.suffix == ".npz" else sorted(root.rglob("*.npz")):
-        if _may_hold_lanes(file):
+    for file in [root] if root.is_file() else _files(root):
+        if file.suffix == ".npz" and _may_hold_lanes(file):
             yield MapFile(file.stem, (file,), "nuscenes-scenes")
-    for file in [root] if root.suffix == ".geojson" else sorted(root.rglob("*.geojson")):
-        yield MapFile(file.stem, (file,), "geojson")
-    for boxes in sorted(root.rglob(ANNOTATIONS)):
-        folder = boxes.parent
-        yield MapFile(folder.name, (boxes, folder / POSES, *sorted((folder / "map").glob(MAP_PATTERN))), "argoverse2")
+        elif file.suffix == ".geojson":
+            yield MapFile(file.stem, (file,), "geojson")
+        elif file.name == ANNOTATIONS:
+            maps = sorted((file.parent / "map").glob(MAP_PATTERN))
+            yield MapFile(file.parent.name, (file, file.parent / POSES, *maps), "argoverse2")
+        elif file.name == SCENE_TABLE:
+            for name, files in scene_files(file):
+                yield MapFile(name, files, "nuscenes")
+
+
+def _files(root: Path) -> Iterator[Path]:
+    """Yield all files below a folder, but for those in folders of images and sweeps, which are many."""
+    for folder, inner, names in os.walk(root, followlinks=True):
+        inner[:] = sorted(name for name in inner if name not in _SENSOR_FOLDERS)
+        yield from (Path(folder) / name for name in sorted(names))
 
 
 def _may_hold_lanes(file: Path) -> bool:
@@ -135,7 +150,7 @@ def _cut_at(log: Log) -> float:
     """Return the distance from the drive to the nearest lane whose successor is not in the map, metres."""
     ends = [s.centerline[-1, :2] for s in log.map.segments.values() if set(s.successors) - set(log.map.segments)]
     places = log.global_from_ego[:, :2, 3]
-    return min((float(np.linalg.norm(places - end, axis=-1).min()) for end in ends), default=_UNCUT)
+    return min(min((float(np.linalg.norm(places - end, axis=-1).min()) for end in ends), default=_UNCUT), _MOST)
 
 
 def _parked(log: Log) -> Float[np.ndarray, "p 3"]:

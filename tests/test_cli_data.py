@@ -1,7 +1,13 @@
 """The command line: what a split holds, as numbers and as pictures."""
 
+import json
+
+import numpy as np
 import pytest
 
+from tests.datasets.test_nuscenes_scenes import content
+from tests.datasets.test_road_maps import crossroads_features, write
+from tests.fakes import FakeConfig, FakeDataset
 from tflane_jax.cli import main
 
 
@@ -39,3 +45,57 @@ def test_data_show_draws_world_cameras(tmp_path, capsys):
     assert main(["data", "show", "--data", "world-cameras", "--count", "1", "--out", str(tmp_path / "world.png")]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"world.png", "world-cameras.png"}
     assert "traffic lights and signs" in capsys.readouterr().out
+
+
+def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
+    maps = tmp_path / "maps"
+    maps.mkdir()
+    write(maps / "town.geojson", crossroads_features())
+    chosen = ["data", "stats", "--data", "street", "--split", "val", "--count", "1", "--out", str(tmp_path / "table")]
+    assert main([*chosen, "--beside", f"real-maps={maps}", "--beside", "street"]) == 0
+    printed = capsys.readouterr().out
+    for column in ("street (1 frames)", "real-maps (1 frames)", "street #2 (1 frames)"):
+        assert column in printed
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
+    for quantity in ("lanes", "connectors", "length, m", "curvature, 1/100 m", "visible share"):
+        first, other, again = (cell.strip() for cell in rows[quantity])
+        assert first == again
+        assert float(other.split(" ")[0]) >= 0.0
+    written = json.loads((tmp_path / "table.json").read_text())
+    assert written["meta"]["values"]["street"]["lanes"]["values"] == 1
+    assert {path.suffix for path in tmp_path.glob("table.*")} == {".md", ".json", ".png"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--beside", "front-views"], "are no lane graphs"),
+        (["--beside", "nothing"], "there is no data source nothing"),
+        (["--beside", "recorded"], "--data recorded needs --root"),
+        (["--out", "x"], "--out is the file of --beside"),
+    ],
+)
+def test_data_that_cannot_be_laid_beside_are_refused(arguments, message, capsys):
+    assert main(["data", "stats", "--data", "street", "--count", "1", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_recorded_frames_are_drawn_beside_simulated_ones(tmp_path, monkeypatch, capsys):
+    np.savez(tmp_path / "scene-0061.npz", **content())
+    shown = []
+
+    def draw(dataset, count, out, **_):
+        shown.extend((dataset.info(i).source, dataset.info(i).scene) for i in range(count))
+        return out
+
+    # The map of this scene is too small to drive on, and drawing takes time.
+    monkeypatch.setattr("tflane_jax.commands.data_maps.show_dataset", draw)
+    monkeypatch.setattr("tflane_jax.commands.data_maps.RealMapDataset", lambda config: FakeDataset(FakeConfig(2)))
+    assert main(["data", "maps", str(tmp_path), "--out", str(tmp_path / "maps.png")]) == 0
+    assert shown == [("nuscenes-scenes", "scene-0061"), ("fake", FakeDataset(FakeConfig(2)).info(1).scene)]
+    assert "maps.png" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["data", "maps", str(tmp_path), "--moment", "1.0"])
+    write(tmp_path / "town.geojson", crossroads_features())
+    assert main(["data", "maps", str(tmp_path), "--logs", "town"]) == 2
+    assert "maps without recordings" in capsys.readouterr().err

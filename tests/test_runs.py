@@ -3,17 +3,19 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from tests.datasets.test_nuscenes_scenes import content
 from tests.test_cli import CONFIG as TINY
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tests.test_migrations import renamed_back
-from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config import RealMapData, RecordedData, RunConfig, WorldData, load_config
 from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.models.toponet import paper_config
-from tflane_jax.runs import current_form, open_run, resumable_config, train_run
+from tflane_jax.runs import current_form, open_run, resumable_config, train_run, training_nearness
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.adaptive import AdaptiveConfig
@@ -92,3 +94,17 @@ def test_the_scores_that_an_evaluation_gives_are_known_before(config, tmp_path):
     grouped = {name for name in of_lanes if name.startswith(LANE_GROUPS)}
     assert grouped
     assert paper.task.score_names(paper.data, paper.evaluation) == (of_lanes | more) - grouped
+
+
+def test_test_frames_are_compared_with_the_places_of_the_training_split(tmp_path):
+    np.savez(tmp_path / "scene-0061.npz", **content())
+    np.savez(tmp_path / "scene-0099.npz", **content())
+    recorded, maps = RecordedData(tmp_path, test=("scene-0099",)), RealMapData(tmp_path, test_logs=("scene-0099",))
+    test = recorded.source("test")
+    for data in (recorded, maps):
+        found = training_nearness(RunConfig(data=data), test)
+        assert found is not None
+        np.testing.assert_allclose(found.distances, 0.0)  # both files hold the same drive
+    assert training_nearness(RunConfig(data=WorldData()), test) is None
+    assert training_nearness(RunConfig(data=replace(maps, generated=1.0)), test) is None
+    assert training_nearness(RunConfig(data=recorded), WorldData().source("test")) is None

@@ -51,6 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
     models.summary(commands)
     comparisons.compare(commands)
     comparisons.tables(commands)
+    comparisons.carry_over(commands)
     comparisons.sweep(commands)
     comparisons.score(commands)
     markers.markers(commands)

@@ -25,6 +25,8 @@ from tflane_jax.datasets.nuscenes import NuScenesData
 from tflane_jax.datasets.nuscenes_scenes import SceneFileData
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Data
 from tflane_jax.datasets.procedural import WorldData
+from tflane_jax.datasets.real_maps import RealMapData
+from tflane_jax.datasets.recorded_logs import RecordedData
 from tflane_jax.datasets.sources import data_classes
 from tflane_jax.datasets.tusimple import TuSimpleData
 from tflane_jax.errors import UserError
@@ -46,6 +48,8 @@ __all__ = [
     "LogData",
     "NuScenesData",
     "OpenLaneV2Data",
+    "RealMapData",
+    "RecordedData",
     "RunConfig",
     "SceneFileData",
     "TuSimpleData",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ import numpy as np
 
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
+from tflane_jax.datasets import sources
+from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -187,7 +190,25 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
         write_json(folder / "config.json", to_json(config))  # last: this file marks a complete run
 
 
-def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = True) -> tuple[str, list[dict[str, Any]]]:
+def training_nearness(config: RunConfig, source: Any) -> Nearness | None:
+    """Return how far the examples of a source are from the training frames of a configuration.
+
+    None where one of them shows no real place, and where no example is in a city of the training frames.
+
+    Raises UserError if the files of the training split cannot be read.
+    """
+    train = config.data.source("train")
+    drives = sources.source_of(train).drives
+    if drives is None or sources.source_of(source).drives is None:
+        return None
+    trained = [drive for drive in drives(train) if len(drive.positions)]
+    found = nearness(trained, sources.make_dataset(source)) if trained else None
+    return found if found is not None and np.isfinite(found.distances).any() else None
+
+
+def evaluate_run(
+    run: Run, source: Any, *, task: Any = None, progress: bool = True, frame_groups: Sequence[str] = ()
+) -> tuple[str, list[dict[str, Any]]]:
     """Evaluate every seed of a run.
 
     Args:
@@ -195,6 +216,7 @@ def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = Tr
         source: configuration of the examples.
         task: a variant of the run's task, such as from `limit_instances`; None: the run's task.
         progress: show progress bars while loading data.
+        frame_groups: a further group for each example, measured on its own.
 
     Returns:
         The metric's protocol with its version, and rows of a table, one per group and seed; with several seeds, their
@@ -202,7 +224,8 @@ def evaluate_run(run: Run, source: Any, *, task: Any = None, progress: bool = Tr
     """
     task = run.config.task if task is None else task
     arrays = task.load(source, progress=progress)
-    every = [task.evaluate(params, arrays, run.config.evaluation) for params in run.params]
+    further = {"frame_groups": frame_groups} if frame_groups else {}
+    every = [task.evaluate(params, arrays, run.config.evaluation, **further) for params in run.params]
     seeds = run.config.training.seeds
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:

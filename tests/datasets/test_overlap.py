@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.shared import shared_root
 from tflane_jax.cli import main
-from tflane_jax.datasets.overlap import Drive, overlap, read_drives
+from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.overlap import NEAR_GROUPS, Drive, frame_drives, nearness, overlap, read_drives
 from tflane_jax.errors import UserError
 
 
@@ -38,6 +39,45 @@ def test_cities_are_never_compared():
     assert np.isinf(found.distances[0]).all()
     assert found.rows()[-1]["frames"] == 0.0
     assert found.worst() == []
+
+
+class Frames:
+    """A dataset of which only the places of its frames are known: (scene, x, y, area)."""
+
+    name = "frames"
+
+    def __init__(self, *frames):
+        self.frames = frames
+
+    def __len__(self):
+        return len(self.frames)
+
+    def example(self, index):
+        raise AssertionError("places need no examples")
+
+    def info(self, index):
+        scene, x, y, area = self.frames[index]
+        pose = np.eye(4)
+        pose[:2, 3] = x, y
+        return FrameInfo("nuscenes", scene, index, pose, area)
+
+
+def test_frames_are_grouped_by_the_nearest_training_frame_of_their_city():
+    near, far = NEAR_GROUPS
+    frames = Frames(("x", 3, 4, "PIT"), ("y", 0, 0, "MIA"), ("x", 5.1, 0, "PIT"), ("y", 100, 0, "MIA"))
+    found = nearness([drive("a", (0, 0)), drive("b", (100, 1), area="MIA")], frames)
+    np.testing.assert_allclose(found.distances, [5.0, 100.005, 5.1, 1.0], atol=1e-3)
+    assert found.groups == [near, far, far, near]
+    assert found.sentence() == "2 of 4 frames are within 5 m of a training frame; the nearest is 1.0 m away"
+    assert nearness([drive("a", (0, 0), area="WDC")], frames).sentence().endswith("none is of the same city")
+
+
+def test_frames_of_a_source_without_cities_are_compared_with_each_other():
+    frames = Frames(("x", 1, 2, ""), ("z", 3, 4, "PIT"), ("x", 5, 6, ""))
+    drives = frame_drives(frames)
+    assert [(one.name, one.area) for one in drives] == [("x", "nuscenes"), ("z", "PIT")]
+    np.testing.assert_array_equal(drives[0].positions, [[1, 2], [5, 6]])
+    assert set(nearness(drives, frames).groups) == {NEAR_GROUPS[0]}
 
 
 @settings(deadline=None, max_examples=25, derandomize=True)

@@ -169,7 +169,7 @@ def test_a_split_that_logs_do_not_have_is_refused(logs):
         (
             ["--data", "tusimple", "--root", "x"],
             None,
-            "no lane graphs: this model takes procedural, .* or nuscenes-scenes",
+            "no lane graphs: this model takes procedural, .* or recorded",
         ),
         (["--data", "procedural"], IMAGES, "are no images: this model takes front-views or tusimple"),
         ([], replace(IMAGES, data=WorldData()), "data are lane graphs, but its task takes images"),

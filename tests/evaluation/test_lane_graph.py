@@ -300,3 +300,13 @@ def test_recall_of_lines_is_the_ratio_of_counts_by_scene():
     )
     assert ratios["lines/recall"].denominator == (30, 15)  # five lines a frame, at three thresholds
     assert scores["lines"]["recall"] == pytest.approx(sum(ratios["lines/recall"].numerator) / 45)
+
+
+def test_groups_of_frames_are_measured_on_their_own():
+    arrays = stack_examples([labelled(i) for i in range(3)])
+    oracle = Oracle(("centerlines", "segments"))
+    metrics = evaluate_lanes(oracle, {}, arrays, BOTH, frame_groups=("near", "far", "near"))
+    found = metrics.compute()
+    assert [found[group]["frames"] for group in ("all", "near", "far")] == [3, 2, 1]
+    assert [found[f"segments {group}"]["frames"] for group in ("all", "near", "far")] == [3, 2, 1]
+    assert found["near"]["lanes"] + found["far"]["lanes"] == found["all"]["lanes"]

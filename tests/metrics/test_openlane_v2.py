@@ -204,6 +204,15 @@ def test_frames_outside_a_group_of_frames_count_nothing_in_it():
     assert metrics.compute()["gap"]["frames"] == 1
 
 
+def test_a_frame_may_belong_to_several_groups_of_frames():
+    metrics = GroupedCenterlineMetrics(frame_groups=("gap", "far", "near"))
+    metrics.update(*hand_frame(), ("gap", "far"))
+    metrics.update(*hand_frame(), ["near"])
+    found = metrics.compute()
+    assert [found[group]["frames"] for group in ("all", "gap", "far", "near")] == [2, 1, 1, 1]
+    assert found["gap"]["recall"] == found["near"]["recall"] == found["all"]["recall"]
+
+
 def test_threshold_of_occlusion_is_strict_and_configurable():
     lanes = {
         limit: evaluate([hand_frame()], GroupedCenterlineMetrics(partition=ByOcclusion(limit)))["occluded"]["lanes"]

@@ -30,7 +30,14 @@ _STANDS = 1.5
 def stats(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Print the means and quantiles over examples spread evenly over a split."""
     config = RunConfig() if options.config is None else load_config(options.config)
-    source = chosen_source(apply_overrides(config, overrides), options)
+    config = apply_overrides(config, overrides)
+    if options.beside:
+        from tflane_jax.commands.data_beside import beside
+
+        return beside(config, options)
+    if options.out is not None:
+        raise UserError("--out is the file of --beside: add data to compare with, or leave it out")
+    source = chosen_source(config, options)
     if sources.source_of(source).example is RoadImage:
         raise UserError("these data are images: `tflane data stats` counts lane graphs")
     dataset = sources.make_dataset(source)

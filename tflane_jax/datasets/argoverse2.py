@@ -10,6 +10,7 @@ from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, Keyframes, check_log
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
@@ -58,7 +59,7 @@ class Argoverse2Dataset:
         """Return log id, time and pose of one example."""
         log, number = self._frames[index]
         keyframe = log.keyframes[number]
-        return FrameInfo(log.source, log.name, keyframe.timestamp_ns, keyframe.global_from_ego)
+        return FrameInfo(log.source, log.name, keyframe.timestamp_ns, keyframe.global_from_ego, log.area)
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
@@ -148,6 +149,7 @@ SOURCE = DataSource(
     dataset=Argoverse2Dataset,
     choose=_choose,
     title=_title,
+    drives=lambda config: frame_drives(Argoverse2Dataset(config)),
     root="a log or a folder of logs",
     check=check_argoverse2,
 )

@@ -132,7 +132,14 @@ def load_log(
             for t, pose, frame in zip(moments, _poses_at(moments, pose_times, poses, folder), nearest, strict=True)
         ),
         seed=zlib.crc32(folder.name.encode()),
+        area=city_of(folder),
     )
+
+
+def city_of(folder: Path) -> str:
+    """Return the city of a log, which the name of its map file tells; "" without it."""
+    names = sorted((folder / "map").glob("log_map_archive_*____*_city_*.json"))
+    return names[0].stem.split("____")[1].split("_")[0] if names else ""
 
 
 def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -110,12 +110,14 @@ class FrameInfo:
         scene: log or scene name.
         timestamp_ns: moment.
         global_from_ego: (4, 4) float64 pose.
+        area: place, such as a city, in whose coordinates the pose is; "" if the source does not tell.
     """
 
     source: str
     scene: str
     timestamp_ns: int
     global_from_ego: np.ndarray
+    area: str = ""
 
 
 class IndexedExamples(Protocol):

@@ -14,6 +14,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
+from tflane_jax.datasets.overlap import Drive
 from tflane_jax.scene import Example, RoadImage
 
 ConfigT = TypeVar("ConfigT")
@@ -89,6 +90,7 @@ class DataSource(Generic[ConfigT]):
         build: (config, progress) -> number of examples, after making them ahead of training; None where nothing is
             made.
         check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
+        drives: config -> where its examples were recorded, area by area; None for data that show no real place.
         tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
     """
 
@@ -105,4 +107,5 @@ class DataSource(Generic[ConfigT]):
     sample: Callable[[ConfigT], Any] | None = None
     build: Callable[[ConfigT, bool], int] | None = None
     check: Callable[..., FolderCheck] | None = None
+    drives: Callable[[ConfigT], list[Drive]] | None = None
     tracks: bool = False

@@ -96,7 +96,7 @@ def read_geojson(path: str | Path) -> RoadLines:
             message names the file, the feature (by its number, from 0, and its id) and the remedy.
     """
     lines, category = [], []
-    for name, feature in _features(Path(path)):
+    for name, feature in read_features(Path(path)):
         geometry = feature.get("geometry")
         if geometry is None:
             continue
@@ -105,7 +105,7 @@ def read_geojson(path: str | Path) -> RoadLines:
             if kind not in _OTHERS:
                 raise UserError(f"{name} has a geometry of type {kind!r}: export roads as LineString")
             continue
-        found = _coordinates(geometry.get("coordinates"), _LINES[kind], name)
+        found = line_coordinates(geometry.get("coordinates"), _LINES[kind], name)
         lines += found
         category += [_category(feature.get("properties"), name)] * len(found)
     return RoadLines(tuple(lines), tuple(category))
@@ -149,7 +149,7 @@ def to_ego(line: Float[np.ndarray, "n 2"], origin: Origin) -> Float[np.ndarray, 
     return np.stack([sin * east + cos * north, sin * north - cos * east], -1)
 
 
-def _features(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def read_features(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the features of a file, each with its name for error messages."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -170,7 +170,7 @@ def _features(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         yield (f"{name} ({feature['id']})" if "id" in feature else name), feature
 
 
-def _coordinates(coordinates: Any, depth: int, name: str) -> list[np.ndarray]:
+def line_coordinates(coordinates: Any, depth: int, name: str) -> list[np.ndarray]:
     """Return the lines of a geometry; `depth` is 1 for one line and 2 for several."""
     lines = []
     several: list[Any] = coordinates if depth == 2 and isinstance(coordinates, list) else [coordinates]

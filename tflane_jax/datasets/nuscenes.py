@@ -34,6 +34,7 @@ from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
 from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
 from tflane_jax.datasets.openlane_example import camera_views
+from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.prepared_map import prepare_map
@@ -126,7 +127,8 @@ class NuScenesDataset:
         """Return scene, time and (level) pose of one key frame."""
         name, number = self._place(index)
         frames = self.frames(name)
-        return FrameInfo("nuscenes", name, int(frames.timestamps_ns[number]), frames.global_from_frame[number])
+        time, pose = int(frames.timestamps_ns[number]), frames.global_from_frame[number]
+        return FrameInfo("nuscenes", name, time, pose, self.tables.location(self.scenes[name]))
 
     def log(self, name: str) -> Log:
         """Return a scene as a log with the part of the city's map around it."""
@@ -294,6 +296,7 @@ SOURCE = DataSource(
     load=_load,
     choose=_choose,
     title=lambda config: f"nuscenes-{config.split}",
+    drives=lambda config: frame_drives(NuScenesDataset(config)),
     root="its folder",
     check=check_nuscenes,
 )

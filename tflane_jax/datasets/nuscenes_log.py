@@ -148,6 +148,7 @@ def scene_log(
             for number, (time, pose) in enumerate(zip(frames.timestamps_ns, frames.global_from_frame, strict=True))
         ),
         seed=zlib.crc32(scene["name"].encode()),
+        area=tables.location(scene),
     )
 
 

@@ -6,7 +6,7 @@ visibility. It has no connectivity either: lanes are joined where their ends coi
 
     instance_token, category (K,); size_wlh (K, 3); position (F, K, 3); yaw, valid (F, K); ego_position (F, 3);
     ego_yaw (F,); map_token, map_type, polyline_len, polygon_len (M,); polyline, polygon (n, 2), the points of all
-    elements in succession; meta, a JSON text with scene and rate_hz
+    elements in succession; meta, a JSON text with scene and rate_hz, and location if it is known
 
 Global metres; no pickle inside.
 """
@@ -53,7 +53,7 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
     """
     path = Path(path)
     content = _content(path)
-    name, period_ns = _meta(content["meta"], f"{path}: meta")
+    name, period_ns, area = _meta(content["meta"], f"{path}: meta")
     x, y, _ = content["ego_position"].T
     pose = yaw_pose(x, y, content["ego_yaw"])
     times = np.arange(len(pose), dtype=np.int64) * period_ns
@@ -72,6 +72,7 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
         actors=tracks,
         keyframes=tuple(KeyFrame(int(time), pose[i], i) for i, time in enumerate(times)),
         seed=zlib.crc32(name.encode()),
+        area=area,
     )
 
 
@@ -114,8 +115,8 @@ def _content(path: Path) -> dict[str, Any]:
     return content
 
 
-def _meta(text: np.ndarray, where: str) -> tuple[str, int]:
-    """Return the scene's name and the time between frames, nanoseconds."""
+def _meta(text: np.ndarray, where: str) -> tuple[str, int, str]:
+    """Return the scene's name, the time between frames (nanoseconds), and its city, "" where it is not recorded."""
     try:
         meta = json.loads(str(text))
     except json.JSONDecodeError as error:
@@ -124,7 +125,8 @@ def _meta(text: np.ndarray, where: str) -> tuple[str, int]:
     name = member(meta, "scene", where)
     if not isinstance(name, str) or not rate > 0.0:
         raise UserError(f"{where}: scene must be a text and rate_hz positive")
-    return name, round(1e9 / rate)
+    area = meta.get("location", "")
+    return name, round(1e9 / rate), area if isinstance(area, str) else ""
 
 
 def _tracks(

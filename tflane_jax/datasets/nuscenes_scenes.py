@@ -10,6 +10,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file
 from tflane_jax.datasets.nuscenes_splits import official_split
+from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 
@@ -60,7 +61,7 @@ class SceneFileDataset:
         """Return scene, time (from the scene's start) and pose of one example."""
         log, number = self._frames[index]
         moment = log.keyframes[number]
-        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego)
+        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego, log.area)
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ SOURCE = DataSource(
     dataset=SceneFileDataset,
     choose=_choose,
     title=lambda config: "nuscenes-scenes",
+    drives=lambda config: frame_drives(SceneFileDataset(config)),
     root="a scene file (npz) or a folder of them",
     check=check_scene_files,
 )

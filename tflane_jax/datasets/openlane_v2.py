@@ -34,6 +34,7 @@ from tflane_jax.datasets.openlane_frames import (
     without_map_changes,
 )
 from tflane_jax.datasets.openlane_tracks import SourceTracks, WithoutTracks
+from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
@@ -290,6 +291,7 @@ SOURCE = DataSource(
     sample=_sample,
     choose=_choose,
     title=lambda config: f"openlane-v2-{config.subset}-{config.split}",
+    drives=lambda config: frame_drives(OpenLaneV2Dataset(config)),
     root="its folder",
     check=_check,
     tracks=True,

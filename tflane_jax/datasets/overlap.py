@@ -1,7 +1,8 @@
 """How much two splits show the same places: drives of both splits past the same spot leak the map.
 
 The official splits of nuScenes and OpenLane-V2 overlap, so a model can score by memorising the map of a place. This
-compares ego positions and reports which fraction of a validation split lies near training frames.
+compares ego positions and reports which fraction of a validation split lies near training frames. Evaluations of real
+data measure the frames near training frames and the others apart (`nearness`).
 """
 
 from __future__ import annotations
@@ -13,11 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.argoverse2_log import find_logs, read_poses
+from tflane_jax.datasets.argoverse2_log import city_of, find_logs, read_poses
+from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member, numbers
 
 RADII = (5.0, 10.0, 20.0, 50.0)
+NEAR = 5.0
+"""Up to this distance from a training frame, metres, a test frame shows a place that a model may know by heart."""
+NEAR_GROUPS = ("near training", "far from training")
 _POSE_INTERVAL = 0.1  # seconds between the poses of a log that are compared; the files have 170 per second
 
 
@@ -59,10 +64,60 @@ def read_drives(root: Path) -> list[Drive]:
 def _log_drive(folder: Path) -> Drive:
     times, poses = read_poses(folder)
     _, kept = np.unique(times // int(_POSE_INTERVAL * 1e9), return_index=True)
-    maps = sorted((folder / "map").glob("log_map_archive_*____*_city_*.json"))
-    if not maps:
+    if not (city := city_of(folder)):
         raise UserError(f"{folder / 'map'} has no log_map_archive_*.json, whose name tells the city")
-    return Drive(folder.name, maps[0].stem.split("____")[1].split("_")[0], poses[kept, :2, 3])
+    return Drive(folder.name, city, poses[kept, :2, 3])
+
+
+def frame_drives(dataset: IndexedExamples) -> list[Drive]:
+    """Return the drives of a dataset: the positions of its examples in their order.
+
+    The area of examples whose city is not known is the dataset's source.
+    """
+    drives: dict[tuple[str, str], list[np.ndarray]] = {}
+    for index in range(len(dataset)):
+        info = dataset.info(index)
+        drives.setdefault((info.scene, info.area or info.source), []).append(info.global_from_ego[:2, 3])
+    return [Drive(scene, area, np.stack(where)) for (scene, area), where in drives.items()]
+
+
+@dataclass(frozen=True)
+class Nearness:
+    """How far the examples of a split are from the nearest training frame.
+
+    Attributes:
+        distances: (N,) metres; inf where no training frame is in the same area.
+    """
+
+    distances: Float[np.ndarray, " n"]
+
+    @property
+    def groups(self) -> list[str]:
+        """The group of each example: one of `NEAR_GROUPS`."""
+        return [NEAR_GROUPS[int(distance > NEAR)] for distance in self.distances]
+
+    def sentence(self) -> str:
+        """Return how many examples are near, and the distance of the nearest."""
+        near = int((self.distances <= NEAR).sum())
+        nearest = self.distances.min()
+        least = f"the nearest is {nearest:.1f} m away" if np.isfinite(nearest) else "none is of the same city"
+        return f"{near} of {len(self.distances)} frames are within {NEAR:g} m of a training frame; {least}"
+
+
+def nearness(train: Sequence[Drive], dataset: IndexedExamples) -> Nearness:
+    """Compare every example of a dataset with the drives of the training split, area by area.
+
+    Raises UserError where one side has no frames.
+    """
+    rows: dict[tuple[str, str], list[int]] = {}
+    for index in range(len(dataset)):
+        info = dataset.info(index)
+        rows.setdefault((info.scene, info.area or info.source), []).append(index)
+    found = overlap(train, frame_drives(dataset))
+    distances = np.zeros(len(dataset))
+    for indices, apart in zip(rows.values(), found.distances, strict=True):
+        distances[indices] = apart
+    return Nearness(distances)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ from tflane_jax.datasets import (
     nuscenes_scenes,
     openlane_v2,
     procedural,
+    real_maps,
+    recorded_logs,
     tusimple,
 )
 from tflane_jax.datasets.data_source import DataSource
@@ -28,6 +30,8 @@ SOURCES: tuple[DataSource[Any], ...] = (
     openlane_v2.SOURCE,
     nuscenes.SOURCE,
     nuscenes_scenes.SOURCE,
+    real_maps.SOURCE,
+    recorded_logs.SOURCE,
     front_views.SOURCE,
     tusimple.SOURCE,
 )

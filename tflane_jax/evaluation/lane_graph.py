@@ -31,6 +31,7 @@ from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
 from tflane_jax.evaluation.vector_maps import measured_lines
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
+from tflane_jax.metrics.groups import FrameGroup
 from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.metrics.segment_matching import match_segments
@@ -86,7 +87,7 @@ class LaneGraphMetrics:
         self,
         prediction: Prediction,
         example: Example,
-        frame_group: str | None = None,
+        frame_group: FrameGroup = None,
         members: Mapping[str, Members] | None = None,
     ) -> None:
         """Add one frame; the frames of a scene come in succession.
@@ -94,7 +95,7 @@ class LaneGraphMetrics:
         Args:
             prediction: the last decoder layer's prediction for this example.
             example: ground truth of all predicted parts. Traffic elements are measured if both have them.
-            frame_group: the group that this frame belongs to.
+            frame_group: the groups that this frame belongs to.
             members: by "centerlines", "segments" and "lines": for each of `lane_groups`, which of the valid true lanes
                 (of the measured true lines) belong to it.
 
@@ -190,6 +191,7 @@ def evaluate_lanes(
     config: EvaluationConfig | None = None,
     *,
     ground: PerceptionRange | None = None,
+    frame_groups: Sequence[str] = (),
 ) -> LaneGraphMetrics:
     """Return the filled accumulator of a dataset.
 
@@ -203,6 +205,7 @@ def evaluate_lanes(
         arrays: examples with ground truth, see `datasets.batches`.
         config: batch size, versions, and traffic flow that the model sees.
         ground: the range that the BEV evidence covers; None for a model that does not see it, without those groups.
+        frame_groups: a further group for each example; lines of vector maps do not have it.
 
     Raises:
         ValueError: the task predicts no lanes.
@@ -219,7 +222,7 @@ def evaluate_lanes(
         if number == 0:
             metrics = LaneGraphMetrics(
                 config.versions,
-                () if batch.markers is None else sightings.groups,
+                (*(() if batch.markers is None else sightings.groups), *dict.fromkeys(frame_groups)),
                 lane_groups=LANE_GROUPS if _members(batch, answer, 0, ground) else (),
                 map_measures=config.map_measures,
                 line_labels=line_labels(batch.map_lines),
@@ -229,10 +232,10 @@ def evaluate_lanes(
             prediction, example = jax.tree.map(lambda leaf, i=row: leaf[i], (answer, _labels(batch)))
             if config.topology == "geometric":
                 prediction = with_geometric_topology(prediction)
-            group = None
+            groups = [frame_groups[int(indices[row])]] if frame_groups else []
             if batch.markers is not None:
-                group = sightings.next(batch.markers.valid[row].any(), batch.has_previous[row])
-            metrics.update(prediction, example, group, _members(batch, answer, row, ground))
+                groups.append(sightings.next(batch.markers.valid[row].any(), batch.has_previous[row]))
+            metrics.update(prediction, example, groups, _members(batch, answer, row, ground))
     return metrics
 
 

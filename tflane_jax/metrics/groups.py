@@ -153,6 +153,8 @@ class ByDistance:
 
 
 FrameT = TypeVar("FrameT", bound=Matched)
+FrameGroup = str | Sequence[str] | None
+"""The groups of frames that a frame belongs to: one, several, or none."""
 
 
 class GroupedMetrics(Generic[FrameT]):
@@ -193,7 +195,7 @@ class GroupedMetrics(Generic[FrameT]):
         self,
         frame: FrameT,
         truth: TrueLanes,
-        frame_group: str | None = None,
+        frame_group: FrameGroup = None,
         members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:
         """Add one matched frame.
@@ -201,16 +203,17 @@ class GroupedMetrics(Generic[FrameT]):
         Args:
             frame: matching results.
             truth: the lanes that it was matched with.
-            frame_group: the group of frames that it belongs to.
+            frame_group: the groups of frames that it belongs to.
             members: for each of `lane_groups`, which of the true lanes belong to it.
         """
+        own = (frame_group,) if isinstance(frame_group, str) else frame_group or ()
         for group, metrics in self._metrics.items():
             lanes = hits = 0
-            if group not in self._frame_groups or group == frame_group:
+            if group not in self._frame_groups or group in own:
                 part = frame
                 if group in self._lane_groups:
                     part = frame.select((members or {})[group])
-                elif group not in ("all", frame_group):
+                elif group != "all" and group not in own:
                     part = frame.select(self.partition.members(group, truth))
                 metrics.add(part)
                 lanes, hits = part.lanes, int(part.hits.sum())

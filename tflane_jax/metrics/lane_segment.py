@@ -18,7 +18,7 @@ from jaxtyping import Bool
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
-from tflane_jax.metrics.groups import BY_OCCLUSION, GroupedMetrics, Partition
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 from tflane_jax.metrics.segment_matching import (
@@ -158,7 +158,7 @@ class GroupedSegmentMetrics(GroupedMetrics[MatchedSegments]):
         self,
         detections: SegmentDetections,
         truth: SegmentTruth,
-        frame_group: str | None = None,
+        frame_group: FrameGroup = None,
         members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:
         """Add one frame; arguments as of `GroupedMetrics.add`.

@@ -19,7 +19,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
-from tflane_jax.metrics.groups import BY_OCCLUSION, GroupedMetrics, Partition
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled
 from tflane_jax.metrics.topology import Version, check_versions
 
@@ -169,7 +169,7 @@ class GroupedCenterlineMetrics(GroupedMetrics[MatchedFrame]):
         self,
         detections: LaneDetections,
         truth: LaneTruth,
-        frame_group: str | None = None,
+        frame_group: FrameGroup = None,
         members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:
         """Add one frame; arguments as of `GroupedMetrics.add`.

@@ -160,6 +160,7 @@ class Log:
         paint_wear: 0 (fresh) to 1 (gone); weakens lane paint.
         seed: of all random numbers in rendering this log.
         markers: fiducial markers beside the road; None if there are none.
+        area: place, such as a city, in whose coordinates the log is; "" if the source does not tell.
     """
 
     name: str
@@ -175,6 +176,7 @@ class Log:
     paint_wear: float = 0.0
     seed: int = 0
     markers: PlacedMarkers | None = None
+    area: str = ""
 
     @property
     def rate_hz(self) -> float | None:

@@ -7,7 +7,7 @@ the commands the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -127,8 +127,10 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
     # -----------------------------------------------------------------------------------------------------------------
     # Numbers and pictures
 
-    def evaluate(self, params: Params, data: DataT, config: EvaluationConfig) -> Evaluation:
-        """Return the metrics of a model on a split."""
+    def evaluate(
+        self, params: Params, data: DataT, config: EvaluationConfig, frame_groups: Sequence[str] = ()
+    ) -> Evaluation:
+        """Return the metrics of a model on a split; `frame_groups` names a further group for each example."""
         raise NotImplementedError
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:

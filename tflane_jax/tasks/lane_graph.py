@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -189,9 +189,11 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     # -----------------------------------------------------------------------------------------------------------------
     # Numbers and pictures
 
-    def evaluate(self, params: Params, data: Example | Streamed, config: EvaluationConfig) -> Evaluation:
+    def evaluate(
+        self, params: Params, data: Example | Streamed, config: EvaluationConfig, frame_groups: Sequence[str] = ()
+    ) -> Evaluation:
         """Return the metrics of all parts that the host predicts and the examples label."""
-        metrics = evaluate_lanes(self, params, data, config, ground=self._ground)
+        metrics = evaluate_lanes(self, params, data, config, ground=self._ground, frame_groups=frame_groups)
         return Evaluation(metrics.protocol, metrics.compute(), ratios=metrics.ratios())
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -127,8 +127,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
 
         return prepare
 
-    def evaluate(self, params: Params, data: LabelledImages, config: EvaluationConfig) -> Evaluation:
-        """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss."""
+    def evaluate(
+        self, params: Params, data: LabelledImages, config: EvaluationConfig, frame_groups: Sequence[str] = ()
+    ) -> Evaluation:
+        """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss; without groups."""
         metrics, losses = TuSimpleMetrics(), []
         for indices, answer in predictions(self, params, data.images, config.batch_size):
             lines = jax.tree.map(lambda leaf, i=indices: leaf[i.start : i.stop], data.images.lines)

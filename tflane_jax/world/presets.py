@@ -1,6 +1,6 @@
-"""Fixed worlds on which models are compared: `CITY` and `STREET`.
+"""Fixed worlds on which models are compared: `CITY` and `STREET`; and `REAL_MAPS`, for recorded maps.
 
-Both hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and traffic as dense and
+All hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and traffic as dense and
 as mixed as in real logs (docs/world.md compares them). They differ in their roads. `WorldData.city` and
 `WorldData.street` add the ranges and capacities of the examples.
 """
@@ -57,3 +57,16 @@ STREET = replace(
     ),
 )
 """Roads that bend, split and merge, and T junctions of streets with one lane in each direction."""
+
+REAL_MAPS = replace(
+    CITY,
+    traffic=replace(
+        CITY.traffic,
+        vehicles_per_metre=0.06,
+        bicycles_per_metre=0.015,
+        pedestrians_per_metre=0.034,
+        crossers_per_minute=5.0,
+        early_s=90.0,
+    ),
+)
+"""Traffic on recorded maps: they have more road, and more kerb to walk along, than the generated ones."""

@@ -10,20 +10,24 @@ import enum
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks
+from tflane_jax.world.roads.map_networks import build_map_network
 from tflane_jax.world.roads.markers import PlacementConfig, place_markers
-from tflane_jax.world.roads.networks import RoadConfig, build_road_network
+from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, build_road_network
+from tflane_jax.world.roads.road_map import RoadMap
 from tflane_jax.world.traffic.signals import element_states, show_signals
-from tflane_jax.world.traffic.simulation import Traffic, TrafficConfig, simulate_traffic
+from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
 
 ROOT = 20_250_711
 # Frames that a scene has before its first key frame, unless its examples look back farther.
 HISTORY = 20
+# Drives that are tried on a recorded map, and frames that it must offer for each key frame.
+_DRIVES, _LEAST_STEP = 8, 4
 
 
 class Stream(enum.IntEnum):
@@ -64,13 +68,31 @@ class WorldConfig:
         return round(self.duration_s * self.rate_hz)
 
 
-def simulate(scene_id: int, config: WorldConfig = WorldConfig(), history: int = HISTORY) -> Log:
+@dataclass(frozen=True)
+class Place:
+    """A recorded map to simulate on, instead of generated roads.
+
+    Attributes:
+        road_map: the map.
+        sees: distance up to which an example must be complete, metres: half the diagonal of the perceived box.
+    """
+
+    road_map: RoadMap
+    sees: float
+
+
+def simulate(
+    scene_id: int, config: WorldConfig = WorldConfig(), history: int = HISTORY, place: Place | None = None
+) -> Log:
     """Return the scene with this number (not negative).
+
+    On a recorded map, key frames are spread over the frames in which the map is complete around the ego vehicle.
 
     Args:
         scene_id: its number.
         config: the world.
         history: frames before the first key frame.
+        place: a recorded map; None generates roads.
 
     Raises UserError if the scene is too short for its key frames or the severity is not between 0 and 1.
     """
@@ -82,15 +104,17 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig(), history: int = 
             f"{config.keyframes} key frames with {history} frames of history each do not fit in the {frames} frames of "
             f"{config.duration_s} s at {config.rate_hz} Hz: raise duration_s or lower keyframes"
         )
-    network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
     density = 0.8 + 0.4 * config.severity
-    traffic = simulate_traffic(
-        _stream(scene_id, Stream.TRAFFIC),
-        network,
-        replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre),
-        frames=frames,
-        rate_hz=config.rate_hz,
-    )
+    amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
+    if place is None:
+        network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
+        traffic = simulate_traffic(
+            _stream(scene_id, Stream.TRAFFIC), network, amounts, frames=frames, rate_hz=config.rate_hz
+        )
+        moments = np.linspace(history, frames - 1, config.keyframes).round().astype(int)
+    else:
+        network, traffic, complete = _drive_on(place, scene_id, config, amounts, history)
+        moments = complete[np.linspace(0, len(complete) - 1, config.keyframes).round().astype(int)]
     global_from_ego = yaw_pose(*traffic.ego.T)
     actors = _in_ego_frames(traffic)
     tracks = track(
@@ -105,22 +129,52 @@ def simulate(scene_id: int, config: WorldConfig = WorldConfig(), history: int = 
     attribute = element_states(network, traffic.signals, np.arange(frames) / config.rate_hz)
     timestamps = np.round(np.arange(frames) * (1e9 / config.rate_hz)).astype(np.int64)
     return Log(
-        name=f"world-{scene_id:09d}",
+        name=f"world-{scene_id:09d}" if place is None else f"{place.road_map.name}-{scene_id:09d}",
         source="procedural",
         map=replace(network.map, elements=show_signals(network, attribute[0])),
         timestamps_ns=timestamps,
         global_from_ego=global_from_ego,
         tracks=tracks,
         actors=actors,
-        keyframes=tuple(
-            KeyFrame(int(timestamps[f]), global_from_ego[f], int(f))
-            for f in np.linspace(history, frames - 1, config.keyframes).round().astype(int)
-        ),
+        keyframes=tuple(KeyFrame(int(timestamps[f]), global_from_ego[f], int(f)) for f in moments),
         element_attribute=attribute,
         weather=float(weather),
         paint_wear=float(paint_wear),
         seed=scene_id,
         markers=place_markers(network.map, scene_id, config.markers),
+    )
+
+
+def _drive_on(
+    place: Place, scene_id: int, config: WorldConfig, amounts: TrafficConfig, history: int
+) -> tuple[RoadNetwork, Traffic, Int[np.ndarray, " k"]]:
+    """Return the roads and the traffic of a scene on a recorded map, and the frames that may become key frames.
+
+    A drive that leaves the complete part of the map too soon is drawn again.
+
+    Raises UserError if no drive stays there long enough.
+    """
+    passes = amounts.ego_passes_s
+    passes = 0.5 * (history / config.rate_hz + config.duration_s) if passes is None else passes
+    amounts = replace(amounts, ego_passes_s=passes)
+    needed = min(config.keyframes * _LEAST_STEP, config.frames - history)
+    for attempt in range(_DRIVES):
+        network = build_map_network(
+            np.random.default_rng([ROOT, scene_id, Stream.ROADS, attempt]),
+            place.road_map,
+            config.roads,
+            sees=place.sees,
+            leads_s=passes + EGO_JOINS,
+        )
+        stream = np.random.default_rng([ROOT, scene_id, Stream.TRAFFIC, attempt])
+        traffic = simulate_traffic(stream, network, amounts, frames=config.frames, rate_hz=config.rate_hz)
+        assert network.drive is not None
+        complete = history + np.flatnonzero(network.drive.covers(traffic.ego[history:, :2]))
+        if len(complete) >= needed:
+            return network, traffic, complete
+    raise UserError(
+        f"{place.road_map.source} {place.road_map.name} is too small a map: in {_DRIVES} drives, no {needed} frames "
+        f"saw {place.sees:.0f} m of it in every direction. Leave it out (data.without), or perceive a smaller range"
     )
 
 

@@ -93,11 +93,11 @@ class PaperTable:
                 config = replace(config, training=replace(config.training, steps=self.steps))
             if row.settings:
                 config = apply_overrides(config, row.settings)
-            found[row.name] = _shortened(config) if quick else config
+            found[row.name] = shortened(config) if quick else config
         return found
 
 
-def _shortened(config: RunConfig, steps: int = 8) -> RunConfig:
+def shortened(config: RunConfig, steps: int = 8) -> RunConfig:
     """Return a smoke test of the configuration: few updates on few data, and one decoder layer, to compile sooner."""
     often = {"eval_every": steps, "checkpoint_every": steps, "log_every": steps // 2}
     training = replace(config.training, steps=steps, **often)

@@ -1,4 +1,4 @@
-"""Arguments of the commands that compare and score: compare, tables, sweep, score, demo, bench."""
+"""Arguments of the commands that compare and score: compare, tables, carry-over, sweep, score, demo, bench."""
 
 from __future__ import annotations
 
@@ -96,6 +96,34 @@ def tables(commands) -> None:
         help="copy the summaries to DIR and write DIR.md anew; the repository keeps docs/results",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/tables"), help="default runs/tables")
+
+
+def carry_over(commands) -> None:
+    """Add `tflane carry-over`."""
+    parser = command(
+        commands,
+        "carry-over",
+        "train on the maps of some recorded logs, test on the recordings of others: each log is left out once",
+        module="carry_over",
+        function="run",
+    )
+    parser.add_argument("maps", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scene files of nuScenes")
+    parser.add_argument("--logs", metavar="LOG", nargs="+", default=[], help="logs to leave out (default: all)")
+    parser.add_argument(
+        "--models",
+        metavar="NAME",
+        nargs="+",
+        default=[],
+        help="of: generated, maps, mixed, 'generated without traffic', 'mixed without traffic' (default: all)",
+    )
+    parser.add_argument("--seeds", metavar="N", type=int, default=1, help="number of seeds (default 1)")
+    parser.add_argument("--steps", metavar="N", type=int, help="updates of each run (default: the configuration's)")
+    parser.add_argument("--scenes", metavar="N", type=int, help="training scenes (default: the configuration's)")
+    parser.add_argument("--jobs", type=int, default=1, help="number of trainings at a time (default 1)")
+    parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("runs/carry_over"), help="default runs/carry_over"
+    )
 
 
 def sweep(commands) -> None:

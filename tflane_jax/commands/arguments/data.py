@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 from tflane_jax.commands.arguments.shared import OVERRIDES, SourceName, command, source_arguments, split_arguments
@@ -31,6 +32,14 @@ def data(commands) -> None:
     stats.add_argument("--config", metavar="FILE[:NAME]", help="config file whose data to count")
     split_arguments(stats, "test")
     stats.add_argument("--count", type=int, default=400, help="examples, spread evenly (default 400)")
+    stats.add_argument(
+        "--beside",
+        metavar="NAME[=PATH]",
+        action="append",
+        default=[],
+        help="lay the distributions of these data beside; PATH is their folder. May be repeated",
+    )
+    stats.add_argument("--out", metavar="STEM", type=Path, help="with --beside: write STEM.md, STEM.json and STEM.png")
     stats.set_defaults(takes_overrides=True)
     check = command(
         inner, "check", "count the content of a dataset's folder and list its faults", module="data", function="check"
@@ -77,6 +86,18 @@ def data(commands) -> None:
         help="also write the road users' tracks and the ego poses, as Argoverse 2 logs",
     )
     export.set_defaults(takes_overrides=True)
+    maps = command(
+        inner,
+        "maps",
+        "draw a frame of each recorded log beside a simulated one on its map",
+        module="data_maps",
+        function="run",
+    )
+    maps.add_argument("root", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scene files of nuScenes")
+    maps.add_argument("--logs", metavar="LOG", nargs="+", default=[], help="names of logs (default: all)")
+    maps.add_argument("--scene", metavar="N", type=int, default=0, help="number of the simulated scene (default 0)")
+    maps.add_argument("--moment", type=_moment, default=0.7, help="of the recorded log, 0 to below 1 (default 0.7)")
+    maps.add_argument("--out", metavar="FILE", type=Path, default=Path("maps.png"), help="picture (default maps.png)")
     overlap = command(
         inner,
         "overlap",
@@ -99,3 +120,13 @@ def data(commands) -> None:
     )
     build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
     build.set_defaults(takes_overrides=True)
+
+
+def _moment(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < 1.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to below 1")
+    return value

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from tflane_jax.scene.logs import VectorMap
+from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads import roadside
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.intersections import crossing_walk
@@ -24,10 +24,31 @@ from tflane_jax.world.roads.layout_roads import plan_road
 from tflane_jax.world.roads.lines import road_lines
 from tflane_jax.world.roads.through_roads import lay_out_road
 
-__all__ = ["RoadConfig", "RoadNetwork", "SceneKind", "build_road_network"]
+__all__ = ["EgoDrive", "RoadConfig", "RoadNetwork", "SceneKind", "build_road_network"]
 
 _SHORTEST_ROUTE = 120.0
 _JUNCTIONS = (SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS, SceneKind.ROUNDABOUT)
+
+
+@dataclass(frozen=True)
+class EgoDrive:
+    """The ego vehicle's drive over a map that is complete around some places only.
+
+    Attributes:
+        aim: where on its route, metres from the start, it should be when examples are made.
+        top_speed: m/s, slow enough to start on the route.
+        places: (n, 2) around which the map is complete, metres.
+        within: an example may be made up to this distance from one of them, metres.
+    """
+
+    aim: float
+    top_speed: float
+    places: Float[np.ndarray, "n 2"]
+    within: float
+
+    def covers(self, xy: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
+        """Return at which positions the map is complete as far as an example sees."""
+        return np.linalg.norm(xy[:, None] - self.places, axis=-1).min(1, initial=np.inf) <= self.within
 
 
 @dataclass(frozen=True)
@@ -44,7 +65,10 @@ class RoadNetwork:
         parking: (P, 3) x, y, yaw of kerb-side slots for parked vehicles.
         ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; its perception
             range (+-51.2 m x +-25.6 m) stays inside the map all along.
-        kind: the central feature.
+        kind: the central feature; None on a recorded map.
+        lanes: what vehicles drive where these are not the map's own segments; every other id is one of theirs.
+        junctions: intersections that share the vehicles which enter the map.
+        drive: where examples may be made, on a recorded map; None on a network that is complete around every route.
     """
 
     map: VectorMap
@@ -55,7 +79,15 @@ class RoadNetwork:
     walk_across: tuple[np.ndarray, ...]
     parking: np.ndarray
     ego_routes: tuple[tuple[int, ...], ...]
-    kind: SceneKind
+    kind: SceneKind | None
+    lanes: dict[int, LaneSegment] | None = None
+    junctions: int = 1
+    drive: EgoDrive | None = None
+
+    @property
+    def traffic_lanes(self) -> dict[int, LaneSegment]:
+        """The lanes that vehicles drive, by id."""
+        return self.map.segments if self.lanes is None else self.lanes
 
 
 def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetwork:

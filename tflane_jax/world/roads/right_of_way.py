@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from tflane_jax.world.roads.curves import wrap
 from tflane_jax.world.roads.lane_network import LaneNetwork
@@ -16,35 +16,48 @@ _CONFLICT = 2.2
 
 
 def conflicts(ids: Sequence[int], movements: Sequence[Movement], network: LaneNetwork) -> Bool[np.ndarray, "c c"]:
+    """Return which pairs of connectors conflict, see `lines_meet`."""
+    lines = [0.5 * (network.drafts[connector].left + network.drafts[connector].right) for connector in ids]
+    return lines_meet(lines, [m.arm for m in movements], [m.source.vehicle for m in movements])
+
+
+def lines_meet(
+    lines: Sequence[Float[np.ndarray, "_ 2"]], arms: Sequence[int], vehicles: Sequence[bool]
+) -> Bool[np.ndarray, "c c"]:
     """Return which pairs of connectors conflict.
 
     Connectors of one arm diverge and do not conflict, except a bicycle's with a vehicle's.
+
+    Args:
+        lines: their centerlines, metres; vertices evenly spaced.
+        arms: from which each comes.
+        vehicles: whether motor vehicles may use each.
     """
-    lines = []
-    for connector in ids:
-        draft = network.drafts[connector]
-        line = 0.5 * (draft.left + draft.right)
-        lines.append(line[np.linspace(0, len(line) - 1, 15).round().astype(int)])
-    points = np.stack(lines).astype(np.float32)
+    vertices = [line[np.linspace(0, len(line) - 1, 15).round().astype(int)] for line in lines]
+    points = np.stack(vertices).astype(np.float32)
     flat = points.reshape(-1, 2)
     square = ((flat[:, None] - flat[None]) ** 2).sum(-1)
-    c = len(ids)
+    c = len(lines)
     near = square.reshape(c, 15, c, 15).min((1, 3)) < _CONFLICT**2
-    arm = np.array([m.arm for m in movements])
-    vehicle = np.array([m.source.vehicle for m in movements])
+    arm, vehicle = np.array(arms), np.array(vehicles)
     return near & ((arm[:, None] != arm[None]) | (vehicle[:, None] != vehicle[None]))
 
 
 def phases(approaches: Sequence[Approach]) -> list[int]:
-    """Return the signal phase of each arm: arms that face each other are green together."""
-    phase = [-1] * len(approaches)
+    """Return the signal phase of each arm, see `phases_of`."""
+    return phases_of([approach.heading for approach in approaches])
+
+
+def phases_of(headings: Sequence[float]) -> list[int]:
+    """Return the signal phase of each arm by its heading: arms that face each other are green together."""
+    phase = [-1] * len(headings)
     following = 0
-    for i, approach in enumerate(approaches):
+    for i, heading in enumerate(headings):
         if phase[i] >= 0:
             continue
         phase[i] = following
-        for j in range(i + 1, len(approaches)):
-            facing = abs(float(wrap(approaches[j].heading - approach.heading + np.pi))) < STRAIGHT
+        for j in range(i + 1, len(headings)):
+            facing = abs(float(wrap(headings[j] - heading + np.pi))) < STRAIGHT
             if phase[j] < 0 and facing:
                 phase[j] = following
                 break

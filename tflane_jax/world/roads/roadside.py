@@ -60,11 +60,21 @@ def buildings(rng: np.random.Generator, site: Site, setback: Range, density: flo
         setback: behind the kerb, metres.
         density: probability that a plot is built on.
     """
-    plots = [_plots(rng, kerb, setback, density) for kerb in site.kerbs]
+    return buildings_along(rng, site.kerbs, [s.forward.line.xy[::2] for s in site.streets], setback, density)
+
+
+def buildings_along(
+    rng: np.random.Generator,
+    kerbs: Sequence[Float[np.ndarray, "_ 2"]],
+    axes: Sequence[Float[np.ndarray, "_ 2"]],
+    setback: Range,
+    density: float,
+) -> Float[np.ndarray, "b 5"]:
+    """Return buildings to the right of kerbs, see `buildings`; none stands on a kerb or on a point of `axes`."""
+    plots = [_plots(rng, kerb, setback, density) for kerb in kerbs]
     boxes = np.concatenate([*plots, np.zeros((0, 5))])
-    road = np.concatenate([points_at(k, np.arange(0.0, arc_length(k)[-1] + 2.0, 2.0)) for k in site.kerbs])
-    axes = np.concatenate([street.forward.line.xy[::2] for street in site.streets])
-    free = ~_contains(boxes, np.concatenate([road, axes]), _BUILDING_CLEARANCE).any(1)
+    road = [points_at(k, np.arange(0.0, arc_length(k)[-1] + 2.0, 2.0)) for k in kerbs]
+    free = ~_contains(boxes, np.concatenate([*road, *axes]), _BUILDING_CLEARANCE).any(1)
     boxes = boxes[free]
     return boxes[_apart(boxes)]
 

@@ -16,7 +16,7 @@ LIGHT, SIGN = 1, 2
 # OpenLane-V2 attributes of traffic elements.
 RED, GREEN, YELLOW, GO_STRAIGHT, TURN_LEFT, TURN_RIGHT = 1, 2, 3, 4, 5, 6
 NO_LEFT_TURN, NO_RIGHT_TURN, NO_U_TURN = 7, 8, 10
-_LIGHT_HEIGHT, _SIGN_HEIGHT = 5.5, 2.5
+LIGHT_HEIGHT, _SIGN_HEIGHT = 5.5, 2.5
 
 
 def traffic_lights(approaches: Sequence[Approach], green: int, beyond: float) -> list[MapElement]:
@@ -33,7 +33,7 @@ def traffic_lights(approaches: Sequence[Approach], green: int, beyond: float) ->
             if lane.vehicle:
                 xy = lane.center + beyond * direction(lane.heading)
                 state = GREEN if phase == green else RED
-                lights.append(_element(xy, _LIGHT_HEIGHT, lane, LIGHT, state, (lane.segment,)))
+                lights.append(_element(xy, LIGHT_HEIGHT, lane, LIGHT, state, (lane.segment,)))
     return lights
 
 
@@ -61,7 +61,7 @@ def signs(approaches: Sequence[Approach], movements: Sequence[Movement], medians
             for lane in lanes:
                 if len(turns[lane.segment]) == 1:
                     attribute = only[next(iter(turns[lane.segment]))]
-                    out.append(_element(lane.center, _LIGHT_HEIGHT, lane, SIGN, attribute, (lane.segment,)))
+                    out.append(_element(lane.center, LIGHT_HEIGHT, lane, SIGN, attribute, (lane.segment,)))
         beside = lanes[-1].right + 1.2 * right_of(lanes[-1].heading)
         governed = tuple(lane.segment for lane in lanes)
         banned = _present(approaches, i) - offered

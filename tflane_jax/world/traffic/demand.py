@@ -82,6 +82,7 @@ def draw_trips(
     vehicles_per_metre: float,
     bicycles_per_metre: float,
     category_share: tuple[tuple[RoadUser, float], ...],
+    junctions: int = 1,
 ) -> Trips:
     """Draw the trips that enter the network between two times.
 
@@ -93,6 +94,7 @@ def draw_trips(
         vehicles_per_metre: target density on a lane in free flow.
         bicycles_per_metre: the same for bicycles on bike lanes; at half the fraction, at the edge of slow outer lanes.
         category_share: motor vehicles by category.
+        junctions: intersections that share the vehicles.
     """
     categories, shares = zip(*category_share, strict=True)
     shares = np.array(shares) / np.sum(shares)
@@ -103,7 +105,7 @@ def draw_trips(
     ways: list[tuple[int, ...]] = [_continue(rng, table, ego_way)]
     outer = _outer_lanes(table)
     lanes = [i for i in range(len(table.ids)) if i not in entered]
-    capacity = _lane_capacity(table, int(table.vehicle[lanes].sum()))
+    capacity = _lane_capacity(table, int(table.vehicle[lanes].sum()), junctions)
     for lane in lanes:
         busy = rng.uniform(0.4, 1.6)
         if table.vehicle[lane]:
@@ -128,12 +130,12 @@ def draw_trips(
     return Trips(_routes(ways, table), drivers, when)
 
 
-def _lane_capacity(table: LaneTable, lanes: int) -> float:
+def _lane_capacity(table: LaneTable, lanes: int, junctions: int) -> float:
     """Return the inflow of each lane into the network, 1/s."""
     if not table.is_gate.any():
         return _LANE_CAPACITY
     junction = _SIGNAL_CAPACITY if (table.intersection >= 0).any() else _JUNCTION_CAPACITY
-    return min(_LANE_CAPACITY, junction / max(lanes, 1))
+    return min(_LANE_CAPACITY, junctions * junction / max(lanes, 1))
 
 
 def _arrivals(rng: np.random.Generator, start: float, stop: float, flow: float) -> Float[np.ndarray, " k"]:

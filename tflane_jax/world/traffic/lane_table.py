@@ -96,7 +96,7 @@ class LaneTable:
 
 def build_lane_table(network: RoadNetwork) -> LaneTable:
     """Flatten a road network."""
-    segments = list(network.map.segments.values())
+    segments = list(network.traffic_lanes.values())
     index = {segment.id: i for i, segment in enumerate(segments)}
     ids = np.array([segment.id for segment in segments], np.int64)
     xy, length, count = _sample([segment.centerline[:, :2] for segment in segments])

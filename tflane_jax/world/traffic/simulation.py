@@ -17,7 +17,7 @@ from tflane_jax.world.traffic.signals import Signals, draw_signals, turn_green
 from tflane_jax.world.traffic.vehicles import Drivers, draw_drivers
 
 # Time step of the warm-up, and how long before its end the ego vehicle joins, seconds.
-_WARM_UP_STEP, _EGO_JOINS = 0.4, 3.2
+_WARM_UP_STEP, EGO_JOINS = 0.4, 3.2
 # Places tried for the ego vehicle.
 _EGO_CHOICES = 6
 # Its mean speed as a fraction of the free speed, and how far from the middle of its route it may aim, metres.
@@ -100,8 +100,8 @@ def simulate_traffic(
     table = build_lane_table(network)
     times = np.arange(frames) / rate_hz
     stop = times[-1] if frames else 0.0
-    steps = max(round((config.warm_up_s - _EGO_JOINS) / _WARM_UP_STEP), 0)
-    start = -(steps * _WARM_UP_STEP + _EGO_JOINS)
+    steps = max(round((config.warm_up_s - EGO_JOINS) / _WARM_UP_STEP), 0)
+    start = -(steps * _WARM_UP_STEP + EGO_JOINS)
 
     index = {int(segment): i for i, segment in enumerate(table.ids)}
     way = tuple(index[i] for i in network.ego_routes[rng.integers(len(network.ego_routes))])
@@ -115,15 +115,17 @@ def simulate_traffic(
         vehicles_per_metre=config.vehicles_per_metre,
         bicycles_per_metre=config.bicycles_per_metre,
         category_share=config.category_share,
+        junctions=network.junctions,
     )
-    trips.drivers.top_speed[0] = config.ego_top_speed
+    drive = network.drive
+    trips.drivers.top_speed[0] = config.ego_top_speed if drive is None else min(config.ego_top_speed, drive.top_speed)
     crossers = draw_crossers(rng, network.walk_across, start=start, stop=stop, per_minute=config.crossers_per_minute)
     places = crossing_places(network.walk_across, table)
     road = Rollout(table, signals, trips, crossers, places, len(network.walk_across))
     road.place_early_trips(start)
     road.drive(start, _WARM_UP_STEP, steps, 1)
-    road.put_ego(_ego_starts(rng, road, stop + _EGO_JOINS, config.ego_passes_s))
-    road.drive(-_EGO_JOINS, _WARM_UP_STEP, round(_EGO_JOINS / _WARM_UP_STEP), 1)
+    road.put_ego(_ego_starts(rng, road, stop + EGO_JOINS, config.ego_passes_s, None if drive is None else drive.aim))
+    road.drive(-EGO_JOINS, _WARM_UP_STEP, round(EGO_JOINS / _WARM_UP_STEP), 1)
 
     substeps = max(1, int(config.step_s * rate_hz + 1e-9))
     position, progress = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
@@ -163,21 +165,28 @@ def _signals_for_ego(rng: np.random.Generator, table: LaneTable, way: tuple[int,
 
 
 def _ego_starts(
-    rng: np.random.Generator, road: Rollout, duration: float, passes_s: float | None
+    rng: np.random.Generator, road: Rollout, duration: float, passes_s: float | None, middle: float | None
 ) -> Float[np.ndarray, " c"]:
-    """Draw candidate start positions on the ego route: early enough to stay on it, and not inside a junction."""
+    """Draw candidate start positions on the ego route: early enough to stay on it, and not inside a junction.
+
+    Args:
+        rng, road: stream and traffic.
+        duration: of the drive, seconds.
+        passes_s: see `TrafficConfig.ego_passes_s`.
+        middle: where it then is on its route, metres; None for half of the route.
+    """
     routes, table = road.trips.routes, road.table
     way = routes.segment[0, np.isfinite(routes.start[0])]
     speed = min(float(np.median(table.speed_at_start[way])), road.trips.drivers.top_speed[0])
     # The continuation of the route to the border of the map must not be driven; 50 m is more than half of it.
     starts = rng.uniform(5.0, max(routes.length[0] - 50.0 - speed * duration, 10.0), _EGO_CHOICES)
     if passes_s is not None:
-        aim = 0.5 * routes.length[0] + rng.uniform(-_EGO_AIM, _EGO_AIM, _EGO_CHOICES)
+        aim = (0.5 * routes.length[0] if middle is None else middle) + rng.uniform(-_EGO_AIM, _EGO_AIM, _EGO_CHOICES)
         rows = np.flatnonzero(road.active)
         on_way = rows[np.isin(routes.take(rows).place(road.position[rows])[0], way)]
         if len(on_way):
             speed = min(speed, float(road.speed[on_way].mean()))
-        starts = np.maximum(aim - _EGO_PACE * speed * (_EGO_JOINS + passes_s), 5.0)
+        starts = np.maximum(aim - _EGO_PACE * speed * (EGO_JOINS + passes_s), 5.0)
     for i, at in enumerate(starts):
         leg = int((routes.start[0] <= at).sum()) - 1
         while leg > 0 and table.is_gate[routes.segment[0, leg]]:

@@ -1,0 +1,148 @@
+"""Leaving each log out once: what is trained and tested, the tables, resuming, and mistakes; on fake examples."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.datasets.test_nuscenes_scenes import content
+from tests.test_cli import CONFIG as TINY
+from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations import carry_over as subject
+from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, ROWS, Settings, carry_over
+from tflane_jax.ablations.declaration import Declaration, check
+from tflane_jax.cli import main
+from tflane_jax.config import RealMapData, load_config
+from tflane_jax.errors import UserError
+
+pytestmark = pytest.mark.usefixtures("cheap")
+
+ON_MAPS = """
+
+from tflane_jax.config import RealMapData
+
+_tiny, _others = get_config, ablations
+
+
+def get_config():
+    return replace(_tiny(), data=RealMapData())
+
+
+def ablations():
+    plain = replace(_others()["baseline"], data=RealMapData(generated=0.5))
+    mixed = replace(_tiny(), data=RealMapData(generated=0.5))
+    return {"generated": replace(_tiny(), data=RealMapData(generated=1.0)), "mixed": mixed, "plain": plain}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with three recorded logs, and the results of two models that left each of two out."""
+    root = tmp_path_factory.mktemp("carry_over")
+    (root / "maps").mkdir()
+    for name in ("scene-1", "scene-2", "scene-3"):
+        np.savez(root / "maps" / f"{name}.npz", **content())
+    tiny = root / "tiny.py"
+    tiny.write_text(TINY + ON_MAPS)
+    rows = {"generated": f"{tiny}:generated", "mixed": f"{tiny}:mixed", "mixed without traffic": f"{tiny}:plain"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subject, "ROWS", rows)
+        carry_over(settings(root), root / "out")
+        yield root
+
+
+def settings(root, **other):
+    return Settings(root / "maps", logs=("scene-1", "scene-3"), steps=4, **other)
+
+
+def test_the_models_see_every_log_but_the_one_that_they_are_tested_on(folder):
+    tested = {}
+    for path in sorted((folder / "out" / "runs").glob("*/config.json")):
+        data = json.loads(path.read_text())["data"]
+        tested.setdefault(data["generated"], []).append(tuple(data["test_logs"]))
+    # Two models on maps, with and without traffic, for each log; one on generated roads for all logs.
+    assert sorted(tested[0.5]) == [("scene-1",), ("scene-1",), ("scene-3",), ("scene-3",)]
+    assert tested[1.0] == [()]
+    train = RealMapData(folder, test_logs=("scene-1",), test_on="recordings").source("train")
+    assert train.without == ("scene-1",)
+
+
+def test_tables_have_every_model_with_own_without_and_with_other_traffic(folder):
+    written = json.loads((folder / "out" / "carry_over.json").read_text())
+    assert [row["model"] for row in written["rows"]] == [
+        "generated",
+        f"generated, {NONE}",
+        f"generated, {OTHER}",
+        "mixed",
+        f"mixed, {NONE}",
+        f"mixed, {OTHER}",
+        "mixed without traffic",
+    ]
+    assert written["meta"]["logs"] == ["scene-1", "scene-3"]
+    each = json.loads((folder / "out" / "logs.json").read_text())["rows"]
+    assert len(each) == 2 * 7
+    percent = [row["all/recall"] for row in each if row["model"] == "mixed"]
+    mean, _, spread = written["rows"][3]["all/recall"].partition(" ± ")
+    assert float(mean) == pytest.approx(np.mean(percent), abs=0.06)
+    assert float(spread) == pytest.approx(np.std(percent, ddof=1), abs=0.06)
+
+
+def test_claims_are_tested_in_pairs_of_logs(folder):
+    each = json.loads((folder / "out" / "logs.json").read_text())["rows"]
+    found = {(row["model"], row["log"]): row["all/recall"] for row in each}
+    tests = json.loads((folder / "out" / "effects.json").read_text())["rows"]
+    assert [test["control"] for test in tests] == [
+        "generated",
+        "mixed without traffic",
+        f"mixed, {NONE}",
+        f"mixed, {OTHER}",
+    ]
+    differences = [found["mixed", log] - found["generated", log] for log in ("scene-1", "scene-3")]
+    assert tests[0]["difference"] == pytest.approx(np.mean(differences))
+    assert tests[0]["logs better"] == f"{sum(d > 0 for d in differences)} of 2"
+    # These models are scored by their parameters alone, so no traffic makes a difference.
+    assert [test["verdict"] for test in tests[2:]] == ["not shown", "not shown"]
+    declared = json.loads((folder / "out" / "declaration.json").read_text())
+    assert declared["primary"] == PRIMARY
+    assert declared["begun"] == 0
+    assert {path.name for path in (folder / "out").glob("*.png")} == {"scene-1.png", "scene-3.png"}
+
+
+def test_the_same_command_trains_nothing_again(folder, monkeypatch, capsys):
+    monkeypatch.setattr("tflane_jax.ablations.workers.train_run", None)
+    before = (folder / "out" / "carry_over.json").read_text()
+    carry_over(settings(folder), folder / "out")
+    assert "5 runs, 5 complete" in capsys.readouterr().out
+    assert (folder / "out" / "carry_over.json").read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"logs": ("scene-9",)}, "has no recorded log scene-9, only scene-1"),
+        ({"rows": ("best",)}, "there is no model best: choose of generated, mixed"),
+        ({"rows": ("mixed",), "seeds": (0, 1)}, "holds another declaration"),
+    ],
+)
+def test_mistakes_are_named_before_anything_is_trained(folder, change, message):
+    with pytest.raises(UserError, match=message):
+        carry_over(Settings(folder / "maps", **{"steps": 4, **change}), folder / "out")
+
+
+def test_a_single_log_cannot_be_left_out(tmp_path, capsys):
+    np.savez(tmp_path / "scene-1.npz", **content())
+    assert main(["carry-over", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "there must be two or more" in capsys.readouterr().err
+    assert main(["carry-over", str(tmp_path), "--seeds", "0"]) == 2
+    assert "--seeds 0: at least one" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_shipped_models_are_measured_by_the_scores_of_the_tables():
+    configs = {row: load_config(reference) for row, reference in ROWS.items()}
+    check(Declaration(PRIMARY, CLAIMS), configs)
+    for config in configs.values():
+        assert isinstance(config.data, RealMapData)
+        assert set(COLUMNS) <= config.task.score_names(config.data, config.evaluation)
+    assert configs["generated"].data.generated == 1.0
+    assert configs["maps"].data.generated == 0.0

@@ -1,0 +1,285 @@
+"""Does a model find lanes on logs whose map it has never seen? Each recorded log is left out of training once.
+
+Every model is trained on the built-in world: on generated roads, on the maps of the other logs, or on both. It is
+tested on the key frames of the log that was left out, with that log's recorded tracks as traffic flow: as they are,
+without them, and with the tracks of another log. Models that see no map are trained once and tested on every log.
+
+<out>/runs/KEY              the runs; the same command resumes what was stopped
+<out>/declaration.json      claims and primary measure, written before the trainings
+<out>/carry_over.md, .json  scores of each model, mean and spread over the logs
+<out>/logs.md, .json        the same for each log
+<out>/effects.md, .json     the claims, by tests paired over the logs
+<out>/LOG.png               test frames of a log: truth and the predictions of two models
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.ablations.compare import draw_models, summary_of
+from tflane_jax.ablations.comparison import Scores, Variant, compact
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
+from tflane_jax.ablations.jobs import Failure, Job
+from tflane_jax.ablations.paper.table import shortened
+from tflane_jax.ablations.scores import measure
+from tflane_jax.ablations.statistics import holm, paired_difference
+from tflane_jax.ablations.store import remaining_seconds, stored_jobs
+from tflane_jax.ablations.workers import noted, train_all, worker_threads
+from tflane_jax.config import RunConfig, load_config
+from tflane_jax.datasets.real_maps import RealMapData
+from tflane_jax.datasets.road_maps import find_maps
+from tflane_jax.errors import UserError
+from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.runs import open_run
+from tflane_jax.tasks import Model
+
+ROWS: Mapping[str, str] = {
+    "generated": "real_maps:generated",
+    "maps": "real_maps",
+    "mixed": "real_maps:mixed",
+    "generated without traffic": "real_maps:generated_no_traffic",
+    "mixed without traffic": "real_maps:mixed_no_traffic",
+}
+"""Models by name: roads that they are trained on, and whether they see traffic flow."""
+NONE, OTHER = "no traffic flow at inference", "traffic of another log"
+PRIMARY = "all/recall"
+COLUMNS = ("all/recall", "all/DET_l", "all/TOP_ll", "occluded/recall")
+CLAIMS = (
+    Claim("mixed", "generated", "maps of other logs help on a log that was never seen"),
+    Claim("mixed", "maps", "generated roads help beside them"),
+    Claim("mixed", "mixed without traffic", "traffic flow helps a model that is trained with it"),
+    Claim("mixed", f"mixed, {NONE}", "this model uses the traffic"),
+    Claim("mixed", f"mixed, {OTHER}", "it uses what the traffic tells of this place"),
+)
+# Training of one model on one core of the machine of docs/benchmarks.md, for estimates.
+_MINUTES = 40.0
+
+ByLog = dict[str, dict[str, Scores]]
+"""Scores by row and log, means over seeds; rows are models, or "model, intervention"."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is left out, trained and tested.
+
+    Attributes:
+        maps: folder of logs.
+        logs: names of those to leave out, one after the other; empty for all.
+        rows: of `ROWS`; empty for all.
+        seeds: of training.
+        steps, scenes: updates and training scenes of each run; None for those of the configurations.
+        jobs: trainings at a time.
+        quick: few updates on few scenes: a smoke test, no result.
+    """
+
+    maps: Path
+    logs: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = (0,)
+    steps: int | None = None
+    scenes: int | None = None
+    jobs: int = 1
+    quick: bool = False
+
+
+@dataclass
+class _Plan:
+    """The trainings: by model, by the log that it leaves out ("" for none), one for each seed."""
+
+    logs: tuple[str, ...]
+    every: tuple[str, ...]
+    jobs: dict[str, dict[str, list[Job]]] = field(default_factory=dict)
+
+    def of(self, row: str, log: str) -> list[Job]:
+        """Return the runs of a model that have not seen a log."""
+        return self.jobs[row].get(log) or self.jobs[row][""]
+
+    def flat(self) -> list[Job]:
+        """Return every run once, log by log, so that an experiment stopped early has whole logs."""
+        order = [job for log in ("", *self.logs) for by_log in self.jobs.values() for job in by_log.get(log, ())]
+        return list({job.folder: job for job in order}.values())
+
+    def other(self, log: str) -> str:
+        """Return the log whose traffic a log gets: the next one by name."""
+        return self.every[(self.every.index(log) + 1) % len(self.every)]
+
+
+def carry_over(settings: Settings, out: Path) -> Path:
+    """Train what is missing, test on every log, and write tables, tests and pictures.
+
+    Returns:
+        The file of the main table.
+
+    Raises:
+        UserError: fewer than two logs, an unknown log or row, another declaration in `out`, or trainings that failed,
+            after the tables of the others were written.
+    """
+    out = out / "quick" if settings.quick else out
+    configs = _configs(settings)
+    claims = tuple(claim for claim in CLAIMS if {claim.treatment, str(claim.control).split(",")[0]} <= set(configs))
+    declaration = Declaration(PRIMARY, claims)
+    check(declaration, configs)
+    plan = _planned(settings, configs, out)
+    by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
+    declared = declare(declaration, by_row, settings.seeds, out)
+    complete = sum(job.is_complete() for job in plan.flat())
+    seconds, guesses = remaining_seconds(by_row, _MINUTES)
+    basis = "a guess" if guesses else "by the runs so far"
+    print(
+        f"{len(plan.flat())} runs, {complete} complete; the others take about {seconds / 3600 / settings.jobs:.1f} h "
+        f"({settings.jobs} at a time; {basis})",
+        flush=True,
+    )
+    failures = train_all(plan.flat(), settings.jobs)
+    found, protocol = _evaluated(plan, failures)
+    if not found:
+        raise UserError(summary_of(failures, len(plan.flat())))
+    path = _save(found, declared, protocol, settings, out)
+    _draw(plan, failures, out)
+    print(f"\nwritten to {out}")
+    if failures:
+        raise UserError(summary_of(failures, len(plan.flat())))
+    return path
+
+
+def _configs(settings: Settings) -> dict[str, RunConfig]:
+    """Return the configuration of each model; its data leave nothing out yet."""
+    if unknown := set(settings.rows) - set(ROWS):
+        raise UserError(f"there is no model {min(unknown)}: choose of {', '.join(ROWS)}")
+    configs = {}
+    for row, reference in ROWS.items():
+        if settings.rows and row not in settings.rows:
+            continue
+        config = load_config(reference)
+        data = replace(_data(config), maps=settings.maps, test_on="recordings")
+        if settings.scenes is not None:
+            data = replace(data, train=settings.scenes)
+        config = replace(config, data=data)
+        if settings.steps is not None:
+            config = replace(config, training=replace(config.training, steps=settings.steps))
+        configs[row] = shortened(config) if settings.quick else config
+    return configs
+
+
+def _data(config: RunConfig) -> RealMapData:
+    assert isinstance(config.data, RealMapData)
+    return config.data
+
+
+def _planned(settings: Settings, configs: Mapping[str, RunConfig], out: Path) -> _Plan:
+    names = tuple(one.name for one in find_maps(settings.maps) if one.recorded)
+    if len(names) < 2:
+        raise UserError(f"{settings.maps} has {len(names)} recorded logs: to leave one out, there must be two or more")
+    if unknown := set(settings.logs) - set(names):
+        raise UserError(f"{settings.maps} has no recorded log {min(unknown)}, only {', '.join(names)}")
+    plan = _Plan(settings.logs or names, names)
+    threads, store = worker_threads(settings.jobs), out / "runs"
+    for row, config in configs.items():
+        data = _data(config)
+        logs = ("",) if data.generated == 1.0 else plan.logs
+        left = {log: replace(config, data=replace(data, test_logs=(log,) if log else ())) for log in logs}
+        labelled = {log: f"{row}, without {log[:12]}" if log else row for log in logs}
+        jobs = stored_jobs({labelled[log]: left[log] for log in logs}, settings.seeds, store, threads=threads)
+        plan.jobs[row] = {log: jobs[labelled[log]] for log in logs}
+    return plan
+
+
+def _tested(config: RunConfig, log: str, traffic: str = "") -> RunConfig:
+    """Return the configuration tested on a log, with the traffic of another one if it is named."""
+    return replace(config, data=replace(_data(config), test_logs=(log,), test_on="recordings", test_traffic=traffic))
+
+
+def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, str]:
+    """Return the scores of all finished runs on the logs that they have not seen, and the protocol."""
+    found: dict[str, dict[str, list[Scores]]] = {}
+    protocol, failed = "", {failure.job.folder for failure in failures}
+    pairs = [(row, log) for row in plan.jobs for log in plan.logs]
+    for row, log in tqdm(pairs, desc="test on recorded logs", unit="log"):
+        for job in plan.of(row, log):
+            if job.folder in failed:
+                continue
+            with noted(job, failures):
+                own = measure(job, _tested(job.config, log), "last")
+                assert own is not None
+                protocol, ways = own.protocol, {row: own.ways[""]}
+                if NONE in own.ways:  # the model reads traffic
+                    swapped = measure(job, _tested(job.config, log, plan.other(log)), "last")
+                    assert swapped is not None
+                    ways |= {f"{row}, {NONE}": own.ways[NONE], f"{row}, {OTHER}": swapped.ways[""]}
+                for name, scores in ways.items():
+                    found.setdefault(name, {}).setdefault(log, []).append(scores)
+    means = {
+        name: {log: {key: float(np.mean([s[key] for s in seeds])) for key in seeds[0]} for log, seeds in by_log.items()}
+        for name, by_log in found.items()
+    }
+    return means, protocol
+
+
+def _save(found: ByLog, declared: Declared, protocol: str, settings: Settings, out: Path) -> Path:
+    """Print and write the tables; only logs that every row was tested on count in means and tests."""
+    logs = [log for log in next(iter(found.values())) if all(log in by_log for by_log in found.values())]
+    if not logs:
+        raise UserError("no log has been tested with every model yet: run the same command again")
+    note = "SMOKE TEST, a few updates on a few scenes: no result. " if settings.quick else ""
+    meta = {"logs": logs, "seeds": list(settings.seeds), "protocol": protocol, "quick": settings.quick}
+    columns = [key for key in COLUMNS if all(key in found[row][log] for row in found for log in logs)]
+    rows = compact([Variant(row, tuple(by_log[log] for log in logs)) for row, by_log in found.items()], columns)
+    title = f"{note}{protocol}; logs that were never seen, percent (mean ± std over {len(logs)} logs)"
+    path, _ = save_table(out / "carry_over", rows, meta, title=title)
+    print("\n" + format_table(rows, title=title))
+    each: list[dict[str, Any]] = [
+        {"log": log, "model": row} | {key: 100.0 * found[row][log][key] for key in columns}
+        for log in logs
+        for row in found
+    ]
+    save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent (mean over {len(settings.seeds)} seeds)")
+    tests = _tests(found, logs, declared)
+    title = f"{note}{declared.sentence()} Paired over {len(logs)} logs, points."
+    save_table(out / "effects", tests, meta, title=title)
+    print("\n" + format_table(tests, title=title))
+    return path
+
+
+def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[str, Any]]:
+    """Return one row for each claim about rows that were measured."""
+    declaration, rows, chances = declared.declaration, [], []
+    for claim in declaration.claims:
+        control = str(claim.control)
+        if claim.treatment not in found or control not in found:
+            continue
+        treated, plain = (
+            np.array([found[row][log][declaration.primary] for log in logs]) for row in (claim.treatment, control)
+        )
+        test = paired_difference(100.0 * treated, 100.0 * plain)
+        chances.append(test.p_value)
+        rows.append(
+            {"claim": claim.text, "treatment": claim.treatment, "control": control, "difference": test.mean}
+            | {"std": test.std, "logs better": f"{test.better} of {test.seeds}", "p": test.p_value}
+        )
+    for row, corrected in zip(rows, holm(chances), strict=True):
+        decided = corrected < declaration.alpha  # False for NaN, a single log
+        verdict = ("shown" if row["difference"] > 0.0 else "contradicted") if decided else "not shown"
+        row |= {"p (Holm)": corrected, "verdict": verdict}
+    return rows
+
+
+def _draw(plan: _Plan, failures: Sequence[Failure], out: Path) -> None:
+    """Draw frames of each log with its truth and the predictions of two models that have not seen it."""
+    failed = {failure.job.folder for failure in failures}
+    for log in plan.logs:
+        models = {}
+        for row in plan.jobs:
+            job = plan.of(row, log)[0]
+            if job.folder not in failed:
+                run = open_run(job.folder, "last")
+                models[row] = Model(run.config.task, run.params[0])
+        if models:
+            pair = [row for row in ("mixed", "generated") if row in models] or list(models)
+            first = _tested(plan.of(next(iter(models)), log)[0].config, log)
+            draw_models(first, models, pair, out / f"{log}.png")

@@ -1,0 +1,49 @@
+"""`tflane data maps`: a recorded frame of each log beside a simulated one on the same map."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+
+from tflane_jax.datasets.base import Dataset, FrameInfo
+from tflane_jax.datasets.real_maps import RealMapConfig, RealMapDataset
+from tflane_jax.datasets.recorded_logs import RecordedConfig, RecordedDataset
+from tflane_jax.datasets.road_maps import chosen_maps
+from tflane_jax.errors import UserError
+from tflane_jax.plots import show_dataset
+from tflane_jax.scene import Example
+
+
+@dataclass
+class _Chosen:
+    """Examples of several datasets, as a dataset."""
+
+    frames: tuple[tuple[Dataset, int], ...]
+    name: str = "maps"
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def example(self, index: int) -> Example:
+        dataset, row = self.frames[index]
+        return dataset.example(row)
+
+    def info(self, index: int) -> FrameInfo:
+        dataset, row = self.frames[index]
+        return dataset.info(row)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Draw the frames of recorded logs and of the world on their maps, a row for each log."""
+    logs = [one.name for one in chosen_maps(options.root, options.logs) if one.recorded]
+    if not logs:
+        raise UserError(f"{options.root} holds maps without recordings: tflane data show --data real-maps draws those")
+    frames: list[tuple[Dataset, int]] = []
+    for log in logs:
+        recorded = RecordedDataset(RecordedConfig(options.root, (log,)))
+        simulated = RealMapDataset(RealMapConfig(options.root, (log,), scenes=1, first=options.scene))
+        frames += [(recorded, int(len(recorded) * options.moment)), (simulated, len(simulated) - 1)]
+    example = RecordedConfig(options.root).example
+    path = show_dataset(_Chosen(tuple(frames)), len(frames), options.out, ground=example.ground, view=example.range)
+    print(f"written to {path}")
+    return 0

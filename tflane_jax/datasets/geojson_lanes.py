@@ -1,0 +1,163 @@
+"""Lanes of a place as GeoJSON (WGS84), so that any map can become a world: one feature for each lane.
+
+| feature | properties |
+|---|---|
+| LineString, centerline in driving direction | `lane`: its id, a number or a text |
+| | `successors`: ids, default: the lanes that start where this one ends |
+| | `width`: metres, default 3.5 |
+| | `left`, `right`: marking, "solid", "dashed" or "none" (default) |
+| | `intersection`, `bicycle`: true or false (default) |
+| LineString or Polygon, edge of the drivable area | `boundary`: true |
+| Polygon of four corners, the first two along the walk | `crossing`: true |
+
+Other features are ignored. A roundabout is several lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.datasets.geojson import Origin, line_coordinates, read_features, to_ego
+from tflane_jax.datasets.lane_outlines import HALF_WIDTH, LaneOutline, boundaries
+from tflane_jax.errors import UserError
+from tflane_jax.scene import LineType
+from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.world.roads.map_roadside import lane_points
+from tflane_jax.world.roads.road_map import RoadMap
+
+# Lanes that end and start nearer to each other than this continue one another, metres.
+_SAME_END = 0.3
+_MARKINGS = {"none": LineType.NONE, "solid": LineType.SOLID, "dashed": LineType.DASHED}
+# A place of an example lies this far inside the hull of all lanes, or as far as the map allows, but at least the
+# second, metres.
+_INSIDE, _LEAST_INSIDE = 60.0, 30.0
+
+
+def read_lanes(path: Path) -> RoadMap:
+    """Read a map; its frame is x east, y north, in metres from the middle of its lanes.
+
+    Raises UserError, which names file and feature, for a file that is no GeoJSON in WGS84, holds no lane, a lane twice,
+    a property of another type, or a map too small to drive on.
+    """
+    path = Path(path)
+    lanes: dict[str, tuple[np.ndarray, Mapping[str, Any], str]] = {}
+    border, crossings = [], []
+    for name, feature in read_features(path):
+        geometry, properties = feature.get("geometry") or {}, feature.get("properties") or {}
+        kind = geometry.get("type") if isinstance(geometry, dict) else None
+        if not isinstance(properties, dict) or kind not in ("LineString", "Polygon"):
+            continue
+        lines = line_coordinates(geometry.get("coordinates"), 2 if kind == "Polygon" else 1, name)
+        if "lane" in properties and kind == "LineString":
+            number = _identity(properties["lane"], name)
+            if number in lanes:
+                raise UserError(f"{name} has the lane id {number} of an earlier feature: give it another one")
+            lanes[number] = lines[0], properties, name
+        elif properties.get("boundary") is True:
+            border += lines
+        elif properties.get("crossing") is True and kind == "Polygon" and len(lines[0]) == 5:
+            crossings.append(lines[0])
+    if not lanes:
+        raise UserError(f"{path} holds no lane: a lane is a LineString with the property `lane`, its id")
+    middle = np.concatenate([line for line, _, _ in lanes.values()]).mean(0)
+    origin = Origin(latitude=float(middle[1]), longitude=float(middle[0]), heading=90.0)
+    segments = _segments({key: (to_ego(line, origin), props, name) for key, (line, props, name) in lanes.items()})
+    places, complete = _places(segments, path)
+    flat = [[np.pad(to_ego(line, origin), ((0, 0), (0, 1))) for line in lines] for lines in (crossings, border)]
+    return RoadMap(path.stem, "geojson", VectorMap(segments, tuple(flat[0]), tuple(flat[1])), places, complete)
+
+
+def _identity(value: Any, name: str) -> str:
+    if isinstance(value, bool) or not isinstance(value, (int, str)):
+        raise UserError(f"{name}: lane is {value!r:.40}, expected an id, a number or a text")
+    return str(value)
+
+
+def _segments(lanes: Mapping[str, tuple[np.ndarray, Mapping[str, Any], str]]) -> dict[int, LaneSegment]:
+    number = {key: i for i, key in enumerate(lanes)}
+    lines = {number[key]: _clean(line, name) for key, (line, _, name) in lanes.items()}
+    starts, ends = (np.stack([line[i] for line in lines.values()]) for i in (0, -1))
+    touching = np.linalg.norm(ends[:, None] - starts, axis=-1) < _SAME_END
+    np.fill_diagonal(touching, False)
+    after: dict[int, tuple[int, ...]] = {}
+    for key, (_, properties, name) in lanes.items():
+        i = number[key]
+        after[i] = tuple(np.flatnonzero(touching[i]).tolist())
+        if "successors" in properties:
+            listed = properties["successors"]
+            if not isinstance(listed, list):
+                raise UserError(f"{name}: successors is {listed!r:.40}, expected a list of lane ids")
+            wanted = [_identity(value, name) for value in listed]
+            if unknown := set(wanted) - set(number):
+                raise UserError(f"{name}: successor {min(unknown)} is no lane of this file")
+            after[i] = tuple(number[value] for value in wanted if value != key)
+    sides = boundaries({i: LaneOutline(line, None) for i, line in lines.items()}, {})
+    segments = {}
+    for key, (_, properties, name) in lanes.items():
+        i = number[key]
+        wider = _width(properties, name) / (2.0 * HALF_WIDTH)
+        left, right = (lines[i] + wider * (side - lines[i]) for side in sides[i])
+        segments[i] = LaneSegment(
+            id=i,
+            centerline=_flat(lines[i]),
+            left=_flat(left),
+            right=_flat(right),
+            left_type=_marking(properties, "left", name),
+            right_type=_marking(properties, "right", name),
+            is_intersection=properties.get("intersection") is True,
+            successors=after[i],
+            vehicle=properties.get("bicycle") is not True,
+        )
+    return segments
+
+
+def _clean(line: Float[np.ndarray, "n 2"], name: str) -> Float[np.ndarray, "m 2"]:
+    """Return a line without points that repeat the one before."""
+    line = line[np.concatenate([[True], np.linalg.norm(np.diff(line, axis=0), axis=-1) > 1e-3])]
+    if len(line) < 2:
+        raise UserError(f"{name} is a lane without length: take it out")
+    return line
+
+
+def _width(properties: Mapping[str, Any], name: str) -> float:
+    width = properties.get("width", 2.0 * HALF_WIDTH)
+    if isinstance(width, bool) or not isinstance(width, (int, float)) or not 1.0 <= width <= 10.0:
+        raise UserError(f"{name}: width is {width!r:.40}, expected metres between 1 and 10")
+    return float(width)
+
+
+def _marking(properties: Mapping[str, Any], side: str, name: str) -> LineType:
+    marking = properties.get(side, "none")
+    if marking not in _MARKINGS:
+        raise UserError(f"{name}: {side} is {marking!r:.40}, expected one of {', '.join(_MARKINGS)}")
+    return _MARKINGS[marking]
+
+
+def _flat(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    return np.pad(line, ((0, 0), (0, 1)))
+
+
+def _places(segments: Mapping[int, LaneSegment], path: Path) -> tuple[Float[np.ndarray, "p 2"], float]:
+    """Return the points of lanes well inside the map, and how far the map reaches around each of them, metres."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = lane_points(s for s in segments.values() if s.vehicle)
+    outline = np.concatenate([line[:, :2] for s in segments.values() for line in (s.left, s.right)])
+    inside = np.zeros(len(points))
+    try:
+        hull = ConvexHull(outline)
+        inside = -(points @ hull.equations[:, :2].T + hull.equations[:, 2]).max(1)
+    except QhullError:  # all in one line
+        pass
+    reach = min(float(inside.max(initial=0.0)), _INSIDE)
+    if reach < _LEAST_INSIDE:
+        raise UserError(
+            f"{path} is too small a map: no lane open to motor vehicles is {_LEAST_INSIDE:.0f} m inside the area of "
+            f"all lanes (the most is {reach:.0f} m). Add the lanes around it"
+        )
+    return points[inside >= 0.9 * reach], reach

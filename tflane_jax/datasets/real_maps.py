@@ -1,0 +1,267 @@
+"""Recorded maps under the built-in world: one log gives any number of different frames.
+
+The ego vehicle and traffic are simulated on the maps of logs; evidence, cameras, markers, SD maps and tracks are those
+of the built-in world. A share of the scenes can have generated roads instead.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.cache import CachedDataset, cached
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.overlap import Drive
+from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
+from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
+from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
+from tflane_jax.errors import UserError
+from tflane_jax.files.images import opencv
+from tflane_jax.scene import Example
+from tflane_jax.scene.logs import Log
+from tflane_jax.world.presets import CITY, REAL_MAPS
+from tflane_jax.world.roads.map_networks import prepare_roads
+from tflane_jax.world.roads.road_map import RoadMap
+from tflane_jax.world.simulate import HISTORY, Place, WorldConfig, simulate
+
+# Stream of a scene's number that decides between maps and generated roads.
+_ROOT = 20_261_122
+
+
+@dataclass(frozen=True)
+class RealMapConfig:
+    """Which maps, which scenes on them, and how they become examples.
+
+    Attributes:
+        maps: folder of logs, see `road_maps.find_maps`, or one log.
+        logs: names of the logs to take; empty takes all.
+        without: names of logs to leave out.
+        split: owns scene numbers as in `ProceduralConfig`.
+        scenes: number of scenes; each gives `world.keyframes` examples.
+        first: number of scenes to skip.
+        generated: fraction of the scenes on generated roads.
+        world: traffic, tracker and key frames of the scenes on maps.
+        generated_world: all of the scenes on generated roads.
+        example: what is in an example, and its capacities.
+        content: hashes of the maps' files, filled in when they are opened: examples of other files are others.
+    """
+
+    maps: Path
+    logs: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    split: Split = "train"
+    scenes: int = 1000
+    first: int = 0
+    generated: float = 0.0
+    world: WorldConfig = REAL_MAPS
+    generated_world: WorldConfig = CITY
+    example: ExampleConfig = field(default_factory=lambda: RECORDED_EXAMPLE)
+    content: tuple[str, ...] = ()
+
+
+class RealMapDataset:
+    """Examples made on request, in order of scene and time.
+
+    Raises UserError where there is no map, a named one is missing, all are left out, scene numbers are outside the
+    split's range, or for cameras without OpenCV, which draws the images.
+    """
+
+    def __init__(self, config: RealMapConfig):
+        if config.scenes < 0 or config.first < 0 or config.first + config.scenes > SCENES_PER_SPLIT:
+            raise UserError(
+                f"{config.split} has scenes 0 to {SCENES_PER_SPLIT - 1}, not {config.first} to "
+                f"{config.first + config.scenes - 1}: change `first` or `scenes`"
+            )
+        if not 0.0 <= config.generated <= 1.0:
+            raise UserError(f"generated is a fraction of the scenes between 0 and 1, not {config.generated}")
+        if config.world.keyframes != config.generated_world.keyframes:
+            raise UserError(
+                f"world has {config.world.keyframes} key frames, generated_world {config.generated_world.keyframes}: "
+                "give both the same number"
+            )
+        if config.example.cameras is not None:
+            opencv()
+        self.maps = tuple(chosen_maps(config.maps, config.logs, config.without))
+        self.config = replace(config, content=tuple(one.content() for one in self.maps))
+        self.name = f"real-maps-{config.split}"
+
+    def __len__(self) -> int:
+        return self.config.scenes * self.config.world.keyframes
+
+    def example(self, index: int) -> Example:
+        """Return one example. The last few scenes stay in memory, so reading a scene's frames in order is fast."""
+        log, keyframe = self._frame(index)
+        return make_example(log, keyframe, self.config.example)
+
+    def info(self, index: int) -> FrameInfo:
+        """Return where one example comes from: the scene is the name of its log with the scene's number."""
+        log, keyframe = self._frame(index)
+        moment = log.keyframes[keyframe]
+        return FrameInfo("real-maps", log.name, moment.timestamp_ns, moment.global_from_ego)
+
+    def drives(self) -> Iterator[Log]:
+        """Yield the simulated logs of all scenes."""
+        for scene in range(self.config.scenes):
+            yield self._frame(scene * self.config.world.keyframes)[0]
+
+    def scene_id(self, index: int) -> int:
+        """Return the world's scene number of one example; raises IndexError outside the dataset."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
+        return FIRST_SCENE[self.config.split] + self.config.first + index // self.config.world.keyframes
+
+    def place(self, scene_id: int) -> MapFile | None:
+        """Return the map of a scene; None for generated roads."""
+        rng = np.random.default_rng([_ROOT, scene_id])
+        share, number = rng.random(), int(rng.integers(len(self.maps)))
+        return None if share < self.config.generated else self.maps[number]
+
+    def _frame(self, index: int) -> tuple[Log, int]:
+        config, scene_id = self.config, self.scene_id(index)
+        place = self.place(scene_id)
+        world = config.generated_world if place is None else config.world
+        history = HISTORY
+        if config.example.history_hz is not None:
+            history = config.example.history * config.example.history_stride(world.rate_hz)
+        return _simulated(scene_id, world, history, place, sees(config.example)), index % world.keyframes
+
+
+def sees(example: ExampleConfig) -> float:
+    """Return the distance up to which an example must be complete, metres: to the farthest corner of its range."""
+    return math.hypot(*(max(abs(low), abs(high)) for low, high in (example.range.x, example.range.y)))
+
+
+@functools.lru_cache(maxsize=64)
+def _read(place: MapFile) -> RoadMap:
+    return place.read()
+
+
+@functools.lru_cache(maxsize=4)
+def _simulated(scene_id: int, world: WorldConfig, history: int, place: MapFile | None, metres: float) -> Log:
+    return simulate(scene_id, world, history, None if place is None else Place(_read(place), metres))
+
+
+@dataclass(frozen=True)
+class RealMapData:
+    """Recorded maps under the built-in world for training, validation and test.
+
+    Logs that neither `val_logs` nor `test_logs` names are training maps. A split without names of its own is simulated
+    on the training maps, from other scene numbers: its scores then say nothing about other places.
+
+    Attributes:
+        maps: folder of logs: Argoverse 2, nuScenes scene files, lanes as GeoJSON.
+        train, val, test: number of scenes of each split.
+        val_logs, test_logs: names of the logs of these splits.
+        without: names of logs that no split takes.
+        test_on: whether the test split is simulated on maps, or is what was recorded: the logs' own key frames and
+            tracks, see `recorded_logs`.
+        test_traffic: name of a log whose recorded tracks replace those of the test split's logs, which is a check of
+            what a model makes of traffic that belongs elsewhere; "" for their own.
+        generated: fraction of the training scenes on generated roads.
+        world: traffic, tracker and key frames of the scenes on maps.
+        generated_world: all of the scenes on generated roads.
+        example: what is in an example, and its capacities.
+    """
+
+    maps: Path = Path("data/maps")
+    train: int = 2000
+    val: int = 25
+    test: int = 100
+    val_logs: tuple[str, ...] = ()
+    test_logs: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    test_on: Literal["maps", "recordings"] = "maps"
+    test_traffic: str = ""
+    generated: float = 0.0
+    world: WorldConfig = REAL_MAPS
+    generated_world: WorldConfig = CITY
+    example: ExampleConfig = RECORDED_EXAMPLE
+
+    def source(self, split: Split) -> RealMapConfig | RecordedConfig:
+        """Return the dataset of a split."""
+        if split == "test" and self.test_on == "recordings":
+            without = () if self.test_logs else self.without
+            return RecordedConfig(self.maps, self.test_logs, without, self.test_traffic, self.example)
+        logs = {"train": (), "val": self.val_logs, "test": self.test_logs}[split]
+        return RealMapConfig(
+            self.maps,
+            logs=logs,
+            without=() if logs else tuple(sorted({*self.val_logs, *self.test_logs, *self.without})),
+            split=split,
+            scenes=getattr(self, split),
+            generated=self.generated if split == "train" else 0.0,
+            world=self.world,
+            generated_world=self.generated_world,
+            example=self.example,
+        )
+
+
+def _drives(config: RealMapConfig) -> list[Drive]:
+    """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated."""
+    found = chosen_maps(config.maps, config.logs, config.without) if config.generated < 1.0 else []
+    maps = [_read(one) for one in found]
+    return [Drive(one.name, one.area or one.source, one.places) for one in maps]
+
+
+# Scenes of --data real-maps where the configuration has other data.
+_SCENES = 100
+
+
+def _choose(choice: Choice) -> RealMapConfig:
+    assert choice.root is not None
+    if isinstance(choice.configured, RealMapConfig):
+        return replace(choice.configured, maps=choice.root)
+    return RealMapConfig(choice.root, split=choice.split, scenes=_SCENES, example=choice.configured.example)
+
+
+def _open(config: RealMapConfig, progress: bool) -> CachedDataset:
+    return cached(RealMapDataset(config), progress=progress)
+
+
+def check_real_maps(root: Path) -> FolderCheck:
+    """Read every map below a folder and count what the world finds on it; raise UserError where there is none."""
+    rows, faults = [], []
+    for one in find_maps(root):
+        row: dict[str, str | int | float] = {"map": one.name, "format": one.kind}
+        try:
+            road_map = one.read()
+            roads = prepare_roads(road_map, REAL_MAPS.roads.sidewalk, sees(RECORDED_EXAMPLE))
+        except UserError as error:
+            faults.append(str(error))
+        else:
+            row |= {
+                "km of lane": sum(roads.length.values()) / 1e3,
+                "intersections": sum(len(junction.minor) > 2 for junction in roads.junctions),
+                "crossings": len(roads.crossings),
+                "parking places": len(roads.parking),
+                "complete m": road_map.complete,
+                "places for examples, m of lane": 3 * len(roads.spots),
+            }
+        rows.append(row)
+    return FolderCheck("recorded maps", rows, faults)
+
+
+SOURCE = DataSource(
+    name="real-maps",
+    data=RealMapData,
+    config=RealMapConfig,
+    example=Example,
+    dataset=RealMapDataset,
+    choose=_choose,
+    title=lambda config: f"real-maps-{config.split}",
+    root="a log, or a folder of logs, whose maps the world drives on",
+    open=_open,
+    # Not from the cache: one example is made sooner than all of them.
+    sample=lambda config: RealMapDataset(config).example(0),
+    build=lambda config, progress: len(_open(config, progress)),
+    drives=_drives,
+    check=check_real_maps,
+)

@@ -1,0 +1,123 @@
+"""Recorded logs of every known format in one folder, as a dataset of lane graphs with their own tracks.
+
+It reads what `road_maps` finds, so that a model that learned on the maps of some logs is tested on the recordings of
+others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.data_source import Choice, DataSource
+from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.overlap import frame_drives
+from tflane_jax.datasets.procedural import CITY_EXAMPLE
+from tflane_jax.datasets.road_maps import chosen_maps
+from tflane_jax.scene import Example
+from tflane_jax.scene.logs import Log
+
+RECORDED_EXAMPLE = replace(CITY_EXAMPLE, lanes=64, segments=128, areas=48, tracks=224, elements=32)
+"""The range and history of the preset `city`, with room for the most that was in a frame of nine logs."""
+
+
+@dataclass(frozen=True)
+class RecordedConfig:
+    """Which logs, and how their key frames become examples.
+
+    Attributes:
+        root: folder of logs, see `road_maps.find_maps`, or one log.
+        logs: their names; empty takes all.
+        without: names of logs to leave out.
+        traffic: name of a log of the folder whose traffic flow replaces that of every log; "" for their own.
+        example: what is in an example, and its capacities.
+    """
+
+    root: Path
+    logs: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    traffic: str = ""
+    example: ExampleConfig = field(default_factory=lambda: RECORDED_EXAMPLE)
+
+
+class RecordedDataset:
+    """Key frames of recorded logs, sorted by log, then time.
+
+    Raises UserError where there is no log, a named one is missing, or one cannot be read.
+    """
+
+    name = "recorded"
+
+    def __init__(self, config: RecordedConfig):
+        self.config = config
+        found = chosen_maps(config.root, config.logs, config.without)
+        self.logs = tuple(one.log() for one in found if one.recorded or config.logs)
+        self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
+        self._giver = chosen_maps(config.root, (config.traffic,))[0].log() if config.traffic else None
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def example(self, index: int) -> Example:
+        """Return one example. Traffic of another log is that of its frame of the same number, from 0 again after it."""
+        log, number = self._frames[index]
+        example = make_example(log, number, self.config.example)
+        if self._giver is None:
+            return example
+        other = make_example(self._giver, number % len(self._giver.keyframes), self.config.example)
+        return replace(example, traffic_flow=other.traffic_flow)
+
+    def info(self, index: int) -> FrameInfo:
+        """Return log, time and pose of one example."""
+        log, number = self._frames[index]
+        moment = log.keyframes[number]
+        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego, log.area)
+
+    def drives(self) -> Iterator[Log]:
+        """Yield the logs."""
+        yield from self.logs
+
+
+@dataclass(frozen=True)
+class RecordedData:
+    """Recorded logs for training, validation and test.
+
+    Attributes:
+        root: folder of logs.
+        val, test: names of the logs of these splits; all others are training logs. A split without names has the
+            training logs.
+        example: what is in an example, and its capacities.
+    """
+
+    root: Path = Path("data/maps")
+    val: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    example: ExampleConfig = RECORDED_EXAMPLE
+
+    def source(self, split: Split) -> RecordedConfig:
+        """Return the dataset of a split."""
+        logs = {"train": (), "val": self.val, "test": self.test}[split]
+        without = () if logs else tuple(sorted({*self.val, *self.test}))
+        return RecordedConfig(self.root, logs, without, example=self.example)
+
+
+def _choose(choice: Choice) -> RecordedConfig:
+    assert choice.root is not None
+    if isinstance(choice.configured, RecordedConfig):
+        return replace(choice.configured, root=choice.root)
+    return RecordedConfig(choice.root, example=replace(choice.configured.example, cameras=None))
+
+
+SOURCE = DataSource(
+    name="recorded",
+    data=RecordedData,
+    config=RecordedConfig,
+    example=Example,
+    dataset=RecordedDataset,
+    choose=_choose,
+    title=lambda config: "-".join(("recorded", *config.logs[:1])),
+    drives=lambda config: frame_drives(RecordedDataset(config)),
+    root="a folder of logs of any known format",
+)

@@ -1,0 +1,43 @@
+"""Distributions of quantities in several datasets, one panel a quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.plots.figure import hide_unused, new_figure, save_figure
+
+_BINS = 24
+# The axis ends at this quantile of all values, so that a few large ones do not squeeze the others.
+_SHOWN = 0.99
+
+
+def save_distributions(path: Path, values: Mapping[str, Mapping[str, Float[np.ndarray, " _"]]]) -> Path:
+    """Write a picture with a histogram of each dataset in each panel, as fractions of the dataset's values.
+
+    Args:
+        path: .png, .pdf or .svg.
+        values: by dataset, by quantity; quantities that a dataset lacks or has no value of are left out.
+    """
+    names = list(dict.fromkeys(name for found in values.values() for name in found))
+    columns = min(4, max(len(names), 1))
+    figure, axes = new_figure(max(-(-len(names) // columns), 1), columns, panel=(3.2, 2.3))
+    for ax, name in zip(axes.flat, names, strict=False):
+        every = np.concatenate([found[name] for found in values.values() if name in found])
+        low, high = float(every.min(initial=0.0)), float(np.quantile(every, _SHOWN)) if len(every) else 1.0
+        whole = bool(np.all(every == np.round(every))) and high - low < 2 * _BINS
+        edges = np.arange(low - 0.5, high + 1.5) if whole else np.linspace(low, max(high, low + 1e-6), _BINS + 1)
+        for number, (dataset, found) in enumerate(values.items()):
+            if len(found.get(name, ())):
+                count, _ = np.histogram(np.clip(found[name], edges[0], edges[-1]), edges)
+                ax.stairs(count / len(found[name]), edges, color=f"C{number}", lw=1.3, label=dataset)
+        ax.set_title(name, fontsize=8, loc="left")
+        ax.tick_params(labelsize=6)
+        ax.grid(alpha=0.3, lw=0.5)
+    if names:
+        axes.flat[0].legend(fontsize=6, frameon=False)
+    hide_unused(axes, len(names))
+    return save_figure(figure, path)

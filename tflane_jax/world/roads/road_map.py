@@ -1,0 +1,95 @@
+"""A recorded map for the built-in world: what a reader must hand over, and its lanes as traffic uses them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.scene.logs import LaneSegment, VectorMap
+
+# Lanes shorter than this carry no traffic, metres.
+_SHORTEST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class RoadMap:
+    """A recorded map and where it is complete.
+
+    Attributes:
+        name: unique among the maps of a folder: the name of the log.
+        source: dataset name.
+        map: global metres; heights are ignored. `road_boundaries` may run in either direction.
+        places: (n, 2) where somebody drove or could drive, metres.
+        complete: distance from each place up to which every lane is in the map, metres.
+        parked: (p, 3) x, y, yaw of places where vehicles were seen parked.
+        area: place, such as a city, in whose coordinates the map is; "" if the source does not tell.
+    """
+
+    name: str
+    source: str
+    map: VectorMap
+    places: Float[np.ndarray, "n 2"]
+    complete: float
+    parked: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
+    area: str = ""
+
+
+def traffic_lanes(segments: dict[int, LaneSegment]) -> dict[int, LaneSegment]:
+    """Return lanes joined over every one-to-one joint at which neither intersection nor kind of vehicle changes.
+
+    A lane has the id of its first segment, and keeps only its centerline: `left` and `right` are the same line. Motor
+    vehicles do not turn into bike lanes. Traffic decides at starts of lanes, so there should be no more than needed.
+    """
+    usable = {i: s for i, s in segments.items() if _length(s.centerline) >= _SHORTEST}
+    onward = {
+        i: tuple(j for j in s.successors if j in usable and (usable[j].vehicle or not s.vehicle))
+        for i, s in usable.items()
+    }
+    entries: dict[int, int] = {}
+    for following in onward.values():
+        for j in following:
+            entries[j] = entries.get(j, 0) + 1
+
+    def same(i: int, j: int) -> bool:
+        a, b = usable[i], usable[j]
+        return a.is_intersection == b.is_intersection and a.vehicle == b.vehicle
+
+    next_of = {i: f[0] for i, f in onward.items() if len(f) == 1 and entries[f[0]] == 1 and same(i, f[0])}
+    followed = set(next_of.values())
+    lanes: dict[int, LaneSegment] = {}
+    walked: set[int] = set()
+    # The heads of chains first; what they do not reach lies on closed loops.
+    for head in sorted(usable, key=lambda i: i in followed):
+        if head in walked:
+            continue
+        chain = [head]
+        while (step := next_of.get(chain[-1])) is not None and step != head:
+            chain.append(step)
+        walked.update(chain)
+        line = _joined([usable[i].centerline[:, :2] for i in chain])
+        first = usable[head]
+        lanes[head] = LaneSegment(
+            id=head,
+            centerline=line,
+            left=line,
+            right=line,
+            left_type=first.left_type,
+            right_type=first.right_type,
+            is_intersection=first.is_intersection,
+            successors=onward[chain[-1]],
+            vehicle=first.vehicle,
+        )
+    return lanes
+
+
+def _joined(lines: list[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "n 3"]:
+    """Return lines in succession on the plane z = 0, without points that repeat the one before."""
+    points = np.concatenate(lines)
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=-1) > 1e-3
+    return np.pad(points[np.concatenate([[True], apart])], ((0, 0), (0, 1)))
+
+
+def _length(line: Float[np.ndarray, "n d"]) -> float:
+    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1).sum())

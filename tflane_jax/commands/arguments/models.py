@@ -86,6 +86,13 @@ def convert(commands) -> None:
         type=Path,
         help="checkpoint, .pth, .pkl or .npz (default: that of the config)",
     )
+    parser.add_argument(
+        "--edge-weight",
+        metavar="FRACTION",
+        type=float,
+        help="LSTR's weights in a GTN encoder: weight of the edge types that make it LSTR's encoder (default 1, "
+        "exactly; 0.98 lets fine-tuning change the selection)",
+    )
     parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="run folder to write")
 
 

@@ -189,10 +189,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         ]
 
 
-def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
-    """Return the lanes of one prediction at the rows of the truth."""
+def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float | None = None) -> RowLanes:
+    """Return the lanes of one prediction at the rows of the truth; `threshold` as of `lane_shapes.detected`."""
     assert truth.rows is not None, "labels have rows"
-    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
+    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH, threshold=threshold)
 
 
 def predict_curves(task: Predictor, params: Params, examples: RoadImage) -> CurvePrediction:

@@ -25,5 +25,6 @@ def run(options: argparse.Namespace) -> int:
     title = f"{weights}: every tensor and what becomes of it"
     print(format_table(table, title=title))
     written = save_table(options.out / "conversion", table, {"weights": str(weights)}, title=title)
-    print(f"\n{len(table)} tensors; run written to {options.out}, table to {written[0]}")
+    count = sum(row["tensor"] != "-" for row in table)
+    print(f"\n{count} tensors; run written to {options.out}, table to {written[0]}")
     return 0

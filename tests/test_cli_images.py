@@ -100,16 +100,37 @@ def test_photos_of_any_size(trained, tmp_path, capsys):
     rng = np.random.default_rng(0)
     for name, size in (("wide", (90, 400)), ("high", (300, 200)), ("dot", (1, 1))):
         cv2.imwrite(str(tmp_path / f"{name}.png"), rng.integers(0, 256, (*size, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((60, 80, 3), np.uint8))
+    video = cv2.VideoWriter(str(tmp_path / "drive.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (160, 90))
+    for _ in range(2):
+        video.write(np.tile(np.linspace(40, 200, 160).astype(np.uint8)[:, None], (90, 1, 3)))
+    video.release()
     out = tmp_path / "out"
-    assert main(["predict", str(trained), str(tmp_path), "--out", str(out)]) == 0
+    command = ["predict", str(trained), str(tmp_path), "--out", str(out)]
+    assert main([*command, "--horizon", "30", "--threshold", "0"]) == 2  # the dot has no row 30
+    assert "the horizon, row 30, is below a photo 1 pixels high" in capsys.readouterr().err
+    assert main([*command, "--threshold", "1.5"]) == 2
+    assert "--threshold 1.5: it must be a score from 0 to 1" in capsys.readouterr().err
+    assert main(command) == 0
+    assert "black.png: the photo is empty" in capsys.readouterr().err
     record = json.loads((out / "predictions.json").read_text())
-    assert [(photo["width"], photo["height"]) for photo in record["photos"]] == [(1, 1), (200, 300), (400, 90)]
+    black, *photos = record["photos"]
+    assert (black["lanes"], record["threshold"]) == ([], 0.5)
+    (clip,) = record["videos"]
+    assert (clip["width"], clip["height"], clip["rate"]) == (160, 90, 10)
+    assert clip["video"] is None or (out / clip["video"]).is_file()
+    assert [(photo["width"], photo["height"]) for photo in photos] == [(1, 1), (200, 300), (400, 90)]
     for photo in record["photos"]:
         assert (out / photo["picture"]).is_file()
         for lane in photo["lanes"]:
             assert 0 <= lane["score"] <= 1
             points = np.array(lane["points"])
             assert ((points >= 0) & (points <= [photo["width"], photo["height"]])).all()
+    assert main(["predict", str(trained), str(tmp_path / "drive.mp4"), "--horizon", "30", "--out", str(out)]) == 0
+    (clip,) = json.loads((out / "predictions.json").read_text())["videos"]
+    assert clip["video"] == "drive-lanes.mp4"
+    assert len(clip["frames"]) == 2
+    assert (out / "drive-lanes.mp4").stat().st_size > 0
     assert main(["predict", str(trained), str(tmp_path / "nothing.jpg"), "--out", str(out)]) == 2
     assert "nothing.jpg" in capsys.readouterr().err
 

@@ -71,7 +71,8 @@ class RunConfig:
         optim: optimizer and schedule.
         training: the training program.
         evaluation: metrics and pictures.
-        weights: file of published PyTorch weights, with which `tflane predict` and `eval` can use the configuration.
+        weights: file of published PyTorch weights, or their name (`convert.weights_files`), with which `tflane predict`
+            and `eval` can use the configuration.
     """
 
     task: LaneGraphTask | LaneShapeTask = LaneGraphTask()

@@ -88,6 +88,38 @@ def test_splits_name_their_files(root):
         dataset_of(root, label_files=("label_data_0531.json", "mine.json"))
 
 
+def moved(root, folder, *names):
+    """Move parts of the folder below another one, as an archive is unpacked."""
+    (root / folder).mkdir()
+    for name in names:
+        (root / name).rename(root / folder / name)
+
+
+def test_the_archives_may_have_folders_of_their_own(root):
+    shutil.copy(root / "label_data_0531.json", root / "test_label.json")
+    plain = {split: dataset_of(root, split=split).example(0) for split in ("train", "val", "test")}
+    shutil.copytree(root / "clips" / "1", root / "test_set" / "clips" / "1")
+    (root / "test_set" / "test_tasks_0627.json").write_text("")
+    moved(root, "train_set", "clips", "label_data_0313.json", "label_data_0531.json")
+    for at_root in (True, False):  # the test labels are a download of their own
+        if not at_root:
+            (root / "test_label.json").rename(root / "test_set" / "test_label.json")
+        for split, expected in plain.items():
+            found = dataset_of(root, split=split)
+            jax.tree.map(np.testing.assert_array_equal, found.example(0), expected)
+            assert len(found) == 2
+    assert len(dataset_of(root, split="all")) == 4
+    (root / "test_set" / "test_label.json").unlink()
+    with pytest.raises(UserError, match=r"test_tasks_0627.json names the test images without their lanes\): download"):
+        dataset_of(root, split="test")
+
+
+def test_lstrs_layout_is_found_from_the_folder_above(root):
+    moved(root, "LaneDetection", "clips", "label_data_0313.json", "label_data_0531.json")
+    assert [len(dataset_of(root, split=split)) for split in ("train", "val", "all")] == [2, 2, 4]
+    assert dataset_of(root).example(3).image.mean() == pytest.approx(120, abs=1)
+
+
 def test_further_label_files_join_the_whole(root):
     (root / "label_data_0313.json").rename(root / "label_data_mine.json")
     found = dataset_of(root)

@@ -71,12 +71,15 @@ DAMAGE = {
     "extra": ([*GUESS, GUESS[0] | {"raw_file": "x.jpg"}], r"1 of 3 frames are predicted, but not .*: x.jpg"),
     "twice": ([*GUESS, GUESS[1]], r"line 4: clips/0313/1/20.jpg is there twice, first in line 2"),
     "no lanes": (change(GUESS[1], lanes=...), r"line 2 \(clips/0313/1/20.jpg\) lacks the entry 'lanes'"),
-    "ragged": (change(GUESS[1], lanes=[[1, 2, 3, 4], [1, 2]]), r"line 2 .*: lanes is of type list, expected numbers"),
+    "ragged": (
+        change(GUESS[1], lanes=[[1, 2, 3, 4], [1, 2]]),
+        r"line 2 .*: lanes\[1\] has 2 numbers, lanes\[0\] has 4",
+    ),
     "rows": (
         change(GUESS[1], lanes=[[1, 2, 3]]),
-        r"frame clips/0313/1/20.jpg: detections: lanes have shape \(1, 3\), expected \(lanes, 4\)",
+        r"pred.json, line 2 \(clips/0313/1/20.jpg\): lanes have shape \(1, 3\), expected \(lanes, 4\)",
     ),
-    "NaN": (change(GUESS[1], lanes=[[1, 2, float("nan"), 4]]), r"line 2 \(.*\): lanes holds nan at \[0, 2\]"),
+    "NaN": (change(GUESS[1], lanes=[[1, 2, float("nan"), 4]]), r"line 2 \(.*\): lanes\[0\] holds nan at \[2\]"),
     "time": (change(GUESS[1], run_time="fast"), r"line 2 \(.*\): run_time is of type str"),
     "no name": (change(GUESS[1], raw_file=...), r"line 2 lacks the entry 'raw_file'"),
     "a list": ([GUESS[0], [1], GUESS[2]], r"line 2 is of type list, expected a mapping"),

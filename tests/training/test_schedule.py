@@ -12,7 +12,7 @@ import pytest
 from tests.golden import case_id, golden_modules, load_module_case
 from tflane_jax.errors import UserError
 from tflane_jax.training.restarts import RestartsConfig
-from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate, make_schedule
+from tflane_jax.training.schedule import DropsConfig, OptimConfig, make_optimizer, make_rate, make_schedule
 from tflane_jax.training.vectors import layout_of, norm, ravel
 
 CASES = pytest.mark.parametrize("path", golden_modules("lr_schedules*"), ids=case_id)
@@ -240,3 +240,25 @@ def test_clipping_is_pytorchs(path):
     (updates,) = updates_of(make_optimizer(config, LONG), grads, grads)
     for name, update in updates.items():
         np.testing.assert_allclose(-update, case.outputs[f"clip.{name}"], rtol=1e-6)
+
+
+def test_a_constant_rate_drops_at_its_steps():
+    config = OptimConfig(lr=2.0, warmup_steps=2, warmup_ratio=0.5, drops=DropsConfig((4, 6), 0.1))
+    rates = [float(make_rate(config, 8)(None, step)) for step in range(8)]
+    np.testing.assert_allclose(rates, [1.0, 1.5, 2.0, 2.0, 0.2, 0.2, 0.02, 0.02], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"drops": DropsConfig(())}, "optim.drops.steps"),
+        ({"drops": DropsConfig((5, 5))}, "optim.drops.steps"),
+        ({"drops": DropsConfig((0, 5))}, "optim.drops.steps"),
+        ({"drops": DropsConfig((5,), 0.0)}, "optim.drops.factor"),
+        ({"drops": DropsConfig(), "restarts": RestartsConfig()}, "optim.restarts exclude each other"),
+        ({"drops": DropsConfig(), "epoch_steps": 3}, "optim.epoch_steps exclude each other"),
+    ],
+)
+def test_drops_that_cannot_be_followed_are_named(settings, message):
+    with pytest.raises(UserError, match=message):
+        make_optimizer(OptimConfig(warmup_steps=0, **settings), 10)

@@ -20,10 +20,11 @@ def run(options: argparse.Namespace) -> int:
     weights = options.weights or config.weights
     if weights is None:
         raise UserError(f"{options.config} names no weights: add --weights FILE")
-    params, table = load_weights(weights, config.task)
+    params, table = load_weights(weights, config.task, "fresh", options.edge_weight)
     save_weights(replace(config, weights=weights), params, options.out)
     title = f"{weights}: every tensor and what becomes of it"
     print(format_table(table, title=title))
     written = save_table(options.out / "conversion", table, {"weights": str(weights)}, title=title)
-    print(f"\n{len(table)} tensors; run written to {options.out}, table to {written[0]}")
+    count = sum(row["tensor"] != "-" for row in table)
+    print(f"\n{count} tensors; run written to {options.out}, table to {written[0]}")
     return 0

@@ -1,26 +1,34 @@
-"""`tflane predict`. For the written files, see `predict_lanes` (lanes around the vehicle) and `predict_images`."""
+"""`tflane predict`. For the written files, see `predict_lanes`, `predict_images` and `predict_photos`."""
 
 from __future__ import annotations
 
 import argparse
 
-from tflane_jax.commands import predict_images, predict_lanes
+from tflane_jax.commands import predict_images, predict_lanes, predict_photos
 from tflane_jax.commands.sources import opened
 from tflane_jax.errors import UserError
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
+# A lane line of LSTR is a query that is more probably a lane than not.
+_OF_LANES, _OF_LANE_LINES = 0.3, 0.5
+
 
 def run(options: argparse.Namespace) -> int:
     """Predict with the first seed, and write all files to --out."""
     configure_jax()
+    if options.threshold is not None and not 0.0 <= options.threshold <= 1.0:
+        raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
     trained, photos = opened(options)
-    if not isinstance(trained.config.task, LaneShapeTask):
+    of_images = isinstance(trained.config.task, LaneShapeTask)
+    if options.threshold is None:
+        options.threshold = _OF_LANE_LINES if of_images else _OF_LANES
+    if not of_images:
         if photos:
             raise UserError(f"{trained.name} does not read photos: leave {photos[0]} out")
         return predict_lanes.predict(trained, options)
     if options.max_instances is not None:
         raise UserError("--max-instances limits traffic flow, and this model takes none")
     if photos:
-        return predict_images.predict_photos(trained, photos, options)
+        return predict_photos.predict(trained, photos, options)
     return predict_images.predict_split(trained, options)

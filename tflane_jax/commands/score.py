@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_writable
 from tflane_jax.plots.tables import format_table, save_table
-from tflane_jax.scoring.protocols import find_protocol
+from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
+from tflane_jax.scoring.scenes import read_scenes, scene_names
 from tflane_jax.scoring.score import Scored, score
 
 
 def run(options: argparse.Namespace) -> int:
     """Score, print the table, and write it as Markdown and JSON."""
     protocol = find_protocol(options.protocol)
-    if options.bootstrap < 0:
-        raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws, 0 for none")
-    if options.by not in (None, "scene", *protocol.groups):
-        raise UserError(f"{options.protocol} cannot be reported by {options.by}")
-    predictions, truth = protocol.read_predictions(options.predictions), protocol.read_truth(options.truth)
-    scored = score(predictions, truth, protocol.metrics, protocol.scene_of)
+    _check(options, protocol)
+    named: Path | None = options.scenes
+    scenes = None if named is None else read_scenes(named)
+    predictions, truth = protocol.read(options.predictions, options.truth)
+    scene_of = protocol.scene_of if named is None or scenes is None else scene_names(scenes, truth, named)
+    files = f"{options.predictions} against {options.truth}"
+    scored = _scored(files, lambda: score(predictions, truth, protocol.metrics, scene_of))
+    remarks = protocol.remarks(predictions, truth)
+    if options.bootstrap and protocol.no_scenes and named is None:
+        remarks.append(f"{protocol.no_scenes}: the intervals are too narrow (name the drives by --scenes FILE)")
+    for remark in remarks:
+        print(f"tflane: {remark}", file=sys.stderr)
     rows = _rows(scored, options.by, options.bootstrap)
     if (grouping := protocol.groups.get(options.by or "")) is not None:
-        grouped = score(predictions, truth, grouping, protocol.scene_of).total()
+        grouped = _scored(files, lambda: score(predictions, truth, grouping, scene_of)).total()
         rows += [{"part": group, **values} for group, values in grouped.items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
@@ -34,10 +45,43 @@ def run(options: argparse.Namespace) -> int:
         "ground_truth": str(options.truth),
         "scenes": len(scored.scenes),
         "bootstrap": options.bootstrap,
+        "remarks": remarks,
     }
     paths = save_table(options.out, rows, meta, columns=shown, title=title, digits=4)
     print(f"\nwritten to {paths[0]} and {paths[1]}")
     return 0
+
+
+def _check(options: argparse.Namespace, protocol: ScoringProtocol) -> None:
+    """Raise UserError for options that cannot be followed, before any file is read."""
+    if options.bootstrap < 0:
+        raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws, 0 for none")
+    if options.by not in (None, "scene", *protocol.groups):
+        raise UserError(f"{options.protocol} cannot be reported by {options.by}")
+    inputs = [path for path in (options.predictions, options.truth, options.scenes) if path is not None]
+    if _same(options.predictions, options.truth):
+        raise UserError(f"{options.predictions} is given as PREDICTIONS and as GROUND_TRUTH: name the other file too")
+    if not options.out.name:
+        raise UserError(f"--out {options.out} names no file: give the beginning of its name, such as score")
+    for suffix in (".md", ".json"):
+        written = options.out.with_name(options.out.name + suffix)
+        if any(_same(written, path) for path in inputs):
+            raise UserError(f"--out {options.out} would write over {written}, which is read: choose another name")
+        check_writable(written)
+
+
+def _same(one: Path, other: Path) -> bool:
+    try:
+        return one.samefile(other)
+    except OSError:
+        return False
+
+
+def _scored(files: str, run_score: Callable[[], Scored]) -> Scored:
+    try:
+        return run_score()
+    except UserError as error:
+        raise UserError(f"{files}: {error}") from None
 
 
 def _rows(scored: Scored, by: str | None, samples: int) -> list[dict[str, Any]]:

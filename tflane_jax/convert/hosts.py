@@ -8,6 +8,7 @@ BEV encoder is part of its head.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,14 @@ import jax
 import jax.numpy as jnp
 
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
+from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fitted
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
 from tflane_jax.convert.maptr import MAPTR_HEAD, MAPTRV2_HEAD
-from tflane_jax.convert.renaming import Converted, Rule, below, check_fits, convert
+from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming
 from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
 from tflane_jax.convert.torch_file import read_state_dict
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
-from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
@@ -78,21 +79,30 @@ def convert_host(state: Mapping[str, AnyArray], model: PublishedHost) -> Convert
     return convert(state, rules, network, frozen=norms)
 
 
-def load_host(path: Path, model: PublishedHost) -> tuple[Params, list[dict[str, str]]]:
+def load_host(path: Path, model: PublishedHost, missing: Missing = "left out") -> tuple[Params, list[dict[str, str]]]:
     """Return a task's parameters from the reference's checkpoint (.pth, .pkl, .npz), and the account of its tensors.
+
+    Args:
+        path: the checkpoint.
+        model: with cameras.
+        missing: what becomes of auxiliary heads that the file does not have.
 
     Raises:
         UserError: the file cannot be read, or its tensors are not exactly those of the model.
     """
     if not isinstance(model.encoder, CameraEncoderConfig):
-        raise UserError("published weights are those of models with cameras: give the model an encoder of cameras")
-    converted = convert_host(read_state_dict(path), model)
-    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), camera_shapes(model.encoder)))
-    # Without auxiliary outputs.
-    kept = {name: expected.get(name, {}) for name in ("params", STATISTICS)}
-    check_fits(converted.variables, kept, path)
-    variables = converted.variables
-    return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
+        raise UserError(
+            f"{path}: published weights are those of models with cameras: give the model an encoder of cameras"
+        )
+    with naming(path):
+        converted = convert_host(read_state_dict(path), model)
+    return fitted(converted, _expected(model), path, missing)
+
+
+@functools.lru_cache(maxsize=2)
+def _expected(model: PublishedHost) -> Expected:
+    assert isinstance(model.encoder, CameraEncoderConfig)
+    return expected_variables(model.build(), (camera_shapes(model.encoder),))
 
 
 def camera_shapes(encoder: CameraEncoderConfig) -> Any:

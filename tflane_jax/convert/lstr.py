@@ -1,10 +1,12 @@
 """The published LSTR weights as parameters of `models.lstr.Lstr`, every tensor accounted for.
 
-Names are those of the published state dict (github.com/liuruijin17/LSTR); `convert.renaming` has the layouts.
+Names are those of the published state dict (github.com/liuruijin17/LSTR); `convert.renaming` has the layouts. Networks
+with a graph encoder take them too (`convert.lstr_graphs`).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +14,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from tflane_jax.convert.renaming import Converted, below, check_fits, convert, renamed_params
+from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fitted
+from tflane_jax.convert.lstr_graphs import GRAPH_LAYER, UNMAPPED, as_graph_state, check_encoder, selections
+from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming, put, renamed_params, size_text
 from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.convert.weights_files import check_digest, find_weights
+from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
-from tflane_jax.layers.batch_norm import STATISTICS
-from tflane_jax.models.lstr import LstrConfig
+from tflane_jax.models.graph_encoders import GtnEncoderConfig
+from tflane_jax.models.lstr import EncoderConfig, LstrConfig, TransformerEncoderConfig
 from tflane_jax.models.parameters import Params
 
 RESNET = (
@@ -39,6 +45,12 @@ _FEED_FORWARD = (
     (r"norm1\.(weight|bias)", r"attended/norm/\1", "norm"),
 )
 _ENCODER_LAYER = (*_ATTENTION, *_FEED_FORWARD, (r"norm2\.(weight|bias)", r"fed/norm/\1", "norm"))
+_FED: tuple[Rule, ...] = (
+    (r"linear1\.(weight|bias)", r"expand/\1", "linear"),
+    (r"linear2\.(weight|bias)", r"contract/\1", "linear"),
+    (r"norm1\.(weight|bias)", r"graph_norm/\1", "norm"),
+    (r"norm2\.(weight|bias)", r"fed_norm/\1", "norm"),
+)
 _DECODER_LAYER = (
     *_ATTENTION,
     *_FEED_FORWARD,
@@ -46,45 +58,83 @@ _DECODER_LAYER = (
     (r"norm3\.(weight|bias)", r"fed/norm/\1", "norm"),
 )
 
-_LSTR = (
+_AROUND_THE_ENCODER: tuple[Rule, ...] = (
     *below("", "backbone", RESNET),
     (r"input_proj\.weight", "input_projection/kernel", "pointwise"),
     (r"input_proj\.bias", "input_projection/bias", "vector"),
     (r"query_embed\.weight", "queries", "vector"),
-    *below(r"transformer\.encoder\.layers\.(\d+)\.", r"encoder/layer_\1", _ENCODER_LAYER),
     *below(r"transformer\.decoder\.layers\.(\d+)\.", r"decoder_\1", _DECODER_LAYER),
     (r"transformer\.decoder\.norm\.(weight|bias)", r"decoder_norm/\1", "norm"),
     (r"class_embed\.(weight|bias)", r"heads/class/\1", "linear"),
     (r"specific_embed\.layers\.(\d+)\.(weight|bias)", r"heads/specific/linear_\1/\2", "linear"),
     (r"shared_embed\.layers\.(\d+)\.(weight|bias)", r"heads/shared/linear_\1/\2", "linear"),
 )
+_ENCODER = r"transformer\.encoder\.layers\.(\d+)\."
 
 
-def convert_lstr(state: Mapping[str, AnyArray]) -> Converted:
+def convert_lstr(
+    state: Mapping[str, AnyArray], encoder: EncoderConfig | None = None, edge_weight: float = 1.0
+) -> Converted:
     """Return the variables of `Lstr` (with `frozen_stem_norm`) and an account of every tensor.
 
     Args:
         state: tensors by PyTorch's names, with or without the prefix `module.`.
+        encoder: that takes the encoder's weights; default the transformer.
+        edge_weight: of the edge types that a GTN encoder selects, see `lstr_graphs.selections`.
 
     Raises:
         UserError: a tensor that LSTR does not have.
     """
-    return convert(state, _LSTR, "LSTR", frozen=r"backbone/bn1/.*")
+    if encoder is None or isinstance(encoder, TransformerEncoderConfig):
+        rules = below(_ENCODER, r"encoder/layer_\1", _ENCODER_LAYER)
+        return convert(state, (*_AROUND_THE_ENCODER, *rules), "LSTR", frozen=r"backbone/bn1/.*")
+    rules = below(_ENCODER, r"encoder/layer_\1", (*GRAPH_LAYER[type(encoder)], *_FED))
+    state, remarks = as_graph_state(state, encoder)
+    converted = convert(state, (*_AROUND_THE_ENCODER, *rules), "LSTR", frozen=r"backbone/bn1/.*")
+    table = [row | {"becomes": row["becomes"] + remarks.get(row["tensor"], "")} for row in converted.table]
+    if isinstance(encoder, GtnEncoderConfig):
+        weights = selections(encoder, edge_weight)
+        for i in range(encoder.layers):
+            put(converted.variables["params"], f"encoder/layer_{i}/graph/selection", weights)
+            becomes = f"encoder/layer_{i}/graph/selection: self, in the last hop similarity, weight {edge_weight:g}"
+            table.append({"tensor": "-", "shape": size_text(weights.shape), "becomes": becomes})
+    return Converted(converted.variables, table)
 
 
-def load_lstr(path: Path, model: LstrConfig) -> tuple[Params, list[dict[str, str]]]:
+def load_lstr(
+    path: Path, model: LstrConfig, missing: Missing = "left out", edge_weight: float = 1.0
+) -> tuple[Params, list[dict[str, str]]]:
     """Return a task's parameters from a published checkpoint (.pth, .pkl, .npz), and the account of its tensors.
 
+    Args:
+        path: the checkpoint, or "lstr" for the published one, see `weights_files`.
+        model: with any encoder.
+        missing: what becomes of parameters that the checkpoint does not have: auxiliary heads, the scores of a HAN.
+        edge_weight: of the edge types that a GTN encoder selects, above 0 and at most 1.
+
     Raises:
-        UserError: the file cannot be read, or its tensors are not exactly those of the model.
+        UserError: the file cannot be read, its tensors are not exactly those of the model, or the encoder has other
+            sizes than LSTR's.
     """
-    state = read_state_dict(path)
-    converted = convert_lstr(state)
-    image = jax.ShapeDtypeStruct((360, 640, 3), jnp.float32), jax.ShapeDtypeStruct((360, 640), jnp.bool_)
-    expected = dict(jax.eval_shape(model.build().init, jax.random.key(0), *image))
-    check_fits(converted.variables, expected, path)
-    variables = converted.variables
-    return variables["params"] | {STATISTICS: variables["batch_stats"]}, converted.table
+    check_encoder(model, edge_weight)
+    path, published = find_weights(path)
+    unmapped = UNMAPPED.get(type(model.encoder), "(?!)")
+    if missing != "fresh" and unmapped != "(?!)":
+        raise UserError(
+            f"{path} is of a transformer, and this encoder has parameters that it lacks: write a run by tflane convert"
+        )
+    with naming(path):
+        state = read_state_dict(path)
+        check_digest(state, path, published)
+        converted = convert_lstr(state, model.encoder, edge_weight)
+    return fitted(converted, _expected(model), path, missing, unmapped)
+
+
+@functools.lru_cache(maxsize=4)
+def _expected(model: LstrConfig) -> Expected:
+    side = 64 * model.shrink  # parameters do not depend on the size of the image
+    image, valid = jax.ShapeDtypeStruct((side, side, 3), jnp.float32), jax.ShapeDtypeStruct((side, side), jnp.bool_)
+    return expected_variables(model.build(), (image, valid))
 
 
 def backbone_variables(state: Mapping[str, AnyArray], *, frozen_stem_norm: bool = False) -> dict[str, Any]:

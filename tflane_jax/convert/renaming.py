@@ -6,14 +6,16 @@ differentiable, so that gradients by our names can be compared with gradients by
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
@@ -46,19 +48,24 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
         frozen: our paths of norms that never learn, whose scales and biases are statistics too.
 
     Raises:
-        UserError: a tensor that no rule knows.
+        UserError: a tensor that no rule knows, that has other axes or types than weights, that holds numbers that no
+            training leaves behind, or that two tensors of the file claim to be.
     """
     table: list[dict[str, str]] = []
     variables: dict[str, Any] = {"params": {}, "batch_stats": {}}
+    origin: dict[str, str] = {}
     for name, tensor in state.items():
         plain, row = name.removeprefix("module."), {"tensor": name, "shape": size_text(tensor.shape)}
-        if why := _left_out(plain):
+        if why := left_out(plain):
             table.append(row | {"becomes": why})
             continue
         leaves = renamed(plain, tensor, rules)
         if leaves is None:
             raise UserError(f"{name} is no tensor of {network}: is this the checkpoint of another network?")
         for path, value in leaves.items():
+            if path in origin:
+                raise UserError(f"{name} and {origin[path]} are the same tensor of {network}: keep one of them")
+            origin[path] = name
             is_statistic = path.endswith(("/mean", "/var")) or re.fullmatch(frozen, path) is not None
             put(variables["batch_stats" if is_statistic else "params"], path, value)
         unused = math.prod(tensor.shape) - sum(math.prod(value.shape) for value in leaves.values())
@@ -67,7 +74,7 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
     return Converted(variables, table)
 
 
-def _left_out(name: str) -> str | None:
+def left_out(name: str) -> str | None:
     """Return why a tensor that checkpoints hold beside their weights is not needed."""
     last = name.rpartition(".")[-1]
     if last in ("num_batches_tracked", "total_ops", "total_params"):
@@ -76,9 +83,18 @@ def _left_out(name: str) -> str | None:
     return "a constant of the loss, not needed" if last == "code_weights" else None
 
 
+@contextlib.contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Put the name of a file before the messages of the block that do not name it."""
+    try:
+        yield
+    except UserError as error:
+        raise error if str(path) in str(error) else UserError(f"{path}: {error}") from None
+
+
 def check_fits(found: Any, expected: Any, path: Path | str) -> None:
     """Raise UserError naming the first leaf that only one of two trees has, or that has another shape."""
-    here, there = _shapes(found), _shapes(expected)
+    here, there = shapes(found), shapes(expected)
     for name in sorted(here.keys() | there.keys()):
         if here.get(name) != there.get(name):
             raise UserError(
@@ -87,7 +103,21 @@ def check_fits(found: Any, expected: Any, path: Path | str) -> None:
             )
 
 
-def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+def without(tree: Any, names: Sequence[str]) -> Any:
+    """Return a nested dictionary without the leaves of these paths, and without dictionaries that they leave empty."""
+
+    def cut(branch: Any, above: str) -> Any:
+        if not isinstance(branch, dict) or not branch:
+            return branch
+        kept = {key: cut(value, f"{above}{key}/") for key, value in branch.items() if f"{above}{key}" not in names}
+        emptied = [key for key, value in kept.items() if isinstance(value, dict) and not value and branch[key]]
+        return {key: value for key, value in kept.items() if key not in emptied}
+
+    return cut(tree, "")
+
+
+def shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each leaf of nested dictionaries, by its path with slashes."""
     return {
         jax.tree_util.keystr(path, simple=True, separator="/"): leaf.shape
         for path, leaf in jax.tree.leaves_with_path(tree)
@@ -123,8 +153,55 @@ def renamed(name: str, tensor: AnyArray, rules: Rules) -> dict[str, Any] | None:
     """Return our leaves, by path, that a tensor becomes; None where no rule knows its name."""
     for pattern, ours, kind in rules:
         if found := re.fullmatch(pattern, name):
-            return _leaves(found.expand(ours), tensor, kind)
+            if kind == "unused":
+                return {}
+            _check_axes(name, tensor.shape, kind)
+            return _leaves(found.expand(ours), _checked(name, tensor), kind)
     return None
+
+
+# Axes of a weight by the kind of layer; biases have one. Embeddings ("vector", "first_row") may have any.
+_AXES = {"conv": 4, "pointwise": 4, "linear": 2, "packed": 2, "pair": 2, "norm": 1}
+
+
+def _check_axes(name: str, shape: tuple[int, ...], kind: str) -> None:
+    """Raise UserError if a tensor has other axes than a layer of this kind."""
+    axes = _AXES.get(kind)
+    if axes is None:
+        return
+    last = name.rpartition(".")[-1]
+    axes = 1 if last.endswith("bias") else axes
+    if len(shape) != axes:
+        raise UserError(f"{name} has shape {size_text(shape)}, expected {axes} ax{'es' if axes > 1 else 'is'}")
+    if kind == "pointwise" and axes == 4 and shape[2:] != (1, 1):
+        raise UserError(f"{name} has shape {size_text(shape)}, expected a kernel of 1 x 1 pixels")
+    if kind == "packed" and shape[0] % 3:
+        raise UserError(f"{name} has shape {size_text(shape)}, expected rows of query, key and value: a multiple of 3")
+    if kind == "pair" and axes == 2 and shape[1] % 2:
+        raise UserError(f"{name} has shape {size_text(shape)}, expected two halves of equal width")
+
+
+def _checked(name: str, tensor: AnyArray) -> AnyArray:
+    """Return a tensor as float32; raises UserError for numbers that cannot be weights. Traced values stay."""
+    if not isinstance(tensor, np.ndarray):
+        return tensor
+    if tensor.dtype.kind != "f":
+        raise UserError(
+            f"{name} holds {tensor.dtype}, expected floating-point numbers: weights that are quantised or of another "
+            "type are not read"
+        )
+    with np.errstate(over="ignore"):
+        tensor = tensor.astype(np.float32, copy=False)
+    if (wrong := ~np.isfinite(tensor)).any():
+        index = [int(i) for i in np.argwhere(wrong)[0]]
+        raise UserError(
+            f"{name} holds {tensor[tuple(index)]} at {index}, {int(wrong.sum())} of {tensor.size} numbers are not "
+            "finite: the training that wrote it had diverged, or the file is damaged"
+        )
+    if name.endswith("running_var") and (negative := tensor < 0.0).any():
+        i = int(negative.argmax())
+        raise UserError(f"{name} holds {tensor.flat[i]:g} at [{i}]: a variance is not negative; the file is damaged")
+    return tensor
 
 
 def _leaves(path: str, tensor: AnyArray, kind: str) -> dict[str, Any]:
@@ -145,8 +222,6 @@ def _leaves(path: str, tensor: AnyArray, kind: str) -> dict[str, Any]:
         if last == "weight":
             return {f"{parent}/{part}/kernel": value.T for part, value in parts.items()}
         return {f"{parent}/{part}/bias": value for part, value in parts.items()}
-    if kind == "unused":
-        return {}
     if kind == "first_row":
         return {path: tensor[:1]}
     if kind == "pair":  # a linear layer on [a | b] as one layer for each, the bias with the first

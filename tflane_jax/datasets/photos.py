@@ -73,8 +73,8 @@ class FittedPhoto(NamedTuple):
     placement: Placement
 
 
-def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = None) -> FittedPhoto:
-    """Return the network's view of a photo of any size.
+def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | Placement | None = None) -> FittedPhoto:
+    """Return the network's view of a photo of any size: what a camera tells, or a part of the photo.
 
     Without a camera the whole photo is stretched to the network's size, as by the reference. A known camera removes
     what TuSimple's camera would not have seen. A horizon cuts rows off the top until it has TuSimple's height; a focal
@@ -92,7 +92,7 @@ def fit_photo(image: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = No
     height, width = image.shape[:2]
     if not height or not width:
         raise UserError(f"a photo of {width} x {height} pixels shows nothing: give another")
-    seen = _seen(height, width, camera or PhotoCamera())
+    seen = camera if isinstance(camera, Placement) else _seen(height, width, camera or PhotoCamera())
     part = image[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
     if seen.width > 2 * WIDTH or seen.height > 2 * HEIGHT:
         cv2 = opencv()

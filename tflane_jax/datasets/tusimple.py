@@ -3,6 +3,9 @@
 A label file has one JSON record a line: `raw_file`, `h_samples` (48 or 56 image rows) and `lanes`, one x per row and
 lane, -2 where the lane has no point. Examples always have the 56 rows of the test set (`datasets.lane_rows`); rows
 that a file does not label are absent. Source: https://github.com/TuSimple/tusimple-benchmark.
+
+The folder may hold label files and `clips` itself, in `LaneDetection` (LSTR's layout), or in `train_set` and
+`test_set`, as the archives are often unpacked.
 """
 
 from __future__ import annotations
@@ -36,6 +39,10 @@ _SPLIT_FILES: dict[LabelSplit, tuple[str, ...]] = {
     "test": ("test_label.json",),
     "all": tuple(sorted(_TRAIN + _VAL)),
 }
+# Folders below the root in which label files and clips may be.
+_FOLDERS = ("", "LaneDetection", "train_set", "test_set")
+# Comes with the test images and names them, without lanes.
+_TASKS = "test_tasks_0627.json"
 
 
 @dataclass(frozen=True)
@@ -43,10 +50,11 @@ class TuSimpleConfig:
     """Which frames, and how they become examples.
 
     Attributes:
-        root: folder with the label files and `clips`.
+        root: folder with the label files and `clips`, or with folders `LaneDetection`, `train_set` or `test_set` that
+            hold them.
         split: "train" (label files 0313, 0601) and "val" (0531) are LSTR's parts of the official training set; "test";
             "all" is the whole training set and any further `label_data_*.json`. Missing files are left out.
-        label_files: file names under `root` to read instead of the split's files; each must exist.
+        label_files: file names in these folders to read instead of the split's files; each must exist.
         height, width: size of an example's image, pixels.
         capacity: lines in an example; of more, those with the fewest points are left out.
     """
@@ -76,17 +84,18 @@ class TuSimpleDataset:
         self.config = config
         self.name = f"tusimple-{'custom' if config.label_files else config.split}"
         self.label_files, self.absent_files = _label_files(root, config)
-        labels: dict[str, RowLanes] = {}
+        labels: dict[str, tuple[RowLanes, Path]] = {}
         for file in self.label_files:
             read = read_truth(file)
             twice = next((name for name in read if name in labels), None)
             if twice is not None:
                 raise UserError(f"{file} labels {twice}, which an earlier label file labels too: leave one of them out")
-            labels |= read
-        self._labels = list(labels.items())
+            folder = _image_folder(root, file, list(read))
+            labels |= {name: (lanes, folder) for name, lanes in read.items()}
+        self._labels = [(name, lanes, folder) for name, (lanes, folder) in labels.items()]
         if not labels:
             raise UserError(f"{', '.join(map(str, self.label_files))}: no labelled frames")
-        missing = [name for name in labels if not (root / name).is_file()]
+        missing = [name for name, _, folder in self._labels if not (folder / name).is_file()]
         if missing:
             shown = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
             raise UserError(
@@ -105,8 +114,8 @@ class TuSimpleDataset:
 
     def example(self, index: int) -> RoadImage:
         """Return one frame; raises UserError where its image cannot be read."""
-        name, truth = self._labels[self._checked(index)]
-        image = read_image(Path(self.config.root) / name)
+        name, truth, folder = self._labels[self._checked(index)]
+        image = read_image(folder / name)
         height, width = image.shape[:2]
         image = resize(image, self.config.height, self.config.width)
         lines = lane_lines(truth, height, width, capacity=self.config.capacity)
@@ -161,18 +170,30 @@ def _label_files(root: Path, config: TuSimpleConfig) -> tuple[tuple[Path, ...], 
     if not root.is_dir():
         raise UserError(f"there is no folder {root}: set `root` to TuSimple's folder of label files and clips")
     names = config.label_files or _SPLIT_FILES[config.split]
-    present = sorted(path.name for path in root.glob("*.json"))
+    present: dict[str, Path] = {}
+    for folder in reversed(_FOLDERS):  # a file in the root itself comes first
+        present |= {path.name: path for path in sorted((root / folder).glob("*.json"))}
     if config.split == "all" and not config.label_files:
         names = tuple(sorted({*names, *(name for name in present if name.startswith("label_data_"))}))
-    found = tuple(root / name for name in names if (root / name).is_file())
-    absent = tuple(name for name in names if not (root / name).is_file())
+    # Names in `label_files` may have folders.
+    paths = {name: present.get(name, root / name) for name in names}
+    found = tuple(path for path in paths.values() if path.is_file())
+    absent = tuple(name for name, path in paths.items() if not path.is_file())
     if not found or (config.label_files and absent):
+        tasks = f"; {_TASKS} names the test images without their lanes" if _TASKS in present else ""
         raise UserError(
             f"{root} lacks the label file{'s' * (len(absent) != 1)} {', '.join(absent)} of "
             f"{'`label_files`' if config.label_files else f'split {config.split}'} (it has "
-            f"{', '.join(present) or 'none'}): download them, or choose another split or `label_files`"
+            f"{', '.join(sorted(present)) or 'none'}{tasks}): download them, or choose another split or `label_files`"
         )
     return found, absent
+
+
+def _image_folder(root: Path, label_file: Path, names: list[str]) -> Path:
+    """Return the folder from which the names of a label file's images start: its own, or another of `_FOLDERS`."""
+    folders = (label_file.parent, *(root / folder for folder in _FOLDERS))
+    some = names[:: max(len(names) // 10, 1)]
+    return max(folders, key=lambda folder: sum((folder / name).is_file() for name in some))
 
 
 @dataclass(frozen=True)
@@ -180,7 +201,7 @@ class TuSimpleData:
     """TuSimple for training, validation and test.
 
     Attributes:
-        root: folder with clips and label files.
+        root: folder with clips and label files, see `TuSimpleConfig`.
         train, val, test: which label files each split reads, see `TuSimpleConfig.split`.
         augmentation: of training images, or None.
     """
@@ -234,6 +255,6 @@ SOURCE = DataSource(
     load=_load,
     choose=_choose,
     title=lambda config: f"tusimple-{config.split}",
-    root="the folder with clips and label files",
+    root="the folder with clips and label files, or with train_set and test_set",
     check=check_tusimple,
 )

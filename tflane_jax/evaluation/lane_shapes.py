@@ -19,8 +19,10 @@ def lane_scores(prediction: CurvePrediction) -> Float[np.ndarray, " q"]:
     return softmax(np.asarray(prediction.logits), -1)[..., 1]
 
 
-def detected(prediction: CurvePrediction) -> Bool[np.ndarray, " q"]:
-    """Return which queries are lanes: those whose lane logit exceeds the background logit."""
+def detected(prediction: CurvePrediction, threshold: float | None = None) -> Bool[np.ndarray, " q"]:
+    """Return which queries are lanes: those with at least this score; by default, where lane exceeds background."""
+    if threshold is not None:
+        return lane_scores(prediction) >= threshold
     logits = np.asarray(prediction.logits)
     return logits[..., 1] > logits[..., 0]
 
@@ -33,15 +35,23 @@ def left_to_right(prediction: CurvePrediction) -> Int[np.ndarray, " l"]:
     return queries[np.argsort(ends, kind="stable")]
 
 
-def row_lanes(prediction: CurvePrediction, rows: Float[np.ndarray, " h"], *, height: float, width: float) -> RowLanes:
+def row_lanes(
+    prediction: CurvePrediction,
+    rows: Float[np.ndarray, " h"],
+    *,
+    height: float,
+    width: float,
+    threshold: float | None = None,
+) -> RowLanes:
     """Return the detected lanes as x at image rows, -2 outside each lane's extent; columns may lie outside the image.
 
     Args:
         prediction: one example, one layer, numpy.
         rows: image rows, pixels.
         height, width: of the image, pixels.
+        threshold: see `detected`.
     """
-    curves = np.asarray(prediction.curves)[detected(prediction)]
+    curves = np.asarray(prediction.curves)[detected(prediction, threshold)]
     fraction = np.asarray(rows, np.float32) / height
     columns = curve_columns(curves[:, 2:], fraction[None]) * width
     inside = (fraction >= curves[:, :1]) & (fraction <= curves[:, 1:2])

@@ -89,6 +89,18 @@ def write_json(path: Path | str, content: Any, *, indent: int | None = 1, allow_
     return write_text(path, json.dumps(content, indent=indent, allow_nan=allow_nan) + "\n")
 
 
+def check_writable(path: Path | str) -> None:
+    """Raise UserError if a file cannot be written there, as far as can be told beforehand; nothing is created."""
+    path = Path(path)
+    if os.path.isdir(path):
+        raise UserError(f"cannot write {path}: it is a folder; choose another path")
+    above = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
+    if not os.path.isdir(above):
+        raise UserError(f"cannot write {path}: {above} is no folder; choose another path")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"cannot write {path}: no right to write in {above}; choose another path")
+
+
 def is_temporary(path: Path | str) -> bool:
     """Return whether the name is one that `replacing` gives, so that a killed process may have left it."""
     return _TEMPORARY.fullmatch(Path(path).name) is not None

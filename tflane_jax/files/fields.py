@@ -6,7 +6,8 @@ Every function returns the value or raises UserError. `where` names the place in
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import reprlib
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,17 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import load_plain_pickle
 
+_FARTHEST = 1e5
+"""Metres from the vehicle, or pixels, that no line of these formats has."""
+
 
 def load_file(path: Path) -> Any:
-    """Return the content of a .json or .pkl file; raises UserError that names the file."""
+    """Return the content of a .json or .pkl file; a JSON object that has an entry twice is refused.
+
+    Raises UserError that names the file.
+    """
     if path.suffix == ".json":
-        return load_json(path)
+        return parse_json(read_text(path), str(path), once=True)
     if path.suffix in (".pkl", ".pickle"):
         return load_plain_pickle(path)
     raise UserError(f"{path}: expected a .json or .pkl file")
@@ -27,14 +34,52 @@ def load_file(path: Path) -> Any:
 
 def load_json(path: Path) -> Any:
     """Return the content of a JSON file; raises UserError that names the file and the line of the mistake."""
+    return parse_json(read_text(path), str(path))
+
+
+def read_text(path: Path, what: str = "JSON file") -> str:
+    """Return the content of a UTF-8 file; raises UserError that names it where it cannot be read or is no text."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise UserError(f"{path} is no JSON file: it is not text") from None
+        raise UserError(f"{path} is no {what}: it is not text") from None
+
+
+def parse_json(text: str, where: str, what: str = "JSON file", *, once: bool = False) -> Any:
+    """Return the value of a JSON text.
+
+    Args:
+        text: the whole file, or one line of it.
+        where: names it in the message.
+        what: it should be.
+        once: refuse objects that have an entry twice, of which Python would keep the last.
+
+    Raises:
+        UserError: names the line and the character of the mistake.
+    """
+    try:
+        return json.loads(text, object_pairs_hook=_once(where) if once else None)
     except json.JSONDecodeError as error:
-        raise UserError(f"{path} is no JSON file: {error.msg} in line {error.lineno}") from None
+        line = f"line {error.lineno}, " if "\n" in text else ""
+        raise UserError(f"{where} is no {what}: {error.msg} in {line}character {error.colno}") from None
+    except RecursionError:
+        raise UserError(f"{where} is no {what} of this kind: its lists are nested too deep") from None
+    except ValueError as error:  # an integer of more than 4300 digits
+        raise UserError(f"{where} is no {what} that can be read: {str(error).partition(';')[0]}") from None
+
+
+def _once(where: str) -> Callable[[list[tuple[str, Any]]], dict[str, Any]]:
+    def record(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        entries = dict(pairs)
+        if len(entries) < len(pairs):
+            names = [name for name, _ in pairs]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise UserError(f"{where}: an object has the entry {twice!r} twice: keep one of them")
+        return entries
+
+    return record
 
 
 def member(record: Any, name: str, where: str) -> Any:
@@ -42,68 +87,146 @@ def member(record: Any, name: str, where: str) -> Any:
     if not isinstance(record, Mapping):
         raise UserError(f"{where} is {_kind(record)}, expected a mapping with the entry {name!r}")
     if name not in record:
-        shown = ", ".join(map(repr, list(record)[:6]))
+        shown = ", ".join(map(reprlib.repr, list(record)[:6]))
         raise UserError(f"{where} lacks the entry {name!r} (it has {shown or 'none'})")
     return record[name]
 
 
 def items(record: Any, name: str, where: str) -> Sequence[Any]:
     """Return an entry that is a list."""
-    value = member(record, name, where)
-    if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, (Sequence, np.ndarray)):
-        raise UserError(f"{where}: {name} is {_kind(value)}, expected a list")
+    return as_list(member(record, name, where), f"{where}: {name}")
+
+
+def as_list(value: Any, where: str) -> Sequence[Any]:
+    """Return a value that is a list, a tuple or an array."""
+    if not (isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim > 0)):
+        raise UserError(f"{where} is {_kind(value)}, expected a list")
     return value  # pyright: ignore[reportReturnType]
 
 
-def numbers(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
-    """Return an array of finite numbers: float32 stays, every other type becomes float64. Text is no number.
+def numbers(value: Any, shape: tuple[int | None, ...], where: str, *, largest: float = np.inf) -> np.ndarray:
+    """Return an array of finite numbers: float32 stays, every other type becomes float64.
 
-    None in `shape` is any size. An empty list fits every shape in which some size is 0 or None.
+    Text, complex numbers, truth values and dates are no numbers.
+
+    Args:
+        value: a number, nested lists or an array.
+        shape: of the array; None is any size. An empty list fits every shape in which some size is 0 or None.
+        where: names the place in the file.
+        largest: absolute value that is allowed.
     """
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind in "SU":  # numpy would read "1.5" as a number
-            raise TypeError("text")
-        array = array if array.dtype == np.float32 else array.astype(np.float64)
-    except (TypeError, ValueError):
-        raise UserError(f"{where} is {_kind(value)}, expected numbers of shape {_shape(shape)}") from None
+    array = _as_array(value, shape, where)
     if array.size == 0 and not all(shape):
         array = array.reshape([size or 0 for size in shape])
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         raise UserError(f"{where} has shape {array.shape}, expected {_shape(shape)}")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise UserError(f"{where} holds {array[index]} at {list(index)}: numbers must be finite")
+        raise UserError(f"{where} holds {array[index]}{_at(index)}: numbers must be finite")
+    if (np.abs(array) > largest).any():
+        index = tuple(int(i) for i in np.argwhere(np.abs(array) > largest)[0])
+        raise UserError(f"{where} holds {array[index]:g}{_at(index)}: beyond {largest:g} in size")
     return array
 
 
+def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
+    expected = f"expected numbers of shape {_shape(shape)}"
+    if value is None:
+        raise UserError(f"{where} is {_kind(value)}, {expected}")
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RecursionError):
+        raise UserError(f"{where} is {_kind(value)}, {_ragged(value) or expected}") from None
+    if array.dtype.kind in "iuf":
+        return array if array.dtype == np.float32 else array.astype(np.float64)
+    if array.dtype.kind == "O" and array.size:  # such as integers of more than 64 bits
+        wrong = [item for item in array.flat if not _is_number(item)]
+        if wrong:
+            raise UserError(f"{where} holds a value {_kind(wrong[0])}, {expected}")
+        try:
+            return array.astype(np.float64)
+        except OverflowError:
+            raise UserError(f"{where} holds an integer of hundreds of digits: no such number is possible") from None
+    if array.size == 0:
+        return array.astype(np.float64)
+    names = {"S": "text", "U": "text", "c": "complex numbers", "b": "truth values"}
+    if array.ndim == 0 or array.dtype.kind not in names:
+        raise UserError(f"{where} is {_kind(value)}, {expected}")
+    raise UserError(f"{where} is {_kind(value)}, {expected}, not {names[array.dtype.kind]}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def _ragged(value: Any) -> str | None:
+    """Return which of a list's rows differs in length from the first, None if that is not its fault."""
+    if not isinstance(value, (list, tuple)):
+        return None
+    sizes = [f"of {len(row)}" if isinstance(row, (list, tuple)) else "no list" for row in value]
+    other = next((i for i, size in enumerate(sizes) if size != sizes[0]), None)
+    if other is None:
+        return None
+    return f"expected numbers, and rows of one length: row 0 is {sizes[0]}, row {other} {sizes[other]}"
+
+
 def line_points(value: Any, where: str) -> np.ndarray:
-    """Return a line's points (n, 3), n >= 1."""
+    """Return a line's points (n, 3), metres in the vehicle's frame, n >= 1."""
     points = numbers(value, (None, 3), where)
     if len(points) == 0:
         raise UserError(f"{where} is empty: a line has at least one point")
+    if (far := np.abs(points) > _FARTHEST).any():
+        index = tuple(int(i) for i in np.argwhere(far)[0])
+        raise UserError(f"{where} holds {points[index]:g}{_at(index)}: expected metres from the vehicle, not a map's")
     return points
 
 
 def scores(values: Sequence[Any], where: str) -> np.ndarray:
     """Return confidences, which must lie between 0 and 1."""
-    array = numbers(values, (len(values),), where)
-    outside = (array < 0.0) | (array > 1.0)
-    if outside.any():
-        i = int(outside.argmax())
-        raise UserError(f"{where}: number {i} is {array[i]:g}, expected 0 to 1 (apply the sigmoid first)")
+    if any(isinstance(value, (bool, np.bool_)) for value in values):
+        raise UserError(f"{where} holds a truth value, expected numbers from 0 to 1")
+    return fractions(values, (len(values),), where)
+
+
+def fractions(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
+    """Return an array of numbers from 0 to 1; truth values count as such."""
+    array = numbers(_as_integers(value), shape, where)
+    if (outside := (array < 0.0) | (array > 1.0)).any():
+        index = tuple(int(i) for i in np.argwhere(outside)[0])
+        number = f"number {index[0]}" if len(index) == 1 else f"entry {list(index)}"
+        raise UserError(f"{where}: {number} is {array[index]:g}, expected 0 to 1 (apply the sigmoid first)")
     return array
+
+
+def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray:
+    """Return an array of truth values, which the file may give as 0 and 1."""
+    array = numbers(_as_integers(value), shape, where)
+    if (other := (array != 0) & (array != 1)).any():
+        index = tuple(int(i) for i in np.argwhere(other)[0])
+        raise UserError(f"{where} holds {array[index]:g}{_at(index)}, expected 0 or 1")
+    return array == 1
+
+
+def _as_integers(value: Any) -> Any:
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RecursionError):
+        return value
+    return array.astype(np.int64) if array.dtype == bool else value
 
 
 def whole_number(value: Any, low: int, high: int, where: str) -> int:
     """Return a whole number from `low` to `high`."""
-    try:
-        number = int(value)
-    except (TypeError, ValueError):
-        number = None
-    if number is None or number != value or not low <= number <= high:
-        raise UserError(f"{where} is {value!r:.40}, expected a whole number from {low} to {high}")
-    return number
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    if not _is_number(value) or not low <= value <= high or value != int(value):
+        shown = "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
+        raise UserError(f"{where} is {shown:.40}, expected a whole number from {low} to {high}")
+    return int(value)
+
+
+def _at(index: tuple[int, ...]) -> str:
+    return f" at {list(index)}" if index else ""
 
 
 def _kind(value: Any) -> str:

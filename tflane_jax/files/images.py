@@ -27,17 +27,19 @@ def opencv() -> ModuleType:
     return cv2
 
 
-def list_photos(paths: Iterable[Path]) -> list[Path]:
+def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXES) -> list[Path]:
     """Return the files among `paths` as they are, and for each folder the photos directly in it, sorted by name.
+
+    Photos are files with one of the suffixes.
 
     Raises UserError for a path that does not exist, a folder without photos, or no paths at all.
     """
     photos = []
     for path in map(Path, paths):
         if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in suffixes and p.is_file())
             if not inside:
-                raise UserError(f"folder {path} holds no photo (looked for {', '.join(PHOTO_SUFFIXES)})")
+                raise UserError(f"folder {path} holds no photo (looked for {', '.join(suffixes)})")
             photos += inside
         elif path.exists():
             photos.append(path)

@@ -6,6 +6,7 @@ docs/reference/data_formats.md, section 2.
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,8 +70,11 @@ def read_labels(record: Any, things: str, field: str, low: int, high: int, where
 
 
 def read_matrix(record: Any, field: str, shape: tuple[int, int], where: str) -> Float[np.ndarray, "n m"]:
-    """Return a topology matrix of the given shape."""
-    return numbers(member(record, field, where), shape, f"{where}: {field}")
+    """Return a topology matrix of the given shape; truth values become 0 and 1."""
+    value = member(record, field, where)
+    if isinstance(value, np.ndarray) and value.dtype == bool:
+        value = value.astype(np.int64)
+    return numbers(value, shape, f"{where}: {field}")
 
 
 def read_elements(record: Any, where: str) -> tuple[Float[np.ndarray, "e 2 2"], Int[np.ndarray, " e"]]:
@@ -90,6 +94,8 @@ def read_areas(record: Any, where: str) -> tuple[list[Float[np.ndarray, "_ 3"]],
 
 def as_identifier(identifier: Any, where: str) -> FrameKey:
     """Return a key of a collected file as a frame; raises UserError if it is none."""
-    if not isinstance(identifier, tuple) or len(identifier) != 3:
-        raise UserError(f"{where}: {identifier!r:.80} is no frame, expected (split, segment, timestamp)")
+    named = isinstance(identifier, tuple) and len(identifier) == 3
+    if not named or not all(isinstance(part, (str, int, np.integer)) for part in identifier):
+        shown = reprlib.repr(identifier)
+        raise UserError(f"{where}: {shown:.80} is no frame, expected (split, segment, timestamp) as texts or numbers")
     return FrameKey(*map(str, identifier))

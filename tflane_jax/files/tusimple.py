@@ -5,7 +5,7 @@ Format: README of github.com/TuSimple/tusimple-benchmark, doc/lane_detection.
 
 from __future__ import annotations
 
-import json
+import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, member, numbers
+from tflane_jax.files.fields import items, member, numbers, parse_json, read_text
 
 NO_POINT = -2.0
 """x of a row in which a lane has no point."""
+_WIDEST = 1e6  # pixels
 
 
 @dataclass(frozen=True)
@@ -28,43 +29,46 @@ class RowLanes:
         x: (L, H) pixels; negative where a lane has no point in a row.
         rows: (H,) the image rows, pixels (`h_samples`); None for predictions, which use those of the truth.
         run_time: duration of the prediction, milliseconds.
+        place: file, line and image, for messages.
     """
 
     x: Float[np.ndarray, "l h"]
     rows: Float[np.ndarray, " h"] | None = None
     run_time: float = 0.0
+    place: str = ""
 
 
 def read_predictions(path: Path) -> dict[str, RowLanes]:
-    """Return the predicted lanes by `raw_file`; raises UserError that names file, line and field."""
-    return {name: _lanes(record, where, timed=True) for name, record, where in _records(path)}
+    """Return the predicted lanes by `raw_file`; raises UserError that names file, line and field.
+
+    Rows that a record repeats from the labels are kept, so that they can be compared.
+    """
+    found = {name: _lanes(record, where, timed=True) for name, record, where in _records(path)}
+    _check_pixels(found, path)
+    return found
 
 
 def read_truth(path: Path) -> dict[str, RowLanes]:
     """Return the labelled lanes by `raw_file`; raises UserError that names file, line and field."""
-    return {name: _lanes(record, where, timed=False) for name, record, where in _records(path)}
+    found = {name: _lanes(record, where, timed=False) for name, record, where in _records(path)}
+    _check_pixels(found, path)
+    return found
 
 
 def _records(path: Path) -> list[tuple[str, Any, str]]:
     """Return image, record and place of every line."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is no file of JSON lines: it is not text") from None
+    text = read_text(path, "file of JSON lines")
+    if text.lstrip().startswith("["):
+        raise UserError(f"{path} is one JSON list: TuSimple's files have one JSON record on each line, and no list")
     records, first = [], {}
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.split("\n"), 1):
         if not line.strip():
             continue
         where = f"{path}, line {number}"
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise UserError(f"{where} is no JSON record: {error.msg} at character {error.pos}") from None
+        record = parse_json(line.strip(), where, "JSON record", once=True)
         name = member(record, "raw_file", where)
-        if not isinstance(name, str):
-            raise UserError(f"{where}: raw_file is of type {type(name).__name__}, expected a path")
+        if not isinstance(name, str) or not name:
+            raise UserError(f"{where}: raw_file is {reprlib.repr(name)}, expected the path of an image")
         if name in first:
             raise UserError(f"{where}: {name} is there twice, first in line {first[name]}")
         first[name] = number
@@ -73,9 +77,37 @@ def _records(path: Path) -> list[tuple[str, Any, str]]:
 
 
 def _lanes(record: Any, where: str, *, timed: bool) -> RowLanes:
-    lanes = items(record, "lanes", where)
+    time = 0.0
     if timed:
         time = float(numbers(member(record, "run_time", where), (), f"{where}: run_time"))
-        return RowLanes(numbers(lanes, (None, None), f"{where}: lanes"), run_time=time)
-    rows = numbers(items(record, "h_samples", where), (None,), f"{where}: h_samples")
-    return RowLanes(numbers(lanes, (None, len(rows)), f"{where}: lanes"), rows)
+        if time < 0.0:
+            raise UserError(f"{where}: run_time is {time:g}, expected milliseconds")
+    rows = _rows(record, where) if not timed or "h_samples" in record else None
+    lanes = [
+        numbers(lane, (None if rows is None else len(rows),), f"{where}: lanes[{i}]", largest=_WIDEST)
+        for i, lane in enumerate(items(record, "lanes", where))
+    ]
+    if other := [i for i, lane in enumerate(lanes) if len(lane) != len(lanes[0])]:
+        sizes = f"{len(lanes[other[0]])} numbers, lanes[0] has {len(lanes[0])}"
+        raise UserError(f"{where}: lanes[{other[0]}] has {sizes}: expected one x for each of h_samples")
+    height = len(lanes[0]) if lanes else 0 if rows is None else len(rows)
+    return RowLanes(np.array(lanes, np.float64).reshape(len(lanes), height), rows, time, where)
+
+
+def _rows(record: Any, where: str) -> Float[np.ndarray, " h"]:
+    at = f"{where}: h_samples"
+    rows = numbers(items(record, "h_samples", where), (None,), at, largest=_WIDEST)
+    if len(rows) and rows[0] < 0:
+        raise UserError(f"{at} holds {rows[0]:g}, expected rows of the image, 0 or more")
+    if (wrong := np.diff(rows) <= 0).any():
+        i = int(wrong.argmax())
+        raise UserError(f"{at} holds {rows[i + 1]:g} after {rows[i]:g}: expected rows from top to bottom, each once")
+    return rows
+
+
+def _check_pixels(lanes: dict[str, RowLanes], path: Path) -> None:
+    """Raise UserError if every x of a file is a fraction of the image's width."""
+    present = [one.x[one.x >= 0.0] for one in lanes.values()]
+    x = np.concatenate([np.zeros(0), *present])
+    if len(x) > 1 and x.max() <= 1.0 and x.max() > 0.0:
+        raise UserError(f"{path}: every x of its lanes lies between 0 and 1: multiply them by the image's width, 1280")

@@ -66,7 +66,11 @@ def score_image(
     if truth.rows is None:
         raise UserError("truth: the rows (h_samples) of the lanes are missing")
     rows = np.asarray(truth.rows, np.float64)
-    true, found = _checked(truth.x, len(rows), "truth"), _checked(detections.x, len(rows), "detections")
+    what = detections.place or "detections"
+    true, found = _checked(truth.x, len(rows), truth.place or "truth"), _checked(detections.x, len(rows), what)
+    if detections.rows is not None and not np.array_equal(detections.rows, rows):
+        own, right = (f"{r[0]:g} to {r[-1]:g}" for r in (detections.rows, rows))
+        raise UserError(f"{what}: h_samples are {own}, those of the truth {right}: predict at the rows of the truth")
     g, p = len(true), len(found)
     if detections.run_time > time_limit or p > g + 2:
         return 0.0, 0.0, 1.0
@@ -109,7 +113,9 @@ def _checked(x: Float[np.ndarray, "l h"], rows: int, what: str) -> Float[np.ndar
     if x.ndim and len(x) == 0:  # no lanes: an empty list does not know its rows
         return np.zeros((0, rows))
     if x.ndim != 2 or x.shape[1] != rows:
-        raise UserError(f"{what}: lanes have shape {x.shape}, expected (lanes, {rows}), one x for each row")
+        raise UserError(
+            f"{what}: lanes have shape {x.shape}, expected (lanes, {rows}), one x for each row of the truth"
+        )
     if not np.isfinite(x).all():
         raise UserError(f"{what}: lane {int((~np.isfinite(x).all(1)).argmax())} has a number that is not finite")
     return x

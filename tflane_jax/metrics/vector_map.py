@@ -168,12 +168,12 @@ class VectorMapMetrics:
 
 
 class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
-    """The metric by Chamfer distance of all lines and of the groups of a partition, see `metrics.groups`.
+    """The metric of all lines and of the groups of a partition, see `metrics.groups`.
 
     Args:
         groups, lane_groups: see `GroupedMetrics`; lines take the place of lanes.
         partition: of the lines; default by occlusion.
-        sampling, dims: see `VectorMapMetrics`.
+        sampling, dims, measure: see `VectorMapMetrics`.
     """
 
     def __init__(
@@ -184,10 +184,13 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
         partition: Partition = BY_OCCLUSION,
         sampling: Sampling = "maptr",
         dims: Dims = 2,
+        measure: Measure = "chamfer",
     ) -> None:
         self.sampling: Sampling = sampling
         self.dims: Dims = dims
-        super().__init__(partial(VectorMapMetrics, sampling, dims=dims), partition, groups, lane_groups=lane_groups)
+        self.measure: Measure = measure
+        make = partial(VectorMapMetrics, sampling, measure, dims)
+        super().__init__(make, partition, groups, lane_groups=lane_groups)
 
     def update(
         self, detections: MapDetections, truth: MapTruth, members: Mapping[str, Bool[np.ndarray, " g"]] | None = None
@@ -196,7 +199,7 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
 
         Raises UserError for arrays that do not fit together, or a visibility that is not known.
         """
-        frame = match_map(detections, truth, self.sampling, dims=self.dims, nearest="all")
+        frame = match_map(detections, truth, self.sampling, self.measure, dims=self.dims, nearest="all")
         self.add(frame, truth, None, members)
 
 
@@ -257,8 +260,8 @@ def match_map(
     Args:
         detections, truth: lines of one frame.
         sampling, measure, dims: see `VectorMapMetrics`.
-        nearest: of detections beyond the largest threshold: "close" leaves it arbitrary, "all" finds it by every
-            `_COARSE`-th vertex.
+        nearest: of detections beyond the largest threshold, or without overlap: "close" leaves it arbitrary, "all"
+            finds it by the Chamfer distance of every `_COARSE`-th vertex.
     """
     true = PaddedLines.of(truth.points, "truth", dims)
     true_classes = _checked_classes(truth.classes, len(true), "truth")
@@ -280,7 +283,8 @@ def match_map(
     least, number = nearest_truth(distance)
     hits = np.stack([greedy_match(least <= limit, number, scores) >= 0 for limit in limits])
     if nearest == "all":
-        number = _nearest_of_all(true, found, same, least, number)
+        far = least >= 1.0 if measure == "iou" else np.isinf(least)
+        number = _nearest_of_all(true, found, same, far, number)
     return MatchedMap(scores, classes, number, least, hits, true_classes)
 
 
@@ -288,18 +292,18 @@ def _nearest_of_all(
     true: PaddedLines,
     found: PaddedLines,
     same: Bool[np.ndarray, "g p"],
-    least: Float[np.ndarray, " p"],
+    far: Bool[np.ndarray, " p"],
     nearest: Int[np.ndarray, " p"],
 ) -> Int[np.ndarray, " p"]:
-    """Return the nearest true line of every detection, also of those beyond the largest threshold."""
-    i, j = np.nonzero(same & np.isinf(least))
+    """Return the nearest true line of every detection, also of the `far` ones, which the measure does not tell."""
+    i, j = np.nonzero(same & far)
     rough_true, rough_found = (
         PaddedLines(points, np.full(len(points), points.shape[1]))
         for points in (lines.points[:, ::_COARSE] for lines in (true, found))
     )
     distance = np.full(same.shape, np.inf)
     distance[i, j] = pair_chamfer(rough_true, rough_found, i, j)
-    return np.where(np.isinf(least), nearest_truth(distance)[1], nearest)
+    return np.where(far, nearest_truth(distance)[1], nearest)
 
 
 def map_distance(true: PaddedLines, found: PaddedLines, same: Bool[np.ndarray, "g p"]) -> Float[np.ndarray, "g p"]:

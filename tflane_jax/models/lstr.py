@@ -7,6 +7,7 @@ query per lane -> class, extent and curve of each lane. Source: docs/reference/l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -73,6 +74,8 @@ class LstrConfig:
             part crosses them, from which b'' and b''' follow, and all outputs are scaled to typical values. None:
             LSTR's parameters, which span five orders of magnitude and take about 500,000 small steps to train. Both
             describe the same curves.
+        init: of the parameters: "flax" has this project's initial values, "lstr" those of LSTR's program
+            (`models.lstr_init`).
     """
 
     backbone: ResNetConfig = ResNetConfig()
@@ -85,6 +88,7 @@ class LstrConfig:
     located: bool = False
     anchors: tuple[float, float] | None = None
     cells: bool = False
+    init: Literal["flax", "lstr"] = "flax"
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:

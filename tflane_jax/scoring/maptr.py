@@ -1,11 +1,13 @@
 """MapTR's files: `nuscmap_results.json` and the ground truth that its evaluation writes (`*_map_anns_val.json`).
 
 Both are lists of {"sample_token", "vectors": [{"pts", "cls_name", "confidence_level" (results only)}]}, under "results"
-and under "GTs"; MapTR's other fields (`pts_num`, `type`) repeat these.
+and under "GTs". Other fields of MapTR (`pts_num`, `type`) repeat these. For groups by occlusion, the truth has one of
+ours, `visibility`, 0 to 1.
 """
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +17,35 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_file, member, numbers, scores
 from tflane_jax.metrics.vector_map import LINE_CLASSES, MapDetections, MapTruth
 
+# Metres from the vehicle: no line of a local map is so far away.
+_FARTHEST = 1e5
+
 
 def read_predictions(path: Path) -> dict[str, MapDetections]:
     """Return the detections by sample token; raises UserError that names file, sample and field."""
     frames = {}
     for token, vectors, where in _samples(path, "results"):
-        levels = [member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)]
         lines = _lines(vectors, where, least=1)
+        levels = [member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)]
         frames[token] = MapDetections(*lines, scores(levels, f"{where}: confidence_level"))
     return frames
 
 
 def read_truth(path: Path) -> dict[str, MapTruth]:
     """Return the annotations by sample token; raises UserError that names file, sample and field."""
-    return {token: MapTruth(*_lines(vectors, where, least=2)) for token, vectors, where in _samples(path, "GTs")}
+    return {
+        token: MapTruth(*_lines(vectors, where, least=2), visibility=_visibility(vectors, where))
+        for token, vectors, where in _samples(path, "GTs")
+    }
 
 
 def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
     """Return token, vectors and place of every sample."""
     samples, seen = [], set()
     for i, record in enumerate(items(load_file(path), field, str(path))):
-        token = str(member(record, "sample_token", f"{path}: {field}[{i}]"))
+        token = member(record, "sample_token", f"{path}: {field}[{i}]")
+        if not isinstance(token, str) or not token:
+            raise UserError(f"{path}: {field}[{i}].sample_token is {reprlib.repr(token)}, expected a text")
         where = f"{path}, sample {token}"
         if token in seen:
             raise UserError(f"{where} is there twice")
@@ -49,12 +59,26 @@ def _lines(vectors: Any, where: str, least: int) -> tuple[list[np.ndarray], np.n
     points, classes = [], []
     for i, vector in enumerate(vectors):
         at = f"{where}: vectors[{i}]"
-        line = numbers(member(vector, "pts", at), (None, None), f"{at}.pts")
+        line = numbers(member(vector, "pts", at), (None, None), f"{at}.pts", largest=_FARTHEST)
         if line.shape[1] not in (2, 3) or len(line) < least:
             raise UserError(f"{at}.pts has shape {line.shape}, expected (n, 2) with n of at least {least}")
+        if "pts_num" in vector and vector["pts_num"] != len(line):
+            told = reprlib.repr(vector["pts_num"])
+            raise UserError(f"{at}.pts_num is {told}, but pts has {len(line)} points: is the line cut off?")
         name = member(vector, "cls_name", at)
-        if name not in LINE_CLASSES:
-            raise UserError(f"{at}.cls_name is {name!r:.40}, expected one of {', '.join(LINE_CLASSES)}")
+        if not isinstance(name, str) or name not in LINE_CLASSES:
+            shown = reprlib.repr(name)
+            raise UserError(f"{at}.cls_name is {shown:.40}, expected one of {', '.join(LINE_CLASSES)}")
         points.append(line[:, :2])
         classes.append(LINE_CLASSES.index(name))
     return points, np.array(classes, np.int64)
+
+
+def _visibility(vectors: Any, where: str) -> np.ndarray | None:
+    """Return the fraction of each line in line of sight; None for official files, which do not tell."""
+    have = ["visibility" in vector for vector in vectors]
+    if have and not any(have):
+        return None
+    if not all(have):
+        raise UserError(f"{where}: vectors[{have.index(False)}] lacks the entry 'visibility', which others have")
+    return scores([vector["visibility"] for vector in vectors], f"{where}: visibility")

@@ -8,6 +8,7 @@ docs/reference/data_formats.md, section 2, and docs/reference/metrics.md, sectio
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, load_file, load_json, member, numbers, scores
+from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
 from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
@@ -29,7 +30,6 @@ from tflane_jax.files.openlane import (
     read_elements,
     read_labels,
     read_lines,
-    read_matrix,
 )
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.frames import ElementDetections, ElementTruth, LaneDetections, LaneTruth
@@ -45,7 +45,8 @@ from tflane_jax.metrics.segment_matching import (
 # Published numbers use every 20th point of a centerline.
 _STRIDE = 20
 # Points of the lines of segments and of areas, equally spaced.
-_LINE_POINTS, _AREA_POINTS = 10, 20
+LINE_POINTS, AREA_POINTS = 10, 20
+CENTERLINE_POINTS = len(range(0, DENSE_POINTS, _STRIDE))
 
 
 def read_predictions(path: Path) -> dict[FrameKey, LaneDetections]:
@@ -86,7 +87,7 @@ def _submission(path: Path, parse: _Parse[T]) -> dict[FrameKey, T]:
 
 
 def _annotations(path: Path, names: FieldNames, parse: _Parse[T], progress: bool) -> dict[FrameKey, T]:
-    if not path.is_dir():
+    if not os.path.isdir(path):
         collected = load_file(path)
         if not isinstance(collected, Mapping):
             raise UserError(f"{path} is of type {type(collected).__name__}, expected a mapping from frames")
@@ -94,14 +95,18 @@ def _annotations(path: Path, names: FieldNames, parse: _Parse[T], progress: bool
     stems = {file: file.stem.removesuffix("-ls") for file in sorted(path.resolve().glob("**/info/*.json"))}
     files = {file: stem for file, stem in stems.items() if file.stem == stem + names.suffix}
     if not files:
+        other = f"; it has {len(stems)} files of the other task" if stems else ""
         raise UserError(
-            f"{path} holds no annotations: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it"
+            f"{path} holds no annotations: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it{other}"
         )
-    frames = {}
+    frames, origin = {}, {}
     for file, stem in tqdm(files.items(), desc=f"read {path.name}", unit="frame", disable=not progress):
         segment = file.parent.parent
-        record = member(load_json(file), "annotation", str(file))
-        frames[FrameKey(segment.parent.name, segment.name, stem)] = parse(record, str(file))
+        key = FrameKey(segment.parent.name, segment.name, stem)
+        if key in origin:
+            raise UserError(f"{path}: frame {key} is there twice: {origin[key]} and {file}")
+        origin[key] = file
+        frames[key] = parse(member(load_file(file), "annotation", str(file)), str(file))
     return frames
 
 
@@ -110,78 +115,121 @@ def _by_frame(records: Mapping[Any, Any], field: str, path: Path, parse: _Parse[
     for identifier, record in records.items():
         key = as_identifier(identifier, str(path))
         where = f"{path}, frame {key}"
+        if key in frames:
+            raise UserError(f"{where} is there twice: once with numbers in its name, once with texts")
         frames[key] = parse(member(record, field, where), where)
     return frames
 
 
 def _truth(record: Any, where: str, names: FieldNames) -> LaneTruth:
     points = read_lines(record, names.lanes, names.line, where)
-    lanes, elements = len(points), items(record, "traffic_element", where)
-    boxes, attributes = read_elements(record, where)
+    boxes, attributes = _elements(record, where)
+    _check_ids(record, (names.lanes, "traffic_element"), where)
+    lane_lane, lane_element = (
+        choices(member(record, field, where), (len(points), count), f"{where}: {field}")
+        for field, count in ((names.lane_lane, len(points)), (names.lane_element, len(boxes)))
+    )
     return LaneTruth(
         points=[line[::_STRIDE] if len(line) == DENSE_POINTS else line for line in points],
-        successor=read_matrix(record, names.lane_lane, (lanes, lanes), where) > 0.5,
+        successor=lane_lane,
         visibility=_visibility(record, names.lanes, where),
-        elements=ElementTruth(
-            boxes, attributes, read_matrix(record, names.lane_element, (lanes, len(elements)), where) > 0.5
-        ),
+        elements=ElementTruth(boxes, attributes, lane_element),
     )
 
 
 def _detections(record: Any, where: str, names: FieldNames) -> LaneDetections:
     points = read_lines(record, names.lanes, names.line, where)
-    lanes, elements = len(points), items(record, "traffic_element", where)
-    boxes, attributes = read_elements(record, where)
+    boxes, attributes = _elements(record, where)
+    _check_ids(record, (names.lanes, "traffic_element"), where)
+    lane_lane, lane_element = (
+        fractions(member(record, field, where), (len(points), count), f"{where}: {field}")
+        for field, count in ((names.lane_lane, len(points)), (names.lane_element, len(boxes)))
+    )
     return LaneDetections(
         points=points,
         scores=_confidences(record, names.lanes, where),
-        successor=read_matrix(record, names.lane_lane, (lanes, lanes), where),
-        elements=ElementDetections(
-            boxes,
-            attributes,
-            _confidences(record, "traffic_element", where),
-            read_matrix(record, names.lane_element, (lanes, len(elements)), where),
-        ),
+        successor=lane_lane,
+        elements=ElementDetections(boxes, attributes, _confidences(record, "traffic_element", where), lane_element),
     )
 
 
 def _segment_truth(record: Any, where: str, flavour: Flavour) -> SegmentTruth:
     lanes = _truth(record, where, SEGMENT)
     points, categories = read_areas(record, where)
+    _check_ids(record, ("area",), where)
     if flavour == "LaneSegNet":
         points = [
             _long_sides(line) if c == CROSSING and len(line) == 5 else line
             for line, c in zip(points, categories, strict=True)
         ]
     center, left, right = (
-        [_with_points(line, _LINE_POINTS) for line in lines]
+        [_with_points(line, LINE_POINTS) for line in lines]
         for lines in (lanes.points, *(read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES))
     )
-    areas = AreaTruth([_with_points(line, _AREA_POINTS) for line in points], categories)
+    areas = AreaTruth([_with_points(line, AREA_POINTS) for line in points], categories)
     return SegmentTruth(replace(lanes, points=center), left, right, areas, *_types(record, where))
 
 
 def _segment_detections(record: Any, where: str) -> SegmentDetections:
     left, right = (read_lines(record, SEGMENT.lanes, f"{side}_laneline", where) for side in _SIDES)
     areas = AreaDetections(*read_areas(record, where), _confidences(record, "area", where))
+    _check_ids(record, ("area",), where)
     return SegmentDetections(_detections(record, where, SEGMENT), left, right, areas, *_types(record, where))
 
 
 def _types(record: Any, where: str) -> list[np.ndarray | None]:
-    """Return the types of the left and of the right lines; None where some segment has none."""
-    lanes = items(record, SEGMENT.lanes, where)
+    """Return the types of the left and of the right lines; None if the file does not tell."""
     return [
-        read_labels(record, SEGMENT.lanes, field, 0, 2, where) if all(field in lane for lane in lanes) else None
+        read_labels(record, SEGMENT.lanes, field, 0, 2, where)
+        if _all_have(field, record, SEGMENT.lanes, where)
+        else None
         for field in (f"{side}_laneline_type" for side in _SIDES)
     ]
 
 
 def _visibility(record: Any, things: str, where: str) -> np.ndarray | None:
     """Return the fraction of each lane in line of sight; None for official files, which do not tell."""
-    lanes = items(record, things, where)
-    if not all("visibility" in lane for lane in lanes):
+    if not _all_have("visibility", record, things, where):
         return None
-    return numbers([lane["visibility"] for lane in lanes], (len(lanes),), f"{where}: {things}: visibility")
+    return scores([lane["visibility"] for lane in items(record, things, where)], f"{where}: {things}: visibility")
+
+
+def _all_have(field: str, record: Any, things: str, where: str) -> bool:
+    """Return whether the lanes have an optional entry; raises UserError if only some have."""
+    have = [field in lane for lane in items(record, things, where)]
+    if any(have) and not all(have):
+        raise UserError(f"{where}: {things}[{have.index(False)}] lacks the entry {field!r}, which others have")
+    return all(have)
+
+
+def _elements(record: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return boxes and attributes of the traffic elements, with ordered corners."""
+    boxes, attributes = read_elements(record, where)
+    swapped = (boxes[:, 0] > boxes[:, 1]).any(-1)
+    if swapped.any():
+        i = int(swapped.argmax())
+        raise UserError(
+            f"{where}: traffic_element[{i}].points is {boxes[i].tolist()}: expected the top-left corner, then the "
+            "bottom-right one (width and height in place of the second?)"
+        )
+    return boxes, attributes
+
+
+def _check_ids(record: Any, groups: tuple[str, ...], where: str) -> None:
+    """Raise UserError if two things of one list have the same id."""
+    for things in groups:
+        first: dict[Any, int] = {}
+        for i, thing in enumerate(items(record, things, where)):
+            identity = thing.get("id")
+            if identity is None:
+                continue
+            if not isinstance(identity, (str, int, np.integer)):
+                raise UserError(
+                    f"{where}: {things}[{i}].id is of type {type(identity).__name__}, expected a whole number or a text"
+                )
+            if identity in first:
+                raise UserError(f"{where}: {things}[{i}] has the id of {things}[{first[identity]}], {identity!r:.40}")
+            first[identity] = i
 
 
 _SIDES = ("left", "right")
@@ -193,7 +241,7 @@ def _with_points(line: np.ndarray, count: int) -> np.ndarray:
 
 def _long_sides(corners: np.ndarray) -> np.ndarray:
     """Return the two long sides of a crossing, as LaneSegNet's evaluation: corners 0 to 1, then corners 2 to 3."""
-    return np.concatenate([resample(corners[:2], _AREA_POINTS // 2), resample(corners[2:4], _AREA_POINTS // 2)])
+    return np.concatenate([resample(corners[:2], AREA_POINTS // 2), resample(corners[2:4], AREA_POINTS // 2)])
 
 
 def _confidences(record: Any, things: str, where: str) -> np.ndarray:

@@ -11,8 +11,9 @@ where lines may have different numbers of points.
 
 from __future__ import annotations
 
+import math
+import reprlib
 import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,10 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, line_points, load_json, member, numbers, scores
+from tflane_jax.files.fields import choices, fractions, items, line_points, load_file, member, scores
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
 SUFFIXES = (".npz", ".json")
+# Bytes of memory that a file's arrays may take: 200 frames of 10,000 lanes of 200 points are 10 GB.
+_MOST_MEMORY = 2**34
 
 
 class PlainKey(NamedTuple):
@@ -46,41 +49,51 @@ def read_predictions(path: Path) -> dict[PlainKey, LaneDetections]:
 
 def read_truth(path: Path) -> dict[PlainKey, LaneTruth]:
     """Return the true lanes by frame; raises UserError that names file, frame and field."""
-    return {
-        key: LaneTruth(
-            _lines(record, where),
-            _successor(record, where) > 0.5,
-            visibility=_column(record, "visibility", where) if "visibility" in record else None,
-        )
-        for key, record, where in _frames(path)
-    }
+    frames = {}
+    for key, record, where in _frames(path):
+        if "scores" in record:
+            raise UserError(f"{where} has scores, so that {path} is a file of predictions: give the ground truth")
+        lanes = _lines(record, where)
+        successor = choices(member(record, "successor", where), (len(lanes), len(lanes)), f"{where}: successor")
+        visibility = _column(record, "visibility", where) if "visibility" in record else None
+        frames[key] = LaneTruth(lanes, successor, visibility=visibility)
+    return frames
 
 
 def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
-    records = _npz_records(path) if path.suffix == ".npz" else items(load_json(path), "frames", str(path))
+    records = _npz_records(path) if path.suffix == ".npz" else items(load_file(path), "frames", str(path))
     seen = set()
     for i, record in enumerate(records):
         at = f"{path}: frames[{i}]"
-        key = PlainKey(str(member(record, "scene", at)), str(member(record, "timestamp_ns", at)))
+        key = PlainKey(_scene(member(record, "scene", at), at), _time(member(record, "timestamp_ns", at), at))
         if key in seen:
             raise UserError(f"{path}: frame {key} is there twice")
         seen.add(key)
         yield key, record, f"{path}, frame {key}"
 
 
+def _scene(value: Any, where: str) -> str:
+    if isinstance(value, bool) or not isinstance(value, (str, int, np.integer)):
+        raise UserError(f"{where}: scene is {reprlib.repr(value)}, expected a text")
+    return str(value)
+
+
+def _time(value: Any, where: str) -> str:
+    """Return a time as the digits of its nanoseconds."""
+    digits = isinstance(value, str) and value.strip().isascii() and value.strip().isdigit()
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not (digits or (whole and abs(int(value)) < 2**63)):
+        raise UserError(f"{where}: timestamp_ns is {_shown(value)}, expected whole nanoseconds")
+    return str(int(value))
+
+
+def _shown(value: Any) -> str:
+    return "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
+
+
 def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
     """Return the frames of a file of arrays, without the empty slots."""
-    try:
-        with path.open("rb") as stream:
-            if not zipfile.is_zipfile(stream):
-                raise ValueError("no archive")  # numpy reads other kinds of files too
-            stream.seek(0)
-            with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is no .npz file of plain arrays, or it is damaged ({error})") from None
+    arrays = _arrays(path)
     points = member(arrays, "points", str(path))
     if points.ndim != 4:
         raise UserError(f"{path}: points has shape {points.shape}, expected (frames, lanes, points, 3)")
@@ -90,7 +103,7 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
     for name, shape in shapes.items():
         if name in arrays and arrays[name].shape != shape:
             raise UserError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape}")
-    valid = arrays.pop("valid", np.ones((frames, lanes), bool)).astype(bool)
+    valid = choices(arrays.pop("valid", np.ones((frames, lanes), bool)), (frames, lanes), f"{path}: valid")
     known = {name: array for name, array in arrays.items() if name in (*shapes, "points")}
     for f in range(frames):
         record: dict[str, Any] = {name: array[f] for name, array in known.items()}
@@ -101,13 +114,50 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
         yield record
 
 
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file, whose sizes are checked before memory is taken for them."""
+    try:
+        with path.open("rb") as stream:
+            if not zipfile.is_zipfile(stream):
+                raise ValueError("no archive")  # numpy reads other kinds of files too
+            stream.seek(0)
+            parts = zipfile.ZipFile(stream).infolist()
+            if len({part.filename for part in parts}) < len(parts):
+                raise ValueError("an array is there twice")
+            if (needed := sum(part.file_size for part in parts)) > _MOST_MEMORY:
+                raise ValueError(f"its arrays claim {needed:.2g} bytes")
+            with zipfile.ZipFile(stream) as archive:
+                for part in parts:
+                    _check_size(archive, part)
+            stream.seek(0)
+            with np.load(stream, allow_pickle=False) as file:
+                return {name: file[name] for name in file.files}
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
+    # A damaged archive may raise any error of zipfile, zlib, numpy or the parser of its headers.
+    except Exception as error:
+        raise UserError(f"{path} is no .npz file of plain arrays, or it is damaged ({error})") from None
+
+
+def _check_size(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> None:
+    """Raise ValueError if the header of an array claims another size than the file has for it."""
+    with archive.open(part) as content:
+        version = np.lib.format.read_magic(content)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(content)
+        claimed = math.prod(shape) * dtype.itemsize
+        if not dtype.hasobject and claimed != part.file_size - content.tell():
+            has = f"but the file has {part.file_size - content.tell()} for it"
+            raise ValueError(f"{part.filename} claims {claimed:.2g} bytes, {has}")
+
+
 def _lines(record: Any, where: str) -> list[np.ndarray]:
     return [line_points(line, f"{where}: points[{i}]") for i, line in enumerate(items(record, "points", where))]
 
 
 def _successor(record: Any, where: str) -> np.ndarray:
     lanes = len(items(record, "points", where))
-    return numbers(member(record, "successor", where), (lanes, lanes), f"{where}: successor")
+    return fractions(member(record, "successor", where), (lanes, lanes), f"{where}: successor")
 
 
 def _column(record: Any, name: str, where: str) -> np.ndarray:

@@ -17,8 +17,9 @@ from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, Lane
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
-from tflane_jax.metrics.vector_map import LINE_CLASSES, Measure, Sampling, VectorMapMetrics
-from tflane_jax.scoring import maptr, openlane_v2, plain
+from tflane_jax.metrics.vector_map import LINE_CLASSES, GroupedMapMetrics, Measure, Sampling, VectorMapMetrics
+from tflane_jax.scoring import maptr, openlane_v2, plain, remarks
+from tflane_jax.scoring.recognise import Format, Side, hint
 from tflane_jax.scoring.score import Accumulator
 
 
@@ -31,8 +32,11 @@ class ScoringProtocol:
         scene_of: returns the name of a frame's scene.
         metrics: returns a new accumulator.
         columns: of the table, in this order; the JSON file has them all.
+        formats: of the files, for messages.
         groups: by a criterion that partitions lanes, "occlusion" or "distance": returns a new accumulator whose numbers
             are by group.
+        remarks: returns what is unusual, though not wrong, about predictions and truth.
+        no_scenes: why `scene_of` separates frames of one drive; "" if it does not.
     """
 
     read_predictions: Callable[[Path], Mapping[Any, Any]]
@@ -40,7 +44,22 @@ class ScoringProtocol:
     scene_of: Callable[[Any], str]
     metrics: Callable[[], Accumulator]
     columns: tuple[str, ...]
+    formats: tuple[Format, ...]
     groups: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
+    remarks: remarks.Remarks = remarks.no_remarks
+    no_scenes: str = ""
+
+    def read(self, predictions: Path, truth: Path) -> tuple[Mapping[Any, Any], Mapping[Any, Any]]:
+        """Return the content of both files by frame; raises UserError that names file, frame, field and cause."""
+        found = self._read(self.read_predictions, predictions, "predictions")
+        return found, self._read(self.read_truth, truth, "ground truth")
+
+    def _read(self, read: Callable[[Path], Mapping[Any, Any]], path: Path, side: Side) -> Mapping[Any, Any]:
+        try:
+            return read(path)
+        except UserError as error:
+            formats = {name: protocol.formats for name, protocol in PROTOCOLS.items()}
+            raise UserError(f"{error}{hint(path, side, self.formats, formats)}") from None
 
 
 def _plain_or(read_plain: Callable[[Path], Any], read_official: Callable[[Path], Any]) -> Callable[[Path], Any]:
@@ -54,6 +73,8 @@ def _centerline(version: Version) -> ScoringProtocol:
         scene_of=lambda key: key.scene,
         metrics=partial(CenterlineMetrics, (version,)),
         columns=("OLS", "DET_l", "DET_t", "TOP_ll", "TOP_lt"),
+        formats=("OpenLane-V2 centerlines", "plain centerlines"),
+        remarks=remarks.centerlines,
         groups={
             "occlusion": partial(GroupedCenterlineMetrics, versions=(version,)),
             "distance": partial(GroupedCenterlineMetrics, partition=ByDistance(), versions=(version,)),
@@ -68,6 +89,8 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
         scene_of=lambda key: key.scene,
         metrics=partial(LaneSegmentMetrics, flavour),
         columns=(*columns, "AE_type", "AE_dist"),
+        formats=("OpenLane-V2 lane segments",),
+        remarks=remarks.segments,
         groups={
             "occlusion": partial(GroupedSegmentMetrics, flavour=flavour),
             "distance": partial(GroupedSegmentMetrics, partition=ByDistance(), flavour=flavour),
@@ -79,9 +102,16 @@ def _maptr(sampling: Sampling, measure: Measure = "chamfer") -> ScoringProtocol:
     return ScoringProtocol(
         read_predictions=maptr.read_predictions,
         read_truth=maptr.read_truth,
-        scene_of=lambda token: token,  # the files do not say which drive a sample is of
+        scene_of=lambda token: token,
+        no_scenes="MapTR's files do not say which drive a sample is of, and single samples are drawn",
         metrics=partial(VectorMapMetrics, sampling, measure),
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
+        formats=("MapTR",),
+        remarks=remarks.map_lines,
+        groups={
+            "occlusion": partial(GroupedMapMetrics, sampling=sampling, measure=measure),
+            "distance": partial(GroupedMapMetrics, partition=ByDistance(), sampling=sampling, measure=measure),
+        },
     )
 
 
@@ -90,8 +120,11 @@ def _tusimple(time_limit: float) -> ScoringProtocol:
         read_predictions=tusimple.read_predictions,
         read_truth=tusimple.read_truth,
         scene_of=lambda image: image.rpartition("/")[0],
+        no_scenes="TuSimple labels one image of each clip, and clips of one drive are drawn as if they were apart",
         metrics=partial(TuSimpleMetrics, time_limit),
         columns=("Accuracy", "FP", "FN"),
+        formats=("TuSimple",),
+        remarks=remarks.rows,
     )
 
 
@@ -101,11 +134,16 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
     "openlane-v2.1-lane-segment": _lane_segment("OpenLane-V2", ("OLUS", "DET_l", "DET_a", "DET_t", "TOP_ll", "TOP_lt")),
     "lanesegnet": _lane_segment("LaneSegNet", ("mAP", "AP_ls", "AP_ped", "TOP_lsls", "AP_boundary")),
     "openlane-v2-f-score": dataclasses.replace(
-        _centerline("v2.1"), metrics=CenterlineFScore, columns=("F_score", "F_recall", "F_precision"), groups={}
+        _centerline("v2.1"),
+        metrics=CenterlineFScore,
+        columns=("F_score", "F_recall", "F_precision"),
+        groups={},
+        remarks=remarks.centerline_units,
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),
     "maptr-iou": _maptr("maptr", "iou"),
+    "maptrv2-iou": _maptr("maptrv2", "iou"),
     "tusimple": _tusimple(OFFICIAL_TIME_LIMIT),
     "tusimple-lstr": _tusimple(LSTR_TIME_LIMIT),
 }

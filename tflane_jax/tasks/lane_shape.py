@@ -32,6 +32,7 @@ from tflane_jax.losses.lane_shape import LaneShapeLossConfig, lane_shape_loss, l
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.lstr import LstrConfig, normalise
+from tflane_jax.models.lstr_init import lstr_init
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
@@ -72,7 +73,8 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     def init(self, key: jax.Array, example: RoadImage) -> Params:
         """Return initial parameters; only the shapes of `example` are used."""
         image = normalise(example.image, example.image_valid)
-        return joined_statistics(self.model.build().init(key, image, example.image_valid))
+        params = joined_statistics(self.model.build().init(key, image, example.image_valid))
+        return lstr_init(params, key) if self.model.init == "lstr" else params
 
     def loss(self, params: Params, batch: RoadImage, key: jax.Array) -> tuple[Float[Array, ""], Terms]:
         """Return the loss of a batch (leading axis on every leaf) and its terms; norms use batch statistics."""
@@ -189,10 +191,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         ]
 
 
-def found_lanes(prediction: CurvePrediction, truth: RowLanes) -> RowLanes:
-    """Return the lanes of one prediction at the rows of the truth."""
+def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float | None = None) -> RowLanes:
+    """Return the lanes of one prediction at the rows of the truth; `threshold` as of `lane_shapes.detected`."""
     assert truth.rows is not None, "labels have rows"
-    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH)
+    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH, threshold=threshold)
 
 
 def predict_curves(task: Predictor, params: Params, examples: RoadImage) -> CurvePrediction:

@@ -1,6 +1,7 @@
 """Adam (or Muon) with linear warm-up, cosine decay and gradient clipping; the defaults are TopoNet's.
 
-The cosine goes down once over the run, by step or by epoch, or in cycles with warm restarts (`training.restarts`).
+The cosine goes down once over the run, by step or by epoch, or in cycles with warm restarts (`training.restarts`). Or
+the rate is constant and drops at given steps.
 """
 
 from __future__ import annotations
@@ -30,6 +31,19 @@ from tflane_jax.training.vectors import Vectors, any_in_leaf, norm
 
 
 @dataclass(frozen=True)
+class DropsConfig:
+    """A constant learning rate that drops at given steps, as LSTR's.
+
+    Attributes:
+        steps: numbers of updates after which the rate drops, ascending.
+        factor: on the rate at each drop.
+    """
+
+    steps: tuple[int, ...] = (450_000,)
+    factor: float = 0.1
+
+
+@dataclass(frozen=True)
 class OptimConfig:
     """Optimiser and averaging.
 
@@ -50,6 +64,7 @@ class OptimConfig:
             A positive number is the length of an epoch: as in mmcv's cosine annealing by epoch, the rate is constant
             within an epoch, the cosine spans all epochs, and the warm-up multiplies it.
         restarts: cycles of the learning rate that follow the warm-up; None has one cosine over the run.
+        drops: steps at which a constant rate drops, in place of the cosine; None for none.
     """
 
     lr: float = 2e-4
@@ -67,6 +82,7 @@ class OptimConfig:
     ema_decay: float = 0.999
     epoch_steps: int = 0
     restarts: RestartsConfig | None = None
+    drops: DropsConfig | None = None
 
 
 Rate = Callable[[Any, Int[ArrayLike, ""]], Float[Array, ""]]
@@ -86,12 +102,20 @@ def make_schedule(config: OptimConfig, steps: int) -> optax.Schedule:
     """Return the learning rate as a function of the step (0 is the first update), for a run without restarts.
 
     Raises:
-        UserError: the warm-up does not end before the training does, or `epoch_steps` is negative.
+        UserError: the warm-up does not end before the training does, `epoch_steps` is negative, or `drops`
+            cannot be followed.
         ValueError: the configuration has restarts; see `make_rate`.
     """
     _check(config, steps)
     if config.restarts is not None:
         raise ValueError("with restarts the learning rate depends on the optimiser's state, not on the step alone")
+    if (drops := config.drops) is not None:
+
+        def by_drops(step: Int[ArrayLike, "..."]) -> Float[Array, "..."]:
+            made = sum((jnp.asarray(step) >= drop for drop in drops.steps), jnp.zeros(()))
+            return config.lr * warmup_factor(config, step) * drops.factor**made
+
+        return by_drops
     if config.epoch_steps:
         epochs = -(-steps // config.epoch_steps)
 
@@ -202,6 +226,18 @@ def _check(config: OptimConfig, steps: int) -> None:
         if config.epoch_steps:
             raise UserError("optim.epoch_steps and optim.restarts exclude each other: set epoch_steps to 0")
         check_restarts(config.restarts)
+    if config.drops is not None:
+        _check_drops(config, config.drops)
+
+
+def _check_drops(config: OptimConfig, drops: DropsConfig) -> None:
+    if config.restarts is not None or config.epoch_steps:
+        other = "restarts" if config.restarts is not None else "epoch_steps"
+        raise UserError(f"optim.drops and optim.{other} exclude each other: set one of them to its default")
+    if not drops.steps or list(drops.steps) != sorted(set(drops.steps)) or drops.steps[0] < 1:
+        raise UserError(f"optim.drops.steps is {drops.steps}: it must be ascending numbers of updates, at least 1")
+    if not 0.0 < drops.factor <= 1.0:
+        raise UserError(f"optim.drops.factor is {drops.factor}: it must be above 0 and at most 1")
 
 
 def is_decayed(params: Vectors) -> Vectors:

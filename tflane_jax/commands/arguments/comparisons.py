@@ -17,8 +17,9 @@ _FILES = """Protocols and their files:
       mAP of the LaneSegNet and TF-Lane papers.
   openlane-v2-f-score
       The files of the centerline protocols; the devkit's F-score of 3-D lanes.
-  maptr, maptrv2
-      MapTR's nuscmap_results.json and the *_map_anns_val.json that its evaluation writes.
+  maptr, maptrv2, maptr-iou, maptrv2-iou
+      MapTR's nuscmap_results.json and the *_map_anns_val.json that its evaluation writes; -iou matches lines by the
+      overlap of their buffers.
   tusimple, tusimple-lstr
       Both files have one JSON record per line: raw_file, lanes (x at every row, negative without a point), h_samples
       (ground truth) or run_time in ms (predictions). tusimple-lstr allows 20 s per image instead of 200 ms, as LSTR."""
@@ -168,7 +169,7 @@ def score(commands) -> None:
     parser.add_argument(
         "--by",
         choices=("scene", "distance", "occlusion"),
-        help="also report parts; distance and occlusion are for centerlines and lane segments",
+        help="also report parts; distance and occlusion are for centerlines, lane segments and vector maps",
     )
     parser.add_argument(
         "--bootstrap",
@@ -176,6 +177,12 @@ def score(commands) -> None:
         metavar="N",
         default=0,
         help="95 percent intervals from N bootstrap samples of scenes (about 200 are enough)",
+    )
+    parser.add_argument(
+        "--scenes",
+        metavar="FILE",
+        type=Path,
+        help='scene of each frame, {"frame": "scene"} or nuScenes\' sample.json, for files that do not name it',
     )
     parser.add_argument(
         "--out", metavar="STEM", type=Path, default=Path("score"), help="write STEM.md and STEM.json (default score)"

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arguments, model_arguments
 
-_PREDICT = """Lane lines in photos of any size:
-  tflane predict RUN photo.jpg folder/          with a model trained by tflane
-  tflane predict --config FILE photo.jpg        with the published weights that the config file names
-Photos of cameras other than TuSimple's are cropped to its field of view if --focal and --horizon are given."""
+_PREDICT = """Lane lines in photos and videos of any size:
+  tflane predict RUN photo.jpg drive.mp4 folder/                     with a model trained by tflane
+  tflane predict --config gtn_lane/lstr --weights lstr photo.jpg     with the published weights (docs/gtn_lane.md)
+The part of a photo that suits the model is searched; --focal and --horizon tell it where the camera is known."""
 
 
 def train(commands) -> None:
@@ -61,11 +61,13 @@ def predict(commands) -> None:
     parser = command(
         commands, "predict", "write predictions and pictures", module="predict", function="run", epilog=_PREDICT
     )
-    model_arguments(parser, "run folder; then photos or folders of photos, for models of lane lines in one image")
+    model_arguments(parser, "run folder; then photos, videos or folders of them, for models of lane lines in one image")
     example_arguments(parser, "val")
     parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
     parser.add_argument(
-        "--threshold", type=float, default=0.3, help="lowest score of a lane in JSON and pictures (default 0.3)"
+        "--threshold",
+        type=float,
+        help="lowest score of a lane in JSON and pictures (default 0.3; of lane lines in one image 0.5, as LSTR)",
     )
     parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
     parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
@@ -85,6 +87,13 @@ def convert(commands) -> None:
         metavar="FILE",
         type=Path,
         help="checkpoint, .pth, .pkl or .npz (default: that of the config)",
+    )
+    parser.add_argument(
+        "--edge-weight",
+        metavar="FRACTION",
+        type=float,
+        help="LSTR's weights in a GTN encoder: weight of the edge types that make it LSTR's encoder (default 1, "
+        "exactly; 0.98 lets fine-tuning change the selection)",
     )
     parser.add_argument("--out", metavar="RUN", type=Path, required=True, help="run folder to write")
 

@@ -1,0 +1,79 @@
+"""Published weights are found by name, and only those."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.convert.lstr_state import TINY, lstr_state
+from tests.shared import shared_path
+from tflane_jax.convert.lstr import load_lstr
+from tflane_jax.convert.torch_file import read_state_dict
+from tflane_jax.convert.weights_files import PUBLISHED, digest_of, find_weights
+from tflane_jax.errors import UserError
+
+LSTR = PUBLISHED["lstr"]
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    """Return two folders of $TFLANE_WEIGHTS and that of the cache."""
+    found = [tmp_path / name for name in ("a", "b")]
+    monkeypatch.setenv("TFLANE_WEIGHTS", os.pathsep.join(map(str, found)))
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    found.append(tmp_path / "cache" / "weights")
+    for folder in found:
+        folder.mkdir(parents=True)
+    return found
+
+
+def test_a_missing_file_is_named_with_its_source_and_checksum(folders):
+    with pytest.raises(UserError) as error:
+        find_weights(Path("lstr"))
+    said = str(error.value)
+    for word in (*map(str, folders), LSTR.url, LSTR.licence, LSTR.digest, "TFLANE_WEIGHTS", *LSTR.files):
+        assert word in said, word
+
+
+@pytest.mark.parametrize("file", LSTR.files)
+@pytest.mark.parametrize("place", range(3))
+def test_the_file_is_found_in_any_folder(folders, place, file):
+    (folders[place] / file).touch()
+    assert find_weights(Path("lstr")) == (folders[place] / file, LSTR)
+
+
+def test_the_variable_may_name_the_file(folders, monkeypatch):
+    file = folders[0] / LSTR.files[0]
+    file.touch()
+    monkeypatch.setenv("TFLANE_WEIGHTS", str(file))
+    assert find_weights(Path("lstr")) == (file, LSTR)
+
+
+def test_paths_are_paths(folders):
+    assert find_weights(Path("any.pth")) == (Path("any.pth"), None)
+    Path("lstr").touch()
+    assert find_weights(Path("lstr")) == (Path("lstr"), None)
+
+
+def test_other_tensors_under_the_name_are_refused(folders):
+    np.savez(folders[2] / "LSTR_500000.npz", **lstr_state())
+    with pytest.raises(UserError, match=r"LSTR_500000.npz is not the published file: the sha256 of its tensors is"):
+        load_lstr(Path("lstr"), TINY)
+    load_lstr(folders[2] / "LSTR_500000.npz", TINY)
+
+
+def test_the_digest_is_that_of_the_weights():
+    state = lstr_state()
+    digest = digest_of(state)
+    counted = {f"module.{name}": tensor for name, tensor in reversed(state.items())}
+    counted |= {"module.total_ops": np.zeros(1), "module.layer1.0.bn1.num_batches_tracked": np.array(9)}
+    assert digest_of(counted) == digest
+    state["bn1.weight"] = state["bn1.weight"] + np.float32(1e-3)
+    assert digest_of(state) != digest
+
+
+@pytest.mark.golden
+def test_the_published_file_has_its_digest():
+    assert digest_of(read_state_dict(shared_path("data/lstr/LSTR_500000.npz"))) == LSTR.digest

@@ -1,0 +1,56 @@
+"""Videos are read frame by frame, and written whole or not at all."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.errors import UserError
+from tflane_jax.files.videos import VideoInfo, read_frames, sample_frames, video_info, writing_video
+
+cv2 = pytest.importorskip("cv2")
+INFO = VideoInfo(frames=6, rate=10.0, width=64, height=48)
+
+
+@pytest.fixture
+def video(tmp_path):
+    with writing_video(tmp_path / "drive.mp4", INFO) as writer:
+        for i in range(6):
+            writer.add(np.full((48, 64, 3), [40 * i, 20, 200 - 30 * i], np.uint8))
+    return tmp_path / "drive.mp4"
+
+
+def test_frames_return(video):
+    frames = list(read_frames(video))
+    assert len(frames) == 6
+    assert {frame.shape for frame in frames} == {(48, 64, 3)}
+    for i, frame in enumerate(frames):
+        np.testing.assert_allclose(frame.mean((0, 1)), [40 * i, 20, 200 - 30 * i], atol=12)
+    assert video_info(video) == INFO
+    assert [path.name for path in video.parent.iterdir()] == ["drive.mp4"]
+
+
+def test_sampled_frames_are_spread(video):
+    reds = [frame[..., 0].mean() for frame in sample_frames(video, 3)]
+    np.testing.assert_allclose(reds, [0, 80, 160], atol=12)
+
+
+def test_an_interrupted_video_is_not_left(tmp_path):
+    def interrupted():
+        with writing_video(tmp_path / "drive.mp4", INFO) as writer:
+            writer.add(np.zeros((48, 64, 3), np.uint8))
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        interrupted()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_damaged_files_are_named(video, tmp_path):
+    (tmp_path / "bad.avi").write_bytes(b"nothing")
+    for path, message in ((tmp_path / "bad.avi", "damaged or no video"), (tmp_path / "none.mp4", "there is no file")):
+        for read in (video_info, lambda path: next(read_frames(path)), lambda path: sample_frames(path, 2)):
+            with pytest.raises(UserError, match=message):
+                read(path)
+    whole = video.read_bytes()
+    video.write_bytes(whole[: len(whole) // 3])
+    with pytest.raises(UserError, match=r"drive.mp4"):
+        list(read_frames(video))

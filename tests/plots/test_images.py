@@ -1,0 +1,19 @@
+"""Lane lines drawn into photos."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.plots.images import lanes_drawn
+
+
+def test_lanes_are_drawn_into_a_copy_of_a_frame():
+    pytest.importorskip("cv2")
+    frame = np.zeros((40, 60, 3), np.uint8)
+    lanes = [np.array([[10.0, 5.0], [10.0, 35.0]]), np.array([[40.0, 5.0], [80.0, 35.0]])]
+    drawn = lanes_drawn(frame, lanes)
+    assert not frame.any()
+    assert drawn[20, 10].tolist() == [255, 77, 109]  # the first of LANE_COLOURS
+    assert drawn[5:36, 10].any(-1).all()
+    assert drawn[12, 49].any()
+    assert not drawn[:, 20:35].any()
+    np.testing.assert_array_equal(lanes_drawn(frame, []), frame)

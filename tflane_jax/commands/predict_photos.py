@@ -1,0 +1,110 @@
+"""`tflane predict` for lane lines in photos and videos of any size and camera.
+
+predictions.json, and one picture or video (MP4) for each input:
+    {"model", "step", "threshold",
+     "photos": [{"file", "width", "height", "picture", "view", "value", "warning", "lanes": LANES}, ...],
+     "videos": [{"file", "width", "height", "rate", "video", "view", "warning", "frames": [LANES, ...]}, ...]}
+    LANES is [{"score", "paint", "points": [[column, row], ...]}, ...]: pixels, from the upper end of a lane to the
+    lower end; lanes are in order from left to right. `paint` is the fraction of the lane that lies on paint, `view` the
+    part of the photo that the network saw ({"left", "top", "width", "height"}), `value` its plausibility.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.commands.sources import make_folder
+from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo
+from tflane_jax.files.atomic import write_json
+from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, read_image
+from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
+from tflane_jax.plots.images import lanes_drawn, save_photo
+from tflane_jax.runs import Run
+from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
+
+# Frames of a video in which its view is searched, and points of a lane in its record.
+_SEARCHED_FRAMES, _VIDEO_POINTS = 4, 20
+
+
+def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
+    """Predict the lane lines in photos and videos; write a picture or video of each, and the points of all."""
+    inputs = list_photos(paths, (*PHOTO_SUFFIXES, *VIDEO_SUFFIXES))
+    videos = [path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES]
+    photos = [path for path in inputs if path not in videos]
+    camera = None if options.focal is None and options.horizon is None else PhotoCamera(options.focal, options.horizon)
+    reader = PhotoReader(trained.config.task, trained.params[0], options.threshold)
+    make_folder(options.out)
+    names = dict(zip(inputs, _names(inputs), strict=True))
+    bar = tqdm(photos, desc="predict", unit="photo", disable=not photos)
+    records = [_photo(reader, path, options.out / names[path], camera) for path in bar]
+    clips = [_video(reader, path, options.out / names[path], camera) for path in videos]
+    head = {"model": trained.name, "step": trained.step, "threshold": options.threshold}
+    write_json(options.out / "predictions.json", head | {"photos": records, "videos": clips})
+    for record in (*records, *clips):
+        if record["warning"]:
+            print(f"tflane: {record['file']}: {record['warning']}", file=sys.stderr)
+    lanes = sum(len(record["lanes"]) for record in records)
+    found = [f"{lanes} lane lines in {len(photos)} photos"] * bool(photos)
+    found += [f"{sum(map(len, clip['frames']))} in {len(clip['frames'])} frames of {clip['file']}" for clip in clips]
+    print(f"{'; '.join(found)}; pictures and predictions.json written to {options.out}")
+    return 0
+
+
+def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:
+    photo = read_image(path)
+    answer = reader.read(photo, camera)
+    count = len(answer.lanes)
+    save_photo(out, photo, answer.lanes, f"{path.name}: {count} lane line{'' if count == 1 else 's'}")
+    height, width = photo.shape[:2]
+    size = {"file": str(path), "width": width, "height": height}
+    told = {"view": _plain_view(answer.view), "value": round(answer.value, 3), "warning": answer.warning}
+    return size | {"picture": out.name} | told | {"lanes": _plain(answer)}
+
+
+def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:
+    """Write the video with its lanes; all frames are seen in one view, because they have one camera."""
+    info = video_info(path)
+    some = sample_frames(path, _SEARCHED_FRAMES)
+    view = reader.find_view(some) if camera is None else fit_photo(some[0], camera).placement
+    head = {"file": str(path), "width": info.width, "height": info.height, "rate": info.rate}
+    if view is None:
+        warning = "no view of its frames shows plausible lanes, and no video is written: give --horizon and --focal"
+        return head | {"video": None, "view": None, "warning": warning, "frames": []}
+    frames, doubtful = [], 0
+    with writing_video(out, info) as writer:
+        for frame in tqdm(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
+            answer = reader.read_view(frame, view, known=camera is not None)
+            writer.add(lanes_drawn(frame, answer.lanes))
+            frames.append(_plain(answer, _VIDEO_POINTS))
+            doubtful += bool(answer.warning)
+    warning = f"{doubtful} of {len(frames)} frames are doubtful or empty" if doubtful else ""
+    return head | {"video": out.name, "view": _plain_view(view), "warning": warning, "frames": frames}
+
+
+def _plain(answer: PhotoLanes, points: int | None = None) -> list[dict[str, Any]]:
+    records = []
+    for lane, score, paint in zip(answer.lanes, answer.scores, answer.paint, strict=True):
+        kept = lane if points is None else lane[np.linspace(0, len(lane) - 1, min(points, len(lane))).astype(int)]
+        records.append({"score": score, "paint": round(paint, 3), "points": np.round(kept, 2).tolist()})
+    return records
+
+
+def _plain_view(view: Placement) -> dict[str, int]:
+    return {"left": view.left, "top": view.top, "width": view.width, "height": view.height}
+
+
+def _names(inputs: list[Path]) -> list[str]:
+    """Return a file name for each input's picture; inputs with equal names in different folders get numbers."""
+    seen: dict[str, int] = {}
+    names = []
+    for path in inputs:
+        count = seen[path.stem] = seen.get(path.stem, 0) + 1
+        suffix = ".mp4" if path.suffix.lower() in VIDEO_SUFFIXES else ".png"
+        names.append(f"{path.stem}-lanes{suffix}" if count == 1 else f"{path.stem}-{count}-lanes{suffix}")
+    return names

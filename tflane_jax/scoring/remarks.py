@@ -1,0 +1,110 @@
+"""What a reader of a score should know about the files: unusual, but not wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tflane_jax.datasets.lane_rows import ROWS
+from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
+from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
+from tflane_jax.metrics.vector_map import MapDetections, MapTruth
+from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
+
+Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]
+# Lines of one side that are so many times as far away as those of the other are of other units.
+_OTHER_UNITS = 8.0
+_NAMED = 3
+
+
+def no_remarks(predictions: Mapping[Any, Any], truth: Mapping[Any, Any]) -> list[str]:
+    """Return nothing."""
+    return []
+
+
+def centerlines(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, LaneTruth]) -> list[str]:
+    """Return remarks on centerlines: other numbers of points than the official one, other units."""
+    return [
+        *_other_counts("predicted centerlines", _lines(predictions, lambda one: one.points), CENTERLINE_POINTS),
+        *_other_counts("true centerlines", _lines(truth, lambda one: one.points), CENTERLINE_POINTS),
+        *centerline_units(predictions, truth),
+    ]
+
+
+def centerline_units(predictions: Mapping[Any, LaneDetections], truth: Mapping[Any, LaneTruth]) -> list[str]:
+    """Return a remark where centerlines seem to be of other units."""
+    return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
+
+
+def segments(predictions: Mapping[Any, SegmentDetections], truth: Mapping[Any, SegmentTruth]) -> list[str]:
+    """Return remarks on lane segments and areas; those of the truth have been resampled."""
+    parts: dict[str, Callable[[SegmentDetections], Lines]] = {
+        "centerlines of predicted segments": lambda one: one.lanes.points,
+        "left lines of predicted segments": lambda one: one.left,
+        "right lines of predicted segments": lambda one: one.right,
+    }
+    counts = [_other_counts(name, _lines(predictions, of), LINE_POINTS) for name, of in parts.items()]
+    areas = _other_counts("predicted areas", _lines(predictions, lambda one: one.areas.points), AREA_POINTS)
+    units = _units(_lines(predictions, lambda one: one.lanes.points), _lines(truth, lambda one: one.lanes.points))
+    return [*(remark for remarks in counts for remark in remarks), *areas, *units]
+
+
+def map_lines(predictions: Mapping[Any, MapDetections], truth: Mapping[Any, MapTruth]) -> list[str]:
+    """Return a remark where lines seem to be of other units."""
+    return _units(_lines(predictions, lambda one: one.points), _lines(truth, lambda one: one.points))
+
+
+def rows(predictions: Mapping[Any, RowLanes], truth: Mapping[Any, RowLanes]) -> list[str]:
+    """Return a remark on labels at other rows than TuSimple's."""
+    other = [key for key, one in truth.items() if one.rows is not None and not np.isin(one.rows, ROWS).all()]
+    if not other:
+        return []
+    return [
+        f"{len(other)} of {len(truth)} frames are labelled at other rows than TuSimple's, every 10th from "
+        f"{ROWS[0]:g} to {ROWS[-1]:g} ({_named(other)}): are h_samples shifted, or of another image size?"
+    ]
+
+
+def _lines(frames: Mapping[Any, Any], of: Callable[[Any], Lines]) -> dict[Any, Lines]:
+    return {key: of(frame) for key, frame in frames.items()}
+
+
+def _other_counts(what: str, frames: Mapping[Any, Lines], count: int) -> list[str]:
+    """Return a remark on lines that have not the official number of points, which the distances presuppose."""
+    total = sum(map(len, frames.values()))
+    other = [
+        f"frame {key}, number {i}: {len(line)}"
+        for key, lines in frames.items()
+        for i, line in enumerate(lines)
+        if len(line) != count
+    ]
+    if not other:
+        return []
+    return [
+        f"{len(other)} of {total} {what} have other than the official {count} points ({_named(other)}). Distances "
+        "compare vertices, so that even the right line may not match: resample them"
+    ]
+
+
+def _units(predictions: Mapping[Any, Lines], truth: Mapping[Any, Lines]) -> list[str]:
+    found, true = _extent(predictions.values()), _extent(truth.values())
+    if found is None or true is None or 1.0 / _OTHER_UNITS <= found / true <= _OTHER_UNITS:
+        return []
+    return [
+        f"predicted lines reach {found:.3g} from the origin, true ones {true:.3g} (median over frames): are the "
+        "predictions normalised, in other units or in another frame?"
+    ]
+
+
+def _extent(frames: Iterable[Lines]) -> float | None:
+    """Return how far lines reach from the origin, median over frames that have any; None without extent."""
+    reach = [max(float(np.abs(np.asarray(line)[:, :2]).max()) for line in lines) for lines in frames if len(lines)]
+    extent = float(np.median(reach)) if reach else 0.0
+    return extent if extent > 0.0 else None
+
+
+def _named(names: Sequence[Any]) -> str:
+    return ", ".join(map(str, names[:_NAMED])) + (", ..." if len(names) > _NAMED else "")

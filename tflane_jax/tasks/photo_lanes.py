@@ -1,0 +1,197 @@
+"""Lane lines in a photo of any camera: where the camera is not known, the view is searched that suits the network.
+
+The network knows one camera, TuSimple's. Cutting sky off the top moves the horizon to its row, and cutting the sides
+makes a wide lens its own. Which cut is right shows in the result: lanes meet in one point on the horizon, do not cross,
+and lie on paint (`evaluation.photo_lanes`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement, fit_photo
+from tflane_jax.evaluation.lane_shapes import lane_scores
+from tflane_jax.evaluation.photo_lanes import Judgement, common_horizon, is_blank, judge_lanes, without_crossings
+from tflane_jax.evaluation.predict import Predictor
+from tflane_jax.files.images import opencv
+from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.models.parameters import Params
+from tflane_jax.scene import LaneLines, RoadImage
+from tflane_jax.tasks.lane_shape import predict_curves
+
+# Rows of the horizon that are tried, as fractions of a photo's height, and widths of the view, of the photo's width.
+_HORIZONS = (0.3, 0.36, 0.42, 0.48, 0.54, 0.6)
+_WIDTHS = (1.0, 0.75, 0.55)
+_FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
+# The value from which a photo is seen whole without a search (TuSimple's ten frames at hand have 0.23 or more), and the
+# ranks from which a view is taken without a warning, and taken at all.
+_SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
+_POINTS = 100
+_EMPTY = "the photo is empty: it has one brightness almost everywhere"
+_NOTHING = (
+    "no lanes: what was found in any part of the photo crosses, does not meet in one point, or lies on no paint. If it "
+    "shows a road, give --horizon (row) and --focal (pixels)"
+)
+
+
+@dataclass(frozen=True)
+class PhotoLanes:
+    """Lanes found in a photo.
+
+    Attributes:
+        view: the part of the photo that the network saw.
+        lanes: (column, row) in pixels of the photo, from the upper to the lower end; from left to right.
+        scores: of the lanes, 0 to 1.
+        paint: fraction of each lane that lies on paint.
+        value: plausibility of the view, see `Judgement`.
+        warning: what is doubtful; "" if nothing is.
+    """
+
+    view: Placement
+    lanes: tuple[Float[np.ndarray, "p 2"], ...]
+    scores: tuple[float, ...]
+    paint: tuple[float, ...]
+    value: float
+    warning: str
+
+
+@dataclass(frozen=True)
+class _Seen:
+    view: Placement
+    lanes: list[Float[np.ndarray, "p 2"]]
+    scores: Float[np.ndarray, " l"]
+    judged: Judgement
+
+
+class PhotoReader:
+    """Reads photos with one model.
+
+    Args:
+        task: of lane shapes.
+        params: of the model.
+        threshold: least score of a lane.
+    """
+
+    def __init__(self, task: Predictor, params: Params, threshold: float = 0.5) -> None:
+        self.task, self.params, self.threshold = task, params, threshold
+
+    def read(self, photo: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = None) -> PhotoLanes:
+        """Return the lanes of a photo; without a camera its view is searched.
+
+        Raises UserError for a camera that does not fit the photo.
+        """
+        grey = _grey(photo)
+        if is_blank(grey):
+            view = fit_photo(photo, camera).placement
+            return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
+        if camera is not None and (camera.focal is not None or camera.horizon is not None):
+            return self._checked(photo, self._see(photo, grey, camera), known=True)
+        return self._checked(photo, self._search(photo, grey), known=False)
+
+    def find_view(self, photos: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Placement | None:
+        """Return the view that suits frames of one camera best; None if no frame shows plausible lanes."""
+        found = [self._search(photo, grey) for photo in photos if not is_blank(grey := _grey(photo))]
+        best = max(found, key=lambda seen: seen.judged.rank, default=None)
+        return None if best is None or best.judged.rank < _LEAST else best.view
+
+    def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement, *, known: bool = False) -> PhotoLanes:
+        """Return the lanes that a view of a photo shows; `known` tells that it was not searched."""
+        grey = _grey(photo)
+        if is_blank(grey):
+            return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
+        return self._checked(photo, self._look(photo, grey, view), known=known)
+
+    def _search(self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"]) -> _Seen:
+        height, width = grey.shape
+        whole = self._see(photo, grey, PhotoCamera())
+        if whole.judged.value >= _SURE:
+            return whole
+        tried = {whole.view: whole}
+        for horizon in _HORIZONS:
+            self._try(tried, photo, grey, PhotoCamera(None, horizon * height))
+            for part in _WIDTHS:
+                self._try(tried, photo, grey, PhotoCamera(FOCAL * width * part, horizon * height))
+        meeting = common_horizon([seen.judged for seen in tried.values()], height)
+        if meeting is not None and meeting[1] < 0.9 * height:
+            ahead = min(max(meeting[0], 0.25 * width), 0.75 * width)
+            self._try(tried, photo, grey, PhotoCamera(None, meeting[1]))
+            for part in _FINE_WIDTHS:
+                for column in (None, ahead):
+                    self._try(tried, photo, grey, PhotoCamera(FOCAL * width * part, meeting[1], column))
+        return max(tried.values(), key=lambda seen: seen.judged.rank)
+
+    def _try(self, tried: dict[Placement, _Seen], photo, grey, camera: PhotoCamera) -> None:
+        view = fit_photo(photo, camera).placement
+        if view not in tried:
+            tried[view] = self._look(photo, grey, view)
+
+    def _see(self, photo, grey, camera: PhotoCamera) -> _Seen:
+        return self._look(photo, grey, fit_photo(photo, camera).placement)
+
+    def _look(self, photo, grey, view: Placement) -> _Seen:
+        fitted = fit_photo(photo, view)
+        example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
+        stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
+        answer = jax.tree.map(lambda leaf: leaf[0], predict_curves(self.task, self.params, stacked))
+        scores = lane_scores(answer)
+        chosen = np.flatnonzero(scores >= self.threshold)
+        curves = np.asarray(answer.curves, np.float64)[chosen]
+        rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
+        lanes = np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
+        order = np.argsort(lanes[:, -1, 0], kind="stable")
+        lanes, scores = list(lanes[order]), scores[chosen][order]
+        return _Seen(view, lanes, scores, judge_lanes(grey, view, lanes, scores))
+
+    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _Seen, *, known: bool) -> PhotoLanes:
+        """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing."""
+        judged, (height, width) = seen.judged, photo.shape[:2]
+        nothing = PhotoLanes(seen.view, (), (), (), judged.value, "")
+        searched = not known and seen.view != fit_photo(photo).placement
+        worth_of_view = judged.rank if searched else judged.value
+        if not known and worth_of_view < _LEAST:
+            if not seen.lanes:
+                return nothing
+            return replace(nothing, warning=_NOTHING)
+        top = seen.view.top + HORIZON * seen.view.height
+        if judged.meeting is not None and not judged.crossed and judged.meeting[1] < height:
+            top = min(top, judged.meeting[1])
+        lanes, worth, kept = [], [], []
+        believed = [i for i in range(len(seen.lanes)) if not searched or judged.supported[i]]
+        for i in believed:
+            lane = seen.lanes[i]
+            points = seen.view.to_photo(lane)
+            u, v = points.T
+            points = points[(u >= 0) & (u < width) & (v >= max(top, 0.0)) & (v < height)]
+            if len(points) > 1:
+                lanes.append(points)
+                worth.append(float(seen.scores[i]) + judged.paint[i])
+                kept.append(i)
+        clear = without_crossings(lanes, worth, seen.view.width)
+        warnings = []
+        if len(lanes) < len(believed):
+            warnings.append(f"{len(believed) - len(lanes)} of {len(believed)} lanes lie above the horizon or outside")
+        if not clear.all():
+            warnings.append(f"{int((~clear).sum())} lanes cross others and are left out")
+        if judged.crossed and clear.all():
+            warnings.append("the lanes would cross before the horizon")
+        if seen.lanes and worth_of_view < _PLAUSIBLE and not judged.crossed:
+            warnings.append("the lanes hardly lie on paint or do not meet on the horizon: look at the picture")
+        shown = [k for k, keep in zip(range(len(lanes)), clear, strict=True) if keep]
+        return PhotoLanes(
+            seen.view,
+            tuple(lanes[k] for k in shown),
+            tuple(float(seen.scores[kept[k]]) for k in shown),
+            tuple(judged.paint[kept[k]] for k in shown),
+            judged.value,
+            "; ".join(warnings),
+        )
+
+
+def _grey(photo: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
+    cv2 = opencv()
+    return np.asarray(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY))

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from tqdm import tqdm
 
 from tflane_jax.config_io import first_difference
 from tflane_jax.datasets.batches import Prepare, batches, first_example
+from tflane_jax.devices import divided, replicated, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.models.parameters import Params
@@ -147,6 +149,7 @@ def train(
             the last good state was written.
     """
     _check(config)
+    mesh = training_mesh(config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
     if adaptive is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
@@ -181,6 +184,7 @@ def train(
             given = starting_params(config.init_from, states, config.seeds, partly=config.init_partly)
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
             started_from = {"init_from": origins(config.init_from, config.seeds)}
+        states = [replicated(state, mesh) for state in states]
         first = step = int(states[0].step)
         _tell(add_provenance(folder, **started_from))
         write_text(folder / "config.txt", resolved_text)
@@ -190,11 +194,12 @@ def train(
         # Compile
         # =============================================================================================================
         began = time.perf_counter()
-        feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size, prepare)
+        place, order = partial(divided, mesh=mesh), range(first, config.steps)
+        feed = batches(arrays, config.seeds, order, config.batch_size, prepare, share=share(mesh), place=place)
         batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1)
+            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1, mesh=mesh)
         compile_seconds = time.perf_counter() - began
         if progress:
             tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)
@@ -242,7 +247,7 @@ def train(
                     if adaptive is not None:
                         together = of_all_seeds([state.opt_state for state in states])
                         together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
-                        changed = per_seed(together, config.seeds)
+                        changed = replicated(per_seed(together, config.seeds), mesh)
                         states = [replace(s, opt_state=o) for s, o in zip(states, changed, strict=True)]
                         writer.write(_seed_record(step, "cycle", cycles))
                     save(metrics)

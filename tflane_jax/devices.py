@@ -11,9 +11,11 @@ import contextlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from tflane_jax import processes
 from tflane_jax.errors import UserError
 
 DATA_AXIS = "data"
@@ -35,9 +37,12 @@ def training_mesh(batch_size: int) -> Mesh | None:
 
 
 def prediction_mesh(batch_size: int) -> Mesh | None:
-    """Return the mesh over all devices; None if there is one, or if they cannot share a batch evenly."""
+    """Return the mesh over all devices; None if there is one, or if they cannot share a batch evenly.
+
+    A process that works `apart` from the others has no mesh either.
+    """
     devices = jax.devices()
-    if len(devices) == 1 or batch_size % len(devices):
+    if len(devices) == 1 or batch_size % len(devices) or processes.count() < jax.process_count():
         return None
     return Mesh(np.array(devices), (DATA_AXIS,), axis_types=(AxisType.Auto,))
 
@@ -54,9 +59,21 @@ def everywhere(mesh: Mesh | None) -> NamedSharding | None:
 
 def replicated(tree: Any, mesh: Mesh | None) -> Any:
     """Put a tree that every process holds on every device; on the default device for None."""
-    if mesh is None and jax.device_count() > 1:
-        tree = jax.device_get(tree)  # which may be on all of them
-    return jax.device_put(tree, everywhere(mesh))
+    if jax.device_count() == 1:
+        return jax.device_put(tree)
+    return jax.tree.map(lambda leaf: _put(leaf, everywhere(mesh)), tree)
+
+
+def _put(leaf: Any, sharding: NamedSharding | None) -> Any:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), sharding))
+    host = np.asarray(leaf)  # the array may be on all devices
+    return jax.device_put(host) if sharding is None else jax.make_array_from_process_local_data(sharding, host)
+
+
+def on_host(tree: Any) -> Any:
+    """Return a tree that one process can work with: as it is, or without the devices of other processes."""
+    return tree if processes.count() == 1 else replicated(tree, None)
 
 
 def divided(rows: Any, mesh: Mesh | None) -> Any:

@@ -12,7 +12,8 @@ from tests.shared import ROOT
 # From the ground up. A file imports from its own package and from the lines above its own, never from its own line.
 FLOORS = (
     "errors",
-    "config_io config_files migrations",
+    "config_io config_files migrations processes",
+    "devices",
     "geometry",
     "files",
     "scene",

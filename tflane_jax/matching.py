@@ -4,11 +4,14 @@ Two backends give the same assignments. "jax" runs on the device, in a program t
 (persistent compilation cache), and takes as long as scipy at the sizes of small models. "scipy" runs on the host: one
 call per step for every layer and example, because the callback receives `vmap`ped axes as batch axes and loops over
 them. A program with a host callback can be neither exported nor kept, so do not use it in prediction.
+
+Where a batch is divided among devices, each device (or its host) solves the problems of its own examples.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +19,8 @@ import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+
+from tflane_jax.devices import DATA_AXIS
 
 _COST_LIMIT = 1e6
 
@@ -49,16 +54,34 @@ def match(
     valid = jnp.broadcast_to(valid, (*cost.shape[:-2], cost.shape[-1]))
     if 0 in cost.shape:
         return Assignment(jnp.zeros(valid.shape, jnp.int32), jnp.zeros(valid.shape, bool))
-    if backend == "jax":
-        solve = _augmenting_paths
-        for _ in cost.shape[:-2]:
-            solve = jax.vmap(solve)
-        query = solve(cost, valid)
-    else:
-        shape = jax.ShapeDtypeStruct(valid.shape, np.int32)
-        query = jax.pure_callback(_assign_on_host, shape, cost, valid, vmap_method="expand_dims")
+    query = _by_device(_on_device if backend == "jax" else _on_host, cost, valid)
     matched = query >= 0
     return Assignment(jnp.where(matched, query, 0), matched)
+
+
+def _by_device(solve: Callable[[Any, Any], Any], cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"]) -> Any:
+    """Solve all problems, those of each device's examples there.
+
+    Left to itself, XLA would run the loops of all devices in step, with an exchange in every round.
+    """
+    devices = jax.sharding.get_abstract_mesh().shape.get(DATA_AXIS, 1)
+    if devices == 1 or cost.ndim == 2 or cost.shape[0] % devices:
+        return solve(cost, valid)
+    examples = jax.sharding.PartitionSpec(DATA_AXIS)
+    # Loops begin with constants, which are equal on all devices, and go on with values that are not: not for `vma`.
+    return jax.shard_map(solve, in_specs=(examples, examples), out_specs=examples, check_vma=False)(cost, valid)
+
+
+def _on_device(cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"]) -> Int[Array, "*b n"]:
+    solve = _augmenting_paths
+    for _ in cost.shape[:-2]:
+        solve = jax.vmap(solve)
+    return solve(cost, valid)
+
+
+def _on_host(cost: Float[Array, "*b q n"], valid: Bool[Array, "*b n"]) -> Int[Array, "*b n"]:
+    shape = jax.ShapeDtypeStruct(valid.shape, np.int32)
+    return jax.pure_callback(_assign_on_host, shape, cost, valid, vmap_method="expand_dims")
 
 
 def _assign_on_host(cost: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
+from tflane_jax.processes import from_first
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
@@ -56,7 +57,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
 
     Raises UserError like `training.loop.train` and the datasets.
     """
-    check_start(folder, start)  # before building data, which may take long
+    from_first(lambda: check_start(folder, start))  # before building data, which may take long
     task = config.task
     _check_metrics(config)
     data: Any = task.load(config.data.source("train"), progress=progress)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from tflane_jax import processes
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.config_files import split_reference
 from tflane_jax.config_io import to_text
@@ -25,6 +26,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         return 0
     if options.config is None and options.start != "resume":
         raise UserError("say what to train: --config FILE (or a name, say tf_lane/toponet), or --resume with --out RUN")
+    if options.distributed or (options.coordinator, options.processes, options.process) != (None, None, None):
+        processes.join(options.coordinator, options.processes, options.process)
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
 
@@ -37,6 +40,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
             file=sys.stderr,
         )
         return 128 + result.stopped_by
+    if not processes.is_first():
+        return 0
     print(
         f"{out}: {result.step} steps, {result.steps_per_second:.2f} steps/s, compiled in {result.compile_seconds:.1f} s"
     )

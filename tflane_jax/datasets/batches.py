@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -67,6 +67,7 @@ def batches(
     prepare: Prepare | None = None,
     *,
     share: tuple[int, int] = (0, 1),
+    place: Callable[[Any], Any] = jax.device_put,
 ) -> Generator[list[Any]]:
     """Yield the batches of each step on the device, one for each seed; a thread gathers the next ones meanwhile.
 
@@ -78,6 +79,7 @@ def batches(
         prepare: augments each example; called in that thread, or in the workers of a `Streamed`.
         share: (index, count) of this process among those that divide every batch (`jax.process_index()`,
             `jax.process_count()`); it gets its part of the rows.
+        place: puts these rows on the device, or on several (`devices.divided`).
 
     Raises:
         ValueError: the processes cannot divide a batch evenly.
@@ -108,7 +110,8 @@ def batches(
         stream = arrays.stream(order, len(steps) * len(seeds) * rows, prepare)
 
     def fetch(step: int) -> list[Any]:
-        return jax.device_put(streamed(step) if isinstance(arrays, Streamed) else gathered(step))
+        parts = streamed(step) if isinstance(arrays, Streamed) else gathered(step)
+        return [place(part) for part in parts]
 
     with contextlib.closing(stream), ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
         ahead = None

@@ -9,9 +9,11 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh
 
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.batches import ordered_batches
+from tflane_jax.devices import divided, everywhere, prediction_mesh, replicated, share
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Example, Prediction, stack_examples
 
@@ -37,10 +39,14 @@ class Predictor(Protocol):
         ...
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def predict_batch(task: Predictor, params: Params, batch: Any) -> Prediction:
-    """Return the predictions for a batch (leading axis on every leaf); compiled once per task and shape."""
-    return jax.vmap(task.predict, in_axes=(None, 0))(params, batch)
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def predict_batch(task: Predictor, params: Params, batch: Any, mesh: Mesh | None = None) -> Prediction:
+    """Return the predictions for a batch (leading axis on every leaf); compiled once per task and shape.
+
+    With a mesh, which divides the batch, every device gets all predictions.
+    """
+    answers = jax.vmap(task.predict, in_axes=(None, 0))(params, batch)
+    return answers if mesh is None else lax.with_sharding_constraint(answers, everywhere(mesh))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -68,15 +74,18 @@ def predicted_batches(
     """Yield indices, stacked examples and stacked predictions; padding may add examples beyond the indices.
 
     A model with memory processes the examples in order, as a stream; at the start of a scene, `has_previous` is False
-    and its memory is ignored.
+    and its memory is ignored. Several devices share each batch, if they can do so evenly.
     """
-    params = jax.device_put(params)
+    mesh = None if task.streams else prediction_mesh(batch_size)
+    params, (part, parts) = replicated(params, mesh), share(mesh)
+    mine = slice(part * batch_size // parts, (part + 1) * batch_size // parts)
     memory = task.start() if task.streams else None
     for indices, batch in ordered_batches(arrays, batch_size):
         if task.streams:
             memory, answers = predict_stream(task, params, memory, batch)
         else:
-            answers = predict_batch(task, params, batch)
+            rows = divided(jax.tree.map(lambda leaf: leaf[mine], batch), mesh) if mesh is not None else batch
+            answers = predict_batch(task, params, rows, mesh)
         answers, kept = jax.device_get(answers), slice(len(indices))
         yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 

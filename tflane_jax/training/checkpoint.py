@@ -202,14 +202,27 @@ class Checkpoints:
 def _save_tree(folder: Path, tree: dict[str, np.ndarray]) -> None:
     import orbax.checkpoint as ocp
 
-    with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as writer:
+    with _checkpointer() as writer:
         writer.save(folder.absolute(), args=ocp.args.PyTreeSave(unflatten_dict(tree, sep="/")))
+
+
+def _checkpointer() -> Any:
+    """Return orbax's reader and writer, for this process alone: it would wait for others that train with it."""
+    import orbax.checkpoint as ocp
+
+    if jax.process_count() == 1:
+        return ocp.Checkpointer(ocp.PyTreeCheckpointHandler())
+    me = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process_{me}"
+    )
+    return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(multiprocessing_options=alone), multiprocessing_options=alone)
 
 
 def _load_tree(folder: Path) -> dict[str, np.ndarray]:
     import orbax.checkpoint as ocp
 
-    with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as reader:
+    with _checkpointer() as reader:
         names = reader.metadata(folder.absolute()).item_metadata.tree
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), names)
         return _flat(reader.restore(folder.absolute(), args=ocp.args.PyTreeRestore(restore_args=as_numpy)))

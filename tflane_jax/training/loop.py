@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +20,17 @@ from tqdm import tqdm
 
 from tflane_jax.config_io import first_difference
 from tflane_jax.datasets.batches import Prepare, batches, first_example
+from tflane_jax.devices import divided, on_host, replicated, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.models.parameters import Params
+from tflane_jax.processes import apart, arrays_from_first, from_first, is_first, stop_signal
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
-from tflane_jax.training.records import Record, RecordWriter
+from tflane_jax.training.records import Record, RecordWriter, Unwritten
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
@@ -147,22 +150,28 @@ def train(
             the last good state was written.
     """
     _check(config)
+    progress = progress and is_first()
+    mesh = training_mesh(config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
     if adaptive is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
     optimizer = make_optimizer(optim, config.steps)
-    with claimed(folder, start), StopRequest() as stop:
+    with contextlib.ExitStack() as stack, StopRequest() as stop:
         # =============================================================================================================
         # Run folder
         # =============================================================================================================
-        if start == "resume":
-            saved, notices = (current_form or _unchanged)(read_config(folder))
-            if difference := first_difference(saved, resolved):
-                raise UserError(
-                    f"{folder} was started with another configuration ({difference}): "
-                    "resume it as it is, or start another run"
-                )
-            _tell(notices)
+        def claim() -> None:
+            stack.enter_context(claimed(folder, start))
+            if start == "resume":
+                saved, notices = (current_form or _unchanged)(read_config(folder))
+                if difference := first_difference(saved, resolved):
+                    raise UserError(
+                        f"{folder} was started with another configuration ({difference}): "
+                        "resume it as it is, or start another run"
+                    )
+                _tell(notices)
+
+        from_first(claim)
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
         # =============================================================================================================
@@ -171,30 +180,43 @@ def train(
         states = init_states(task, optimizer, config.seeds, first_example(arrays))
         window, metrics, seconds = _Window(), {}, 0.0
         memories, started_from = [Memory() for _ in config.seeds], {}
-        if start == "resume" and (written := checkpoints.steps()):
-            manifest = checkpoints.manifest(written[-1])
-            states = per_seed(checkpoints.restore(manifest.step, of_all_seeds(states)), config.seeds)
-            window, seconds = _Window(**manifest.progress["window"]), manifest.progress["seconds"]
-            metrics = manifest.progress["metrics"]
-            memories = [Memory(**memory) for memory in manifest.progress.get("cycles", [])] or memories
-        elif config.init_from is not None:
-            given = starting_params(config.init_from, states, config.seeds, partly=config.init_partly)
+        if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
+            whole = of_all_seeds(states)
+            states = per_seed(
+                arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole), config.seeds
+            )
+            progress_so_far = latest["progress"]
+            window, seconds = _Window(**progress_so_far["window"]), progress_so_far["seconds"]
+            metrics = progress_so_far["metrics"]
+            memories = [Memory(**memory) for memory in progress_so_far.get("cycles", [])] or memories
+        elif (origin := config.init_from) is not None:
+            fresh = states
+            given = arrays_from_first(
+                lambda: starting_params(origin, fresh, config.seeds, partly=config.init_partly),
+                [state.params for state in fresh],
+            )
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
-            started_from = {"init_from": origins(config.init_from, config.seeds)}
+            started_from = {"init_from": from_first(lambda: origins(origin, config.seeds))}
+        states = [replicated(state, mesh) for state in states]
         first = step = int(states[0].step)
-        _tell(add_provenance(folder, **started_from))
-        write_text(folder / "config.txt", resolved_text)
-        write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
+
+        def begin() -> None:
+            _tell(add_provenance(folder, **started_from))
+            write_text(folder / "config.txt", resolved_text)
+            write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
+
+        from_first(begin)
 
         # =============================================================================================================
         # Compile
         # =============================================================================================================
         began = time.perf_counter()
-        feed = batches(arrays, config.seeds, range(first, config.steps), config.batch_size, prepare)
+        place, order = partial(divided, mesh=mesh), range(first, config.steps)
+        feed = batches(arrays, config.seeds, order, config.batch_size, prepare, share=share(mesh), place=place)
         batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1)
+            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1, mesh=mesh)
         compile_seconds = time.perf_counter() - began
         if progress:
             tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)
@@ -206,17 +228,17 @@ def train(
             carried = {"window": asdict(window), "seconds": seconds, "metrics": metrics}
             if adaptive is not None:
                 carried["cycles"] = [asdict(memory) for memory in memories]
-            checkpoints.save(
-                of_all_seeds(states), Manifest(step=step, config=resolved, metrics=evaluated, progress=carried)
-            )
+            manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried)
+            kept = of_all_seeds([on_host(state) for state in states])
+            from_first(lambda: str(checkpoints.save(kept, manifest)))
 
-        stepping, saved_step = 0.0, first
+        stepping, saved_step, stopped = 0.0, first, stop_signal(stop.signal, 0)
         with (
             contextlib.closing(feed),
-            RecordWriter(folder, first) as writer,
+            RecordWriter(folder, first) if is_first() else Unwritten() as writer,
             tqdm(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
         ):
-            while batch is not None and stop.signal is None:
+            while batch is not None and stopped is None:
                 began = time.perf_counter()
                 states, values = update_all(update, states, batch)
                 if not values["finite"].all():
@@ -236,22 +258,25 @@ def train(
                     bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
                     window = _Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
-                    evaluations = [evaluate(state.ema_params) for state in states]
+                    measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
+                    evaluations = from_first(lambda measured=measured: measured)
                     writer.write(_seed_record(step, "val", {k: [e[k] for e in evaluations] for k in evaluations[0]}))
                     metrics = {k: float(np.mean([e[k] for e in evaluations])) for k in evaluations[0]}
                     if adaptive is not None:
                         together = of_all_seeds([state.opt_state for state in states])
                         together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
-                        changed = per_seed(together, config.seeds)
+                        changed = replicated(per_seed(together, config.seeds), mesh)
                         states = [replace(s, opt_state=o) for s, o in zip(states, changed, strict=True)]
                         writer.write(_seed_record(step, "cycle", cycles))
                     save(metrics)
                     saved_step = step
-                    if draw is not None:
-                        draw(folder, step, states[0].ema_params, writer.records)
+                    if draw is not None and is_first():
+                        with apart():
+                            draw(folder, step, states[0].ema_params, writer.records)
                 elif step % config.checkpoint_every == 0 or is_last:
                     save({})
                     saved_step = step
+                stopped = stop_signal(stop.signal, step)
 
             # =========================================================================================================
             # Stop
@@ -259,7 +284,14 @@ def train(
             if step > saved_step:
                 save({})
         rate = (step - first) / stepping if stepping else 0.0
-        return TrainingResult(step, metrics, compile_seconds, rate, stop.signal if step < config.steps else None)
+        return TrainingResult(step, metrics, compile_seconds, rate, stopped if step < config.steps else None)
+
+
+def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
+    """Return step and progress of the latest checkpoint; None if there is none."""
+    if not (steps := checkpoints.steps()):
+        return None
+    return {"step": steps[-1], "progress": checkpoints.manifest(steps[-1]).progress}
 
 
 def _check(config: TrainingConfig) -> None:

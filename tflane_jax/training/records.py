@@ -69,5 +69,22 @@ class RecordWriter:
         self._board.close()
 
 
+class Unwritten:
+    """The records of a process that writes none."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def write(self, record: Record) -> None:
+        """Keep one record."""
+        self.records.append(record)
+
+    def __enter__(self) -> Unwritten:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
 def _line(record: Record) -> str:
     return json.dumps(record) + "\n"

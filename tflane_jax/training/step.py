@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
+from tflane_jax.devices import active, everywhere
 from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
@@ -27,7 +29,9 @@ Metrics = dict[str, jax.Array]
 UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 
 
-def make_update_step(task: Trainable, optim: OptimConfig, steps: int, *, donate: bool = True) -> UpdateStep:
+def make_update_step(
+    task: Trainable, optim: OptimConfig, steps: int, *, donate: bool = True, mesh: Mesh | None = None
+) -> UpdateStep:
     """Return the jitted update (state, batch) -> (state, metrics) of one seed.
 
     Metrics: `loss`, the task's terms as `loss/<term>` (a name with a group, "matching/lanes", stays as it is),
@@ -39,8 +43,11 @@ def make_update_step(task: Trainable, optim: OptimConfig, steps: int, *, donate:
         task, optim: what to train, and how.
         steps: of the whole run.
         donate: give the memory of the input state to the new one; the input state cannot be used again.
+        mesh: of several devices, on each of which the new state and the metrics are.
     """
-    return jax.jit(_traced_once(_update(task, optim, steps)), donate_argnums=0 if donate else ())
+    update = _traced_once(_update(task, optim, steps))
+    placed: Any = {} if mesh is None else {"out_shardings": everywhere(mesh)}
+    return jax.jit(update, donate_argnums=0 if donate else (), **placed)
 
 
 def update_all(
@@ -60,23 +67,47 @@ def update_all(
 
 
 def compiled_update(
-    task: Trainable, optim: OptimConfig, steps: int, state: TrainState, batch: Any, *, donate: bool = True
+    task: Trainable,
+    optim: OptimConfig,
+    steps: int,
+    state: TrainState,
+    batch: Any,
+    *,
+    donate: bool = True,
+    mesh: Mesh | None = None,
 ) -> UpdateStep:
     """Return the update of one seed, compiled for the shapes of a state and a batch.
 
     A process compiles it once: trainings that differ only in seeds or starting parameters use the same program.
+
+    Args:
+        task, optim, steps, donate: see `make_update_step`.
+        state, batch: with `mesh` as `devices.replicated` and `devices.divided` return them.
+        mesh: see `devices.training_mesh`.
     """
     leaves, tree = jax.tree.flatten((state, batch))
-    return _compiled(task, optim, steps, donate, tree, tuple(jax.typeof(leaf) for leaf in leaves))
+    placed = tuple(leaf.sharding if mesh is not None else None for leaf in leaves)
+    return _compiled(task, optim, steps, donate, tree, tuple(jax.typeof(leaf) for leaf in leaves), placed, mesh)
 
 
 @functools.lru_cache(maxsize=16)
 def _compiled(
-    task: Trainable, optim: OptimConfig, steps: int, donate: bool, tree: Any, types: tuple[Any, ...]
+    task: Trainable,
+    optim: OptimConfig,
+    steps: int,
+    donate: bool,
+    tree: Any,
+    types: tuple[Any, ...],
+    placed: tuple[Any, ...],
+    mesh: Mesh | None,
 ) -> UpdateStep:
-    update: Any = make_update_step(task, optim, steps, donate=donate)
-    shapes = [jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in types]
-    return update.lower(*jax.tree.unflatten(tree, shapes)).compile()
+    update: Any = make_update_step(task, optim, steps, donate=donate, mesh=mesh)
+    shapes = [
+        jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type, sharding=where)
+        for each, where in zip(types, placed, strict=True)
+    ]
+    with active(mesh):
+        return update.lower(*jax.tree.unflatten(tree, shapes)).compile()
 
 
 def _traced_once(update: UpdateStep) -> UpdateStep:

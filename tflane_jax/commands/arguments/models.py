@@ -31,6 +31,13 @@ def train(commands) -> None:
     start.add_argument(
         "--overwrite", action="store_const", const="overwrite", dest="start", help="delete the run in --out first"
     )
+    several = parser.add_argument_group("one training by several processes (docs/scale.md)")
+    several.add_argument(
+        "--distributed", action="store_true", help="join the processes that the cluster started: Slurm, Open MPI, ..."
+    )
+    several.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0, without a cluster")
+    several.add_argument("--processes", type=int, metavar="N", help="number of processes")
+    several.add_argument("--process", type=int, metavar="I", help="number of this one, from 0")
     parser.add_argument("-h", "--help", action="store_true", dest="wants_help", help="show this and exit")
     parser.set_defaults(start="new", takes_overrides=True, usage=parser.format_help())
 

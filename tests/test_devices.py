@@ -1,0 +1,68 @@
+"""Several devices: the numbers of one, evenly shared batches, bit-identical resumes. A CPU plays them all."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tests.shared import ROOT
+from tests.slow import with_slow
+from tests.training.many_devices import BATCH, EVENLY, assignments, predicted
+from tests.training.stub_run import run
+from tests.training.test_loop import arrays, timeless
+
+
+@pytest.fixture(scope="module", params=with_slow([2, 8], quick=[8]))
+def forced(request, tmp_path_factory):
+    """Return the folder of a process with so many devices, and what it says."""
+    folder = tmp_path_factory.mktemp("devices")
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={request.param}"
+    ended = subprocess.run(
+        [sys.executable, "-m", "tests.training.many_devices", str(folder)],
+        cwd=ROOT,
+        env=os.environ | {"XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert ended.returncode == 0, ended.stderr
+    facts = json.loads(ended.stdout.splitlines()[-1])
+    assert facts["devices"] == request.param
+    return folder, facts
+
+
+def test_training_gives_the_numbers_of_one_device(forced, tmp_path):
+    run(tmp_path / "run", config=EVENLY)
+    one, many = timeless(tmp_path / "run"), timeless(forced[0] / "whole")
+    assert len(one) == len(many)
+    for expected, found in zip(one, many, strict=True):
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            if name != "split":
+                np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
+
+
+def test_a_resume_is_bit_identical(forced):
+    folder, _ = forced
+    assert arrays(folder / "resumed") == arrays(folder / "whole")
+    assert timeless(folder / "resumed") == timeless(folder / "whole")
+
+
+def test_each_device_matches_its_own_examples(forced):
+    for backend, found in forced[1]["assignments"].items():
+        assert found == assignments(backend)
+
+
+def test_devices_share_predictions_or_one_makes_them(forced):
+    for found in (forced[1]["predicted"], forced[1]["predicted by one"]):
+        np.testing.assert_allclose(found, predicted(BATCH), rtol=1e-5, atol=1e-6)
+
+
+def test_a_batch_that_cannot_be_shared_evenly_is_refused(forced):
+    devices = forced[1]["devices"]
+    assert forced[1]["refused"] == (
+        f"training.batch_size is 9, which {devices} devices cannot share evenly: choose a multiple of {devices}"
+    )

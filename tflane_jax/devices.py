@@ -1,0 +1,94 @@
+"""Data parallelism: parameters are on every device, each batch is divided among the devices by examples.
+
+A program stays one program over all devices of all processes (GSPMD): XLA divides what is done for each example, and
+adds up gradients and batch statistics. A loss is therefore that of the whole batch, and equal on one device and on many
+up to rounding. With one device nothing here changes anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from tflane_jax import processes
+from tflane_jax.errors import UserError
+
+DATA_AXIS = "data"
+"""Axis of the mesh that divides a batch."""
+
+
+def training_mesh(batch_size: int) -> Mesh | None:
+    """Return the mesh over all devices of all processes; None if there is one device.
+
+    Raises UserError if the devices cannot share a batch evenly.
+    """
+    devices = jax.device_count()
+    if batch_size % devices:
+        raise UserError(
+            f"training.batch_size is {batch_size}, which {devices} devices cannot share evenly: "
+            f"choose a multiple of {devices}"
+        )
+    return prediction_mesh(batch_size)
+
+
+def prediction_mesh(batch_size: int) -> Mesh | None:
+    """Return the mesh over all devices; None if there is one, or if they cannot share a batch evenly.
+
+    A process that works `apart` from the others has no mesh either.
+    """
+    devices = jax.devices()
+    if len(devices) == 1 or batch_size % len(devices) or processes.count() < jax.process_count():
+        return None
+    return Mesh(np.array(devices), (DATA_AXIS,), axis_types=(AxisType.Auto,))
+
+
+def active(mesh: Mesh | None) -> contextlib.AbstractContextManager[Any]:
+    """Return a context in which programs for `mesh` are traced."""
+    return contextlib.nullcontext() if mesh is None else jax.set_mesh(mesh)
+
+
+def everywhere(mesh: Mesh | None) -> NamedSharding | None:
+    """Return the sharding of arrays that are whole on every device; None for the default device."""
+    return None if mesh is None else NamedSharding(mesh, PartitionSpec())
+
+
+def replicated(tree: Any, mesh: Mesh | None) -> Any:
+    """Put a tree that every process holds on every device; on the default device for None."""
+    if jax.device_count() == 1:
+        return jax.device_put(tree)
+    return jax.tree.map(lambda leaf: _put(leaf, everywhere(mesh)), tree)
+
+
+def _put(leaf: Any, sharding: NamedSharding | None) -> Any:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), sharding))
+    host = np.asarray(leaf)  # the array may be on all devices
+    return jax.device_put(host) if sharding is None else jax.make_array_from_process_local_data(sharding, host)
+
+
+def on_host(tree: Any) -> Any:
+    """Return a tree that one process can work with: as it is, or without the devices of other processes."""
+    return tree if processes.count() == 1 else replicated(tree, None)
+
+
+def divided(rows: Any, mesh: Mesh | None) -> Any:
+    """Put a batch on the devices, divided along the leading axis.
+
+    Args:
+        rows: the examples of this process's own devices (`share`).
+        mesh: None for one device.
+    """
+    if mesh is None:
+        return jax.device_put(rows)
+    sharding = NamedSharding(mesh, PartitionSpec(DATA_AXIS))
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), rows)
+
+
+def share(mesh: Mesh | None) -> tuple[int, int]:
+    """Return (index, count) of this process among those that divide every batch."""
+    return (0, 1) if mesh is None else (jax.process_index(), jax.process_count())

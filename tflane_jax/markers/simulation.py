@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.markers.observe import frame_before
+from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.bev.line_of_sight import hidden_points
 
@@ -82,14 +84,15 @@ PERFECT = MarkerSimulationConfig(forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0
 
 @dataclass(frozen=True)
 class MarkerConfig:
-    """The marker prior of an example.
+    """The marker prior of an example: detections are simulated, or found in images with `pixels`.
 
     Attributes:
         markers, lanes, points: capacities M and J, and points P on each lane. In 2000 frames of the test world never
             more than one marker was detected, with at most 34 lanes in range. Beyond the capacities the
             farthest markers, and the lanes farthest from their marker, are dropped.
         radius: lanes within this distance of a marker are stored, metres.
-        simulation: of the detections.
+        simulation: of the detections; with `pixels` only its residual settings apply.
+        pixels: detect the boards in native images of the built-in world's cameras instead; None simulates.
     """
 
     markers: int = 2
@@ -97,6 +100,7 @@ class MarkerConfig:
     points: int = 11
     radius: float = 50.0
     simulation: MarkerSimulationConfig = MarkerSimulationConfig()
+    pixels: PixelConfig | None = None
 
 
 class SimulatedMarkers(NamedTuple):
@@ -163,12 +167,8 @@ def moment_before(log: Log, keyframe: int, interval: float | None) -> KeyFrame |
     if interval is None:
         return log.keyframes[keyframe - 1] if keyframe > 0 else None
     earlier = log.timestamps_ns[: moment.track_frame]
-    if not len(earlier):
-        return None
-    off = np.abs(earlier - (moment.timestamp_ns - interval * 1e9))
-    frame = int(off.argmin())
-    # At a gap or at the start of the log the nearest frame is too far from the requested time.
-    if off[frame] > 0.5e9 * interval:
+    frame = frame_before(earlier, moment.timestamp_ns, interval)
+    if frame is None:
         return None
     return KeyFrame(int(earlier[frame]), log.global_from_ego[frame], frame)
 

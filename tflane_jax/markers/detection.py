@@ -72,10 +72,10 @@ def detect(
         sizes: surveyed side of the black square by id, metres (`MarkerStore.sizes`); other ids have `config.size`. The
             distance of a marker is proportional to it.
     """
-    return place_markers(views, [_found_in(views, number, config) for number in _valid(views)], config, sizes)
+    return locate(views, [_found_in(views, number, config) for number in _valid(views)], config, sizes)
 
 
-def place_markers(
+def locate(
     views: CameraViews,
     found: Sequence[ImageMarkers],
     config: DetectorConfig = DetectorConfig(),

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
-from tflane_jax.markers.detection import DetectedMarkers, place_markers
+from tflane_jax.markers.detection import DetectedMarkers, locate
 from tflane_jax.markers.image_search import DetectorConfig, ImageMarkers, find_markers, joined
 from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.scene import CameraViews
@@ -79,7 +79,7 @@ def detect_in_world(
                 parts.append(_shifted(find_markers(pixels, config.detector), corner))
         found.append(joined(parts))
     sizes = dict.fromkeys(np.asarray(markers.marker_id).tolist(), float(markers.size))
-    return place_markers(_empty_views(cameras), found, config.detector, sizes)
+    return locate(_empty_views(cameras), found, config.detector, sizes)
 
 
 def _window(

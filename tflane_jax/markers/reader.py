@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, relative_pose
-from tflane_jax.markers.detection import DetectedMarkers, detect, place_markers
+from tflane_jax.markers.detection import DetectedMarkers, detect, locate
 from tflane_jax.markers.image_search import DetectorConfig, ImageMarkers
 from tflane_jax.markers.observe import Observed, frame_before, observe
 from tflane_jax.markers.store import MarkerStore
@@ -87,7 +87,7 @@ class MarkerReader:
         if found is None:
             detected = detect(views, config.detector, sizes)
         else:
-            detected = place_markers(views, found, config.detector, sizes)
+            detected = locate(views, found, config.detector, sizes)
         number = frame_before([past.timestamp_ns for past in self._past], timestamp_ns, config.residual_interval)
         before = None if number is None else self._past[number]
         observed = observe(

@@ -15,8 +15,11 @@ from jaxtyping import Bool, Float, Int
 from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.markers.observe import frame_before
 from tflane_jax.markers.pixels import PixelConfig
+from tflane_jax.markers.visibility import seen_fraction
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount
+from tflane_jax.world.cameras.stage import static_boxes
 
 ROOT = 20_251_123
 
@@ -41,9 +44,14 @@ class MarkerSimulationConfig:
             5 pixels for each of the 7 cells of a 5x5 ArUco marker.
         range: largest distance at which a marker is visible, metres (the paper's curves end at 60 m).
         field_of_view: full angle of view ahead, degrees.
+        cameras: the whole square must lie in the image of one of them, with the calibration of the log; None asks for
+            the field of view alone, which has no upper end.
         frontal: largest angle, from straight at the face, of both the line of sight and the vehicle's heading, degrees:
             a marker is visible only to a vehicle that approaches it frontally.
-        occlusion: "line_of_sight": road users and buildings hide markers; "none": nothing does.
+        occlusion: "bodies": road users, buildings, masts, signs, lamp posts and trees hide markers (needs OpenCV; of
+            real logs the first two are known); "line_of_sight": road users and buildings hide the middle of a marker;
+            "none": nothing does.
+        least_seen: with "bodies", smallest visible fraction of a square that is detected.
         score: range from which the detection score is drawn (uniform).
         residual_interval: r compares with the observation this many seconds before (the paper's frames come at 2 Hz);
             None compares with the previous key frame.
@@ -63,7 +71,9 @@ class MarkerSimulationConfig:
     range: float = 60.0
     field_of_view: float = 120.0
     frontal: float = 60.0
-    occlusion: Literal["line_of_sight", "none"] = "line_of_sight"
+    cameras: tuple[CameraMount, ...] | None = None
+    occlusion: Literal["bodies", "line_of_sight", "none"] = "line_of_sight"
+    least_seen: float = 0.75
     score: tuple[float, float] = (1.0, 1.0)
     residual_interval: float | None = 0.5
     first_residual: float = 0.0
@@ -130,6 +140,11 @@ def simulate_detections(
     """
     true = relative_pose(moment.global_from_ego, markers.pose)
     seen = visible(true, config)
+    if config.cameras is not None or config.occlusion == "bodies":
+        mounts = config.cameras or ARGOVERSE2_RING
+        bodies = static_boxes(log) if config.occlusion == "bodies" else None
+        shown = seen_fraction(log, moment, true[seen], markers.size, mounts, bodies, framed=config.cameras is not None)
+        seen[seen] = shown >= (config.least_seen if config.occlusion == "bodies" else 1.0)
     if config.occlusion == "line_of_sight":
         seen[seen] = ~_hidden(log, moment, true[seen])
     count = len(seen)

@@ -39,7 +39,7 @@ from tflane_jax.markers.store_files import load_store, save_store
 from tflane_jax.plots import format_table
 from tflane_jax.plots.marker_drive import save_drive_frame
 from tflane_jax.runs import open_run
-from tflane_jax.scene.marker_patterns import MarkerFamily
+from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, check_model
 from tflane_jax.training.runtime import configure_jax
@@ -115,7 +115,10 @@ def _with_capacities(config: ReaderConfig, model: DriveModel | None) -> ReaderCo
 def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig:
     if options.family not in MarkerFamily.__members__:
         raise UserError(f"there is no marker family {options.family}: one of {', '.join(MarkerFamily.__members__)}")
-    return DetectorConfig(MarkerFamily[options.family])
+    family = MarkerFamily[options.family]
+    # Of a partly hidden board only these ids can be told apart; whole ones are read whatever their id.
+    ids = tuple(number for number in sorted(store.markers) if number < marker_count(family))
+    return DetectorConfig(family, search=options.search, ids=ids)
 
 
 def _day(options: argparse.Namespace) -> datetime.date:

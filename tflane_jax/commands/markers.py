@@ -41,7 +41,13 @@ _OUTLINE = (255, 210, 0)
 def find(options: argparse.Namespace) -> int:
     """Detect markers in photos of one calibrated camera; print a table, write pictures and detections.json."""
     photos = list_photos(options.images)
-    config = DetectorConfig(_family(options.family), options.size, corners=options.corners, enlarge=options.enlarge)
+    config = DetectorConfig(
+        _family(options.family),
+        options.size,
+        corners=options.corners,
+        enlarge=options.enlarge,
+        search=options.search,
+    )
     config.validate()
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)

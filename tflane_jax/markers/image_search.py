@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.markers.corner_refinement import refine_corners
+from tflane_jax.markers.occluded_search import find_occluded
 from tflane_jax.scene.marker_patterns import MarkerFamily, dictionary_of, marker_cells
 
 # Window widths of OpenCV's adaptive threshold, pixels: its defaults.
@@ -32,6 +33,10 @@ class DetectorConfig:
         corners: "pattern" fits all printed cells to the image, "subpixel" refines each corner separately, "none" keeps
             the pixels of the outline.
         enlarge: factor by which images are enlarged before the search; a larger one finds smaller markers, more slowly.
+        search: "outlines": OpenCV's search alone, which needs the whole outline of a square; "all": also boards that
+            are partly hidden, dirty or half in the shadow (`occluded_search`), in several times the time.
+        ids: that partly hidden boards may have, for example those of the store; None: all of the family. The fewer, the
+            more of a board may be hidden.
         least_pixels: smallest side of a detected square, pixels of the given image.
         ambiguous: the prior chooses between the two poses if the ratio of the smaller to the greater error is above
             this; 1 never uses the prior.
@@ -44,6 +49,8 @@ class DetectorConfig:
     capacity: int = 16
     corners: Literal["pattern", "subpixel", "none"] = "pattern"
     enlarge: int = 1
+    search: Literal["outlines", "all"] = "outlines"
+    ids: tuple[int, ...] | None = None
     least_pixels: float = 8.0
     ambiguous: float = 0.6
     tilt: float = 0.05
@@ -101,6 +108,12 @@ def find_markers(
             if config.corners == "pattern":
                 corners = refine_corners(grey, corners, cells)
             found.append(_Reading(marker_id, _fit(cv2, grey, corners, cells), corners))
+    if config.search == "all":
+        for each in find_occluded(grey, config.family, config.least_pixels * config.enlarge, config.ids):
+            cells = marker_cells(config.family, each.marker_id)
+            found.append(
+                _Reading(each.marker_id, (each.wrong_bits, _fit(cv2, grey, each.corners, cells)[1]), each.corners)
+            )
     return _as_arrays(_one_for_each_place(found), config.enlarge)
 
 

@@ -38,7 +38,7 @@ class PixelConfig:
     """
 
     rig: CameraRigConfig = CameraRigConfig(cameras=ARGOVERSE2_RING[:3], scale=1.0, markers=True)
-    detector: DetectorConfig = DetectorConfig()
+    detector: DetectorConfig = DetectorConfig(search="all")
     range: float = 70.0
 
     def native(self, cameras: CameraRigConfig | None) -> CameraRigConfig:

@@ -72,6 +72,12 @@ def markers(commands) -> None:
         help="sigma_d of the paper's detection curve in the picture, metres (default 40)",
     )
     curves.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    detect.add_argument(
+        "--search",
+        choices=("outlines", "all"),
+        default="outlines",
+        help="all also finds partly hidden boards, more slowly (default outlines)",
+    )
     for parser, many in ((detect, False), (curves, True)):
         parser.add_argument("--family", default="ARUCO_5X5_100", help="marker family (default ARUCO_5X5_100)")
         parser.add_argument(
@@ -103,6 +109,9 @@ def _drive(inner) -> None:
     )
     run.add_argument("--model", metavar="RUN", type=Path, help="run folder of a model with cameras; default none")
     run.add_argument("--today", metavar="YYYY-MM-DD", help="day on which entries are valid (default the present day)")
+    run.add_argument(
+        "--search", choices=("all", "outlines"), default="all", help="all also finds partly hidden boards (default)"
+    )
     run.add_argument("--family", default="ARUCO_5X5_100", help="marker family (default ARUCO_5X5_100)")
     run.add_argument(
         "--threshold", type=float, default=0.3, help="lowest score of a lane that is drawn and written (default 0.3)"

@@ -47,6 +47,7 @@ def cache(tmp_path, monkeypatch):
 
 def arguments(folder, out, **changed):
     options = {"store": folder / "store.json", "images": folder, "poses": folder / "poses.json", "out": out}
+    options["search"] = "outlines"  # whole boards; the search for hidden ones takes seconds an image
     options |= {"today": "2026-02-01"} | changed
     return ["markers", "run", *(text for name, value in options.items() for text in (f"--{name}", str(value)))]
 

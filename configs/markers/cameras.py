@@ -15,6 +15,8 @@ from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig, uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
@@ -50,7 +52,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the other rows of the table, and gated fusion without memory."""
+    """Return the other rows of the table, gated fusion without memory of markers, and rows without memory of BEV."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
     markers = SMALL_MARKER_FUSION
@@ -59,7 +61,18 @@ def ablations() -> dict[str, RunConfig]:
         model = replace(config.task.model, priors=PriorsConfig(markers=changed))
         return replace(config, task=replace(config.task, model=model))
 
+    def alone(row: RunConfig) -> RunConfig:
+        """Return the row without memory of BEV features, as the host was trained."""
+        assert isinstance(row.task, LaneGraphTask)
+        encoder = row.task.model.encoder
+        assert isinstance(encoder, CameraEncoderConfig)
+        assert isinstance(encoder.bev, BevFormerConfig)
+        model = replace(row.task.model, encoder=replace(encoder, bev=replace(encoder.bev, memory="off")))
+        return replace(row, task=replace(row.task, model=model))
+
     return {
+        "toponet_single": alone(with_markers(None)),
+        "markers_single": alone(config),
         "toponet": with_markers(None),
         "uniform": with_markers(uniform_fusion(markers)),
         "ungated": with_markers(replace(markers, fusion="uniform")),

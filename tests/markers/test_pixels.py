@@ -9,6 +9,7 @@ from tests.markers.test_simulation import markers_at, standing
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.marker_observations import marker_observations, store_of_log
 from tflane_jax.errors import UserError
+from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.observe import observe
 from tflane_jax.markers.pixels import PixelConfig, detect_in_world
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
@@ -18,6 +19,8 @@ pytest.importorskip("cv2")
 
 # The front camera alone, at a third of its size: a board at 14 m is 42 pixels wide.
 CAMERAS = CameraRigConfig(cameras=ARGOVERSE2_RING[:1], scale=0.1, severity=0.0)
+
+PIXELS = PixelConfig(detector=DetectorConfig())  # whole boards, which are found faster
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +37,7 @@ def test_the_short_form_names_the_default_settings():
 
 
 def test_the_prior_of_an_example_is_the_composition_of_its_parts(scene, monkeypatch):
-    config = MarkerConfig(pixels=PixelConfig(), simulation=MarkerSimulationConfig(first_residual=50.0))
+    config = MarkerConfig(pixels=PIXELS, simulation=MarkerSimulationConfig(first_residual=50.0))
     small = replace(CAMERAS, scale=0.33, markers=True)
     monkeypatch.setattr(PixelConfig, "native", lambda self, cameras: small)  # a native image takes seconds
     found = marker_observations(scene, 5, config, ExampleConfig().range, bike_lanes=True, cameras=CAMERAS)
@@ -59,7 +62,7 @@ def test_the_prior_of_an_example_is_the_composition_of_its_parts(scene, monkeypa
 
 def test_a_moment_between_key_frames_can_be_drawn(scene):
     """As the key frame at the same time, but for noise."""
-    config, rig = PixelConfig(), replace(CAMERAS, scale=0.33, markers=True)
+    config, rig = PIXELS, replace(CAMERAS, scale=0.33, markers=True)
     late = replace(scene, keyframes=scene.keyframes[5:])
     poses = [detect_in_world(one, scene.keyframes[5], scene.markers, rig, config).pose[0] for one in (late, scene)]
     np.testing.assert_allclose(poses[0], poses[1], atol=0.05)

@@ -304,16 +304,14 @@ def _splits(m: int) -> tuple[tuple[_Side, ...], ...]:
     y, x = (axis.ravel() for axis in np.meshgrid(at, at, indexing="ij"))
     margin, border = (ring.ravel() for ring in rings(m))
 
-    def parts(*sides: np.ndarray) -> tuple[_Side, ...]:
-        return tuple(
-            (np.flatnonzero(side), *(np.flatnonzero(side & ring) for ring in (margin, border))) for side in sides
-        )
+    def part(side: np.ndarray) -> _Side:
+        return np.flatnonzero(side), np.flatnonzero(side & margin), np.flatnonzero(side & border)
 
-    found = [parts(np.ones(m * m, bool))]
+    found: list[tuple[_Side, ...]] = [(part(np.ones(m * m, bool)),)]
     for angle in np.arange(8) * np.pi / 8:
         for offset in (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3):
             side = x * np.cos(angle) + y * np.sin(angle) > offset
-            both = parts(side, ~side)
+            both = part(side), part(~side)
             if all(len(whites) >= 4 and len(blacks) >= 3 for _, whites, blacks in both):
                 found.append(both)
     return tuple(found)

@@ -3,7 +3,8 @@
     python -m benchmarks.marker_confidence --scenes 40
 
 The test split of `configs/markers/` with the paper's simulation, against the same frames without noise. The error of
-a detection is the mean displacement of the ground from 10 m behind to 30 m ahead of the vehicle.
+a detection is the mean displacement of the ground from 10 m behind to 30 m ahead of the vehicle. The other columns say
+by how much the detection's own lanes enter Eq. (3) in the rows of Table II: the weight of their tokens times c.
 """
 
 from __future__ import annotations
@@ -13,21 +14,57 @@ import dataclasses
 import itertools
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from benchmarks.timing import markdown_table
 from tflane_jax.config import load_config
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.geometry import PerceptionRange
 from tflane_jax.markers.simulation import PERFECT
+from tflane_jax.models.marker_fusion import (
+    SMALL_MARKER_FUSION,
+    MarkerFusionConfig,
+    fusion_gate,
+    uniform_fusion,
+)
+from tflane_jax.models.prior import HostSpec
 from tflane_jax.priors.markers import MarkerPriorConfig, confidence
+from tflane_jax.scene import Example
 
 CONFIG = Path(__file__).parent.parent / "configs" / "markers" / "host.py"
 _GROUND = np.array([[x, y, 0.0, 1.0] for x in (-10.0, 0.0, 10.0, 20.0, 30.0) for y in (-8.0, 0.0, 8.0)])
 _EDGES = (0.0, 1.0, 3.0, 10.0, np.inf)
 
 
-def measure(scenes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, of every detection, how far it is off (metres) and its confidence."""
+FUSIONS = {
+    "gated": SMALL_MARKER_FUSION,
+    "only c = 1": dataclasses.replace(SMALL_MARKER_FUSION, fusion="uniform"),
+    "uniform": uniform_fusion(SMALL_MARKER_FUSION),
+}
+
+
+class _Factor:
+    """How much the lanes of a frame's own markers enter Eq. (3), frame by frame."""
+
+    def __init__(self, config: MarkerFusionConfig):
+        assert config.memory is not None
+        # The whole union: its first rows are the lanes of the present frame.
+        self._config = dataclasses.replace(config, memory=dataclasses.replace(config.memory, lanes=None))
+        box = PerceptionRange()
+        prior = self._config.build(HostSpec(1, box, box))
+        self._observe, self._bank = jax.jit(prior.observe), prior.start()
+
+    def of(self, example: Example) -> float:
+        """Return the largest factor of the frame's lanes, 0 if only remembered ones are used."""
+        guide, self._bank = self._observe(example, self._bank)
+        gate, valid = fusion_gate(guide, self._config)
+        own = slice(self._config.prior.lanes)
+        return float(gate * (guide.weight * valid)[own].max())
+
+
+def measure(scenes: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Return, of every frame with one marker, how far it is off (metres), its confidence and its factors by fusion."""
     source = load_config(str(CONFIG)).data.source("test")
     assert isinstance(source, ProceduralConfig)
     assert source.example.markers is not None
@@ -37,9 +74,13 @@ def measure(scenes: int) -> tuple[np.ndarray, np.ndarray]:
         ProceduralDataset(dataclasses.replace(source, scenes=scenes, example=each)) for each in (example, exact)
     )
     off, trust = [], []
+    following = {name: _Factor(config) for name, config in FUSIONS.items()}
+    factors: dict[str, list[float]] = {name: [] for name in FUSIONS}
     for index in range(len(noisy)):
-        found, truth = noisy.example(index).markers, right.example(index).markers
-        if found is None or truth is None:
+        frame = noisy.example(index)
+        found, truth = frame.markers, right.example(index).markers
+        now = {name: factor.of(frame) for name, factor in following.items()}
+        if found is None or truth is None or found.valid.sum() != 1 or not found.lane_valid.any():
             continue
         for seen, true in np.argwhere(
             (found.marker_id[:, None] == truth.marker_id[None]) & found.valid[:, None] & truth.valid[None]
@@ -48,21 +89,24 @@ def measure(scenes: int) -> tuple[np.ndarray, np.ndarray]:
             off.append(np.linalg.norm((moved - _GROUND)[:, :2], axis=-1).mean())
             distance = np.linalg.norm(found.pose[seen][None, :2, 3], axis=-1)
             trust.append(float(confidence(distance, found.residual[seen][None], MarkerPriorConfig())[0]))
-    return np.array(off), np.array(trust)
+            for name, value in now.items():
+                factors[name].append(value)
+    return np.array(off), np.array(trust), {name: np.array(values) for name, values in factors.items()}
 
 
 def main() -> None:
     """Parse the command line, measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=40)
-    off, trust = measure(parser.parse_args().scenes)
+    off, trust, factors = measure(parser.parse_args().scenes)
     rows = []
     for low, high in itertools.pairwise(_EDGES):
         inside = (off >= low) & (off < high)
         mean = f"{trust[inside].mean():.3f}" if inside.any() else "-"
-        rows.append([f"{low:g} to {high:g} m", f"{inside.mean():.1%}", mean])
+        entering = [f"{values[inside].mean():.3f}" if inside.any() else "-" for values in factors.values()]
+        rows.append([f"{low:g} to {high:g} m", f"{inside.mean():.1%}", mean, *entering])
     print(f"{len(off)} detections, in the middle {np.median(off):.2f} m off\n")
-    print(markdown_table(["off by", "share", "mean confidence"], rows))
+    print(markdown_table(["off by", "share", "mean confidence", *factors], rows))
 
 
 if __name__ == "__main__":

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks import metrics, paper_sizes
+from benchmarks import marker_occlusion, metrics, paper_sizes
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.markers.square_pose import solve_square
 from tflane_jax.training.schedule import make_optimizer
 
 
@@ -46,6 +47,23 @@ def test_frames_of_the_metrics_hold_hits_and_misses(tmp_path):
             result = accumulator.compute()
             score = next(result[name] for name in ("DET_l", "F_score", "AP_ls", "mAP", "Accuracy") if name in result)
             assert 0.2 < score < 1.0, comparison.name
+
+
+@pytest.mark.parametrize("damage", ["none", "bar 10 %"])
+def test_composites_show_the_board_where_they_say(damage, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("TFLANE_SHARED", str(tmp_path))
+    photo = marker_occlusion.photographs()[0]
+    assert "invented pictures" in capsys.readouterr().out
+    drawn = [marker_occlusion.composite(photo, 10.0, damage, np.random.default_rng(seed)) for seed in range(2)]
+    for each in drawn:
+        found = marker_occlusion.search(each.image, "OpenCV")
+        if damage == "none":
+            assert found.marker_id.tolist() == [each.marker_id]
+            assert np.abs(found.corners[0] - each.outline).max() < 1.0
+            fit = solve_square(found.corners[0], each.camera, marker_occlusion.CAMERA)
+            assert abs(fit.camera_from_marker[0, 2, 3] - 10.0) < 0.4
+        else:
+            assert not len(found.marker_id)
 
 
 def test_table_is_aligned():

@@ -7,15 +7,17 @@
 
 The first command trains the host. Every row of the second starts from that one host; its seeds vary the new parameters
 and the order of the clips. The images show the marker boards, but too small to be read: detections are simulated as in
-`toponet_markers.py` (paper, section IV-A). Results: docs/markers.md.
+`toponet_markers.py` (paper, section IV-A), of boards that the rig's cameras see. Results: docs/markers.md.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
-from tflane_jax.markers.simulation import MarkerConfig
-from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig
+from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig, uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -31,9 +33,12 @@ def get_config() -> RunConfig:
     assert isinstance(host.task.model, TopoNetConfig)
     assert isinstance(host.data, WorldData)
     assert host.data.example.cameras is not None
-    world = replace(host.data.world, markers=PlacementConfig(side="both"))
+    world = replace(host.data.world, markers=PlacementConfig(side="both", site="clear"))
+    seen = MarkerSimulationConfig(cameras=host.data.example.cameras.cameras, occlusion="bodies")
     example = replace(
-        host.data.example, cameras=replace(host.data.example.cameras, markers=True), markers=MarkerConfig()
+        host.data.example,
+        cameras=replace(host.data.example.cameras, markers=True),
+        markers=MarkerConfig(simulation=seen),
     )
     # Denoising speeds up training from random weights; this decoder is trained already.
     model = replace(host.task.model, denoising=None, priors=PriorsConfig(markers=SMALL_MARKER_FUSION))
@@ -47,7 +52,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the other rows of the table, and gated fusion without memory."""
+    """Return the other rows of the table, gated fusion without memory of markers, and rows without memory of BEV."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
     markers = SMALL_MARKER_FUSION
@@ -56,9 +61,21 @@ def ablations() -> dict[str, RunConfig]:
         model = replace(config.task.model, priors=PriorsConfig(markers=changed))
         return replace(config, task=replace(config.task, model=model))
 
+    def alone(row: RunConfig) -> RunConfig:
+        """Return the row without memory of BEV features, as the host was trained."""
+        assert isinstance(row.task, LaneGraphTask)
+        encoder = row.task.model.encoder
+        assert isinstance(encoder, CameraEncoderConfig)
+        assert isinstance(encoder.bev, BevFormerConfig)
+        model = replace(row.task.model, encoder=replace(encoder, bev=replace(encoder.bev, memory="off")))
+        return replace(row, task=replace(row.task, model=model))
+
     return {
+        "toponet_single": alone(with_markers(None)),
+        "markers_single": alone(config),
         "toponet": with_markers(None),
-        "uniform": with_markers(replace(markers, fusion="uniform")),
+        "uniform": with_markers(uniform_fusion(markers)),
+        "ungated": with_markers(replace(markers, fusion="uniform")),
         "hard": with_markers(replace(markers, fusion="hard")),
         "no_memory": with_markers(replace(markers, memory=None)),
     }

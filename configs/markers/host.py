@@ -13,7 +13,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
-from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
@@ -22,14 +22,17 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
 from tflane_jax.world.simulate import WorldConfig
 
 # Eight frames half a second apart, as in OpenLane-V2.
-WORLD = WorldConfig(duration_s=5.6, keyframes=8, markers=PlacementConfig(side="both"))
+WORLD = WorldConfig(duration_s=5.6, keyframes=8, markers=PlacementConfig(side="both", site="clear"))
+# Boards that the cameras of the paper's dataset have in view.
+SEEN = MarkerSimulationConfig(cameras=ARGOVERSE2_RING, occlusion="bodies")
 # GNSS receiver: 2 m and 1 degree (standard deviations), on top of the map's own error of 1.5 m.
-EXAMPLE = ExampleConfig(markers=MarkerConfig(), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
+EXAMPLE = ExampleConfig(markers=MarkerConfig(simulation=SEEN), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
 
 
 def get_config() -> RunConfig:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.config import RunConfig, load_config
-from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION
+from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig, as_written, uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
@@ -30,7 +30,11 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the other rows of each table, and two variants beyond the paper."""
+    """Return the other rows of each table, and variants beyond the paper.
+
+    "uniform" trusts all markers alike (`uniform_fusion`); "ungated" only sets c = 1 in Eq. (3). Rows that end in
+    "everywhere" have no radius, those in "as_written" are Eq. (3) to the letter.
+    """
     memory = MARKERS.memory
     assert memory is not None
     table_1 = {
@@ -38,18 +42,35 @@ def ablations() -> dict[str, RunConfig]:
         "toponet": _tuned(),
         "toponet_smerf": _tuned(sd_map=SMALL_SD_MAP),
     }
-    table_2 = {name: _tuned(markers=replace(MARKERS, fusion=name)) for name in ("uniform", "hard")}
-    table_3 = {
-        "no_memory": _tuned(markers=replace(MARKERS, memory=None)),
-        "no_decay": _tuned(markers=replace(MARKERS, memory=replace(memory, decay=1.0))),
+    rows = _tables_2_to_4(MARKERS) | {
+        "ungated": _tuned(markers=replace(MARKERS, fusion="uniform")),
         "not_moved": _tuned(markers=replace(MARKERS, memory=replace(memory, compensation="none"))),
+        "scaled_twice": _tuned(markers=replace(MARKERS, memory=replace(memory, gate="strongest"))),
     }
-    table_4 = {name: _tuned(markers=replace(MARKERS, encoding=name)) for name in ("mlp", "transformer")}
+    # Every BEV cell sees every lane, and Eq. (3) as it stands in the paper: the same rows again.
+    for name, base in (("everywhere", replace(MARKERS, radius=None)), ("as_written", as_written(MARKERS))):
+        rows[name] = _tuned(markers=base)
+        rows |= {f"{row}_{name}": config for row, config in _tables_2_to_4(base).items()}
     beyond = {
         "connectivity": _tuned(markers=replace(MARKERS, connectivity=True)),
         "everything": _tuned(markers=MARKERS, sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()),
     }
-    return table_1 | table_2 | table_3 | table_4 | beyond
+    return table_1 | rows | beyond
+
+
+def _tables_2_to_4(base: MarkerFusionConfig) -> dict[str, RunConfig]:
+    """Return the rows of Tables II to IV beside a form of the paper's system."""
+    memory = base.memory
+    assert memory is not None
+    changed = {
+        "uniform": uniform_fusion(base),
+        "hard": replace(base, fusion="hard"),
+        "no_memory": replace(base, memory=None),
+        "no_decay": replace(base, memory=replace(memory, decay=1.0)),
+        "mlp": replace(base, encoding="mlp"),
+        "transformer": replace(base, encoding="transformer"),
+    }
+    return {name: _tuned(markers=markers) for name, markers in changed.items()}
 
 
 def _tuned(host: str = "host", **priors: Any) -> RunConfig:

@@ -8,7 +8,7 @@ import pytest
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.markers.curves import CurveConfig, Sighting, measure, street, summarise
-from tflane_jax.markers.detection import DetectorConfig
+from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.scene.marker_patterns import MarkerFamily
 
 pytest.importorskip("cv2")

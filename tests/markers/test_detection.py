@@ -4,21 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import invert_pose
-from tflane_jax.geometry.cameras import project
 from tflane_jax.markers.corner_refinement import refine_corners
-from tflane_jax.markers.detection import (
-    DetectorConfig,
-    detect,
-    detection_score,
-    find_markers,
-    marker_outline,
-    solve_square,
-)
+from tflane_jax.markers.detection import detect, detection_score
+from tflane_jax.markers.image_search import DetectorConfig, find_markers
+from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.scene import CameraViews
 from tflane_jax.scene.marker_patterns import (
     MarkerFamily,
@@ -114,7 +105,7 @@ def test_a_marker_is_found_at_its_pose(family, place):
     assert degrees_between(found.pose[0], truth) < 1.0
     assert found.reprojection[0] < 0.2
     assert 0.8 < found.score[0] <= 1.0
-    assert [column.dtype for column in found] == [np.int32, *[np.float32] * 4, np.int32, bool]
+    assert [column.dtype for column in found] == [np.int32, *[np.float32] * 4, np.int32, np.float32, bool, bool]
 
 
 @pytest.mark.parametrize("corners", ["subpixel", "none"])
@@ -212,51 +203,6 @@ def test_score_is_the_stated_formula():
     assert detection_score(square, 0, 0.0, ARUCO) > detection_score(square / 4.0, 0, 0.0, ARUCO) > 0.0
 
 
-@given(
-    x=st.floats(4.0, 40.0),
-    bearing=st.floats(-0.4, 0.4),
-    z=st.floats(0.5, 4.0),
-    turn=st.floats(-70.0, 70.0),
-)
-@settings(deadline=None, max_examples=30)
-def test_exact_corners_give_the_exact_pose(x, bearing, z, turn):
-    """Turned far enough for the two poses to differ, the right one is preferred."""
-    truth = pose(x, bearing * x, z, turn)
-    corners = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
-    fit = solve_square(corners, AHEAD.intrinsics, AHEAD.camera_from_ego)
-    found = invert_pose(AHEAD.camera_from_ego) @ fit.camera_from_marker
-    assert fit.error.min() < 1e-4
-    assert min(degrees_between(solution, truth) for solution in found) < 0.1
-    if fit.ambiguity < 0.5:
-        assert degrees_between(found[0], truth) < 0.1
-        np.testing.assert_allclose(found[0, :3, 3], truth[:3, 3], atol=1e-3 * x)
-    assert fit.ambiguity == pytest.approx((fit.error.min() + 1e-3) / (fit.error.max() + 1e-3))
-
-
-def test_the_prior_decides_where_both_poses_fit():
-    """Corners between those of both poses, nearer to the wrong one, which leans."""
-    truth = pose(22.0, 0.0, 9.0, 25.0)
-    camera = AHEAD
-    exact = marker_outline(truth, 1.0, camera.intrinsics, camera.camera_from_ego)
-    both = solve_square(exact, camera.intrinsics, camera.camera_from_ego)
-    wrong = invert_pose(camera.camera_from_ego) @ both.camera_from_marker[1]
-    assert degrees_between(wrong, truth) > 20.0
-    flipped = marker_outline(wrong, 1.0, camera.intrinsics, camera.camera_from_ego)
-    ego_from, doubtful = invert_pose(camera.camera_from_ego), 0
-    for share in np.linspace(0.0, 1.0, 81):
-        between = (1.0 - share) * exact + share * flipped
-        by_error = solve_square(between, camera.intrinsics, camera.camera_from_ego, DetectorConfig(ambiguous=1.0))
-        by_prior = solve_square(between, camera.intrinsics, camera.camera_from_ego)
-        right = [degrees_between(ego_from @ fit.camera_from_marker[0], truth) < 15.0 for fit in (by_error, by_prior)]
-        assert by_error.error[0] <= by_error.error[1]
-        if by_error.ambiguity <= 0.6:
-            assert right[0] == right[1] == (share < 0.5)
-        else:
-            doubtful += not right[0]
-            assert right[1]
-    assert doubtful > 0
-
-
 def test_refinement_corrects_moved_corners_and_stays_without_a_pattern():
     truth = pose(12.0, 0.3, 2.0, 25.0)
     grey = photo(AHEAD, {21: truth}).mean(-1).astype(np.uint8)
@@ -269,56 +215,33 @@ def test_refinement_corrects_moved_corners_and_stays_without_a_pattern():
     assert np.abs(refine_corners(noise, guess, cells) - guess).max() < 0.6 * 10.5  # cells, pixels of a cell
 
 
-def test_partial_occlusion_moves_the_corners_little():
-    """A post before the right margin, as dark as the square."""
-    truth = pose(12.0, 0.3, 2.0)
-    image = photo(AHEAD, {21: truth})
-    expected = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
-    right = round(float(expected[1, 0])) + 4
-    image[:, right : right + 9] = 25
-    found = find_markers(image)
-    assert found.marker_id.tolist() == [21]
-    assert np.abs(found.corners[0] - expected).max() < 0.25
+def test_the_surveyed_size_scales_the_distance():
+    """A board of half a metre at 6 m looks like one of a metre at 12 m."""
+    truth, image = pose(6.0, -0.5, 1.9), photo(AHEAD, {42: pose(12.0, -1.0, 2.3), 7: pose(9.0, 3.0, 2.0)})
+    found = detect(views((AHEAD, image)), sizes={42: 0.5, 3: 2.0})
+    rows = {int(number): k for k, number in enumerate(found.marker_id) if found.valid[k]}
+    assert rows.keys() == {42, 7}
+    np.testing.assert_allclose(found.pose[rows[42], :3, 3], truth[:3, 3], atol=0.03)
+    assert found.size[rows[42]] == 0.5
+    # An id without a surveyed size has the detector's.
+    assert found.size[rows[7]] == 1.0
+    np.testing.assert_allclose(found.pose[rows[7], :3, 3], [9.0, 3.0, 2.0], atol=0.04)
 
 
-def test_enlarging_keeps_pixels_where_they_are():
-    image = photo(AHEAD, {21: pose(14.0, 0.3, 2.0, 25.0)})
-    once, twice = (find_markers(image, DetectorConfig(enlarge=factor)) for factor in (1, 2))
-    assert once.marker_id.tolist() == twice.marker_id.tolist() == [21]
-    np.testing.assert_allclose(once.corners, twice.corners, atol=0.1)
-
-
-def test_outline_is_upper_left_first():
-    (left, top), _, (right, bottom), _ = marker_outline(
-        pose(10.0, 0.0, 1.5), 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego
-    )
-    np.testing.assert_allclose([left, top, right, bottom], [435.0, 225.0, 525.0, 315.0])
-    middle, _, _ = project(np.array([[10.0, 0.0, 1.5]]), AHEAD.intrinsics, AHEAD.camera_from_ego)
-    np.testing.assert_allclose(middle[0], [0.5 * (left + right), 0.5 * (top + bottom)])
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"capacity": 0},
-        {"enlarge": 0},
-        {"size": 0.0},
-        {"least_pixels": float("nan")},
-        {"tilt": 0.0},
-        {"turn": -1.0},
-    ],
-)
-def test_invalid_settings_are_refused(change):
-    with pytest.raises(UserError, match=next(iter(change))):
-        find_markers(np.zeros((60, 60), np.uint8), DetectorConfig(**change))
-
-
-@pytest.mark.parametrize("x", [4.0, 15.0, 39.7])
-def test_a_marker_that_exactly_faces_the_camera_has_a_pose(x):
-    """Seen exactly from the front, where OpenCV's solution is not a number."""
-    truth = pose(x, 0.0, 1.5)
-    corners = marker_outline(truth, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
-    fit = solve_square(corners, AHEAD.intrinsics, AHEAD.camera_from_ego)
-    for solution in invert_pose(AHEAD.camera_from_ego) @ fit.camera_from_marker:
-        assert degrees_between(solution, truth) < 0.2
-    assert fit.error.max() < 1e-3
+def test_two_boards_with_one_id_are_reported():
+    near, far, other = pose(9.0, -2.0, 2.0), pose(15.0, 2.0, 2.0), pose(11.0, 0.0, 2.0)
+    image = np.minimum(photo(AHEAD, {42: near}), photo(AHEAD, {5: other}))
+    second = photo(AHEAD, {42: far})
+    columns = slice(300, 430)  # of the second board
+    image[:, columns] = second[:, columns]
+    found = detect(views((AHEAD, image)))
+    assert sorted(found.marker_id[found.valid].tolist()) == [5, 42]
+    assert dict(zip(found.marker_id[:2].tolist(), found.contradictory[:2].tolist(), strict=True)) == {
+        42: True,
+        5: False,
+    }
+    # In two cameras: one board is one, two boards are a contradiction.
+    alone = detect(views((AHEAD, photo(AHEAD, {42: near})), (ASIDE, photo(ASIDE, {42: near}))))
+    assert not alone.contradictory.any()
+    apart = detect(views((AHEAD, photo(AHEAD, {42: near})), (ASIDE, photo(ASIDE, {42: far}))))
+    assert apart.contradictory.tolist() == [True, *[False] * 15]

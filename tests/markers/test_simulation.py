@@ -20,7 +20,8 @@ from tflane_jax.markers.simulation import (
     simulate_detections,
     visible,
 )
-from tflane_jax.scene.logs import PlacedMarkers
+from tflane_jax.scene.logs import MapElement, PlacedMarkers
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING
 from tflane_jax.world.roads.markers import marker_pose
 from tflane_jax.world.simulate import simulate
 
@@ -136,6 +137,26 @@ def test_road_users_and_buildings_hide_markers():
     assert simulate_detections(car, car.keyframes[0], placed, config).valid.tolist() == [True, True]
     house = standing(1, vector_map=replace(MAP, buildings=np.array([[30.0, 0.0, 5.0, 5.0, 0.3]])))
     assert simulate_detections(house, house.keyframes[0], placed, config).valid.tolist() == [True, False]
+
+
+def test_markers_must_be_in_the_image_and_clear_of_bodies():
+    placed = markers_at(4.0, 20.0)
+    scene, wide = replace(standing(1), markers=placed), replace(PERFECT, cameras=ARGOVERSE2_RING)
+
+    def seen(config, log=scene):
+        return simulate_detections(log, log.keyframes[0], placed, config).valid.tolist()
+
+    assert seen(PERFECT) == [True, True]
+    assert seen(wide) == [False, True]  # the near one is above the image
+    # A sign before the second one.
+    sign = MapElement(np.array([19.0, 0.0, 3.0]), np.pi, 2, 4, ())
+    signed = replace(scene, map=replace(MAP, elements=(sign,)))
+    assert seen(wide, signed) == [False, True]
+    assert seen(replace(wide, occlusion="bodies"), signed) == [False, False]
+    assert seen(replace(wide, occlusion="bodies", least_seen=0.1), signed) == [False, True]
+    assert seen(replace(PERFECT, occlusion="bodies"), signed) == [True, False]
+    # A real log, without boards, has no scenery.
+    assert seen(replace(wide, occlusion="bodies"), replace(signed, markers=None)) == [False, True]
 
 
 def test_random_draws_depend_on_seed_frame_and_id_only():

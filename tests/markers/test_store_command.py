@@ -11,7 +11,7 @@ from tflane_jax.cli import main
 from tflane_jax.datasets.argoverse2_log import load_log
 from tflane_jax.datasets.marker_observations import markers_of
 from tflane_jax.geometry import transform_points
-from tflane_jax.markers.store import load_store
+from tflane_jax.markers.store_files import load_store
 from tflane_jax.world.simulate import simulate
 
 SCENE = 200_000_034

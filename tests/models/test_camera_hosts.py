@@ -233,3 +233,30 @@ def test_a_camera_that_sees_too_many_cells_is_named_before_training():
     config.task.check(config.data, examples)
     with pytest.raises(UserError, match="`capacity` of BevFormerConfig is 1"):
         task.check(config.data, examples)
+
+
+def without_memory():
+    encoder = CAMERA_TOPONET.encoder
+    off = dataclasses.replace(encoder, bev=dataclasses.replace(encoder.bev, memory="off"))
+    return LaneGraphTask(dataclasses.replace(CAMERA_TOPONET, encoder=off))
+
+
+def test_bev_memory_can_be_switched_off():
+    """No frame leaves BEV features to the next, and the parameters are those of the host with memory."""
+    task, example = without_memory(), make_camera_example()
+    assert task.start().bev is None
+    assert TASKS["toponet"].start().bev is not None
+    params = jax.eval_shape(TASKS["toponet"].init, jax.random.key(0), example)
+    following, _ = jax.eval_shape(task.step, params, task.start(), example)
+    assert following.bev is None
+
+
+@pytest.mark.slow
+def test_without_bev_memory_every_frame_stands_alone(toponet):
+    step = jax.jit(without_memory().step)
+    first, second = (make_camera_example(seed) for seed in (0, 1))
+    second = second.replace(has_previous=np.asarray(True))
+    memory, _ = step(toponet.params, without_memory().start(), first)
+    _, later = step(toponet.params, memory, second)
+    alone = toponet.predict(second)
+    np.testing.assert_allclose(later.centerlines.points, alone.centerlines.points, atol=1e-4)

@@ -17,9 +17,12 @@ from tflane_jax.models.marker_fusion import (
     LaneNeighbours,
     MarkerFusion,
     MarkerFusionConfig,
+    MarkerPrior,
     MarkerTokens,
+    as_written,
     fusion_gate,
     fusion_mask,
+    uniform_fusion,
 )
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.priors.marker_memory import MarkerMemoryConfig
@@ -219,6 +222,42 @@ def test_the_gate_is_the_confidence_and_its_variants():
     same(fused(hard, near, bev, position)[0], fused(uniform, near, bev, position)[0])
     same(fused(hard, far, bev, position)[0], bev)
     assert not np.array_equal(out, fused(CONFIG, far, bev, position)[0])
+
+
+def test_as_written_the_norm_applies_without_markers_too():
+    config = as_written(replace(CONFIG, width=16, radius=2.0, norm="query"))
+    assert (config.norm, config.width, config.radius, config.query_position) == ("written", None, None, False)
+    assert config.memory == CONFIG.memory
+    rng = np.random.default_rng(0)
+    bev, position = (jnp.asarray(rng.normal(size=(5, 8)), jnp.float32) for _ in range(2))
+    near = lanes_of(seeing(observed(10.0)))
+    nothing = near.replace(valid=jnp.zeros_like(near.valid), gate=jnp.zeros(()))
+    same(fused(config, near, bev, position)[0], fused(config, near, bev, position + 1.0)[0])
+    out, variables, _ = fused(config, nothing, bev, position)
+    norm = jax.tree.map(np.asarray, variables["params"]["norm"])
+    expected = np.asarray(bev - bev.mean(-1, keepdims=True)) / np.sqrt(np.asarray(bev.var(-1))[:, None] + 1e-5)
+    np.testing.assert_allclose(out, expected * norm["scale"] + norm["bias"], atol=1e-4)
+    same(fused(replace(config, norm="sum"), nothing, bev, position)[0], bev)
+
+
+def test_uniform_fusion_knows_no_confidence():
+    """Near or far, still or jumped: the same tokens, gate and memory."""
+    config = uniform_fusion(CONFIG)
+    near, far = observed(10.0), observed(70.0)
+    jumped = far.replace(residual=np.full_like(far.residual, 25.0))
+    prior = MarkerPrior(config, BASELINE.spec)
+    guides = [prior.observe(seeing(markers), prior.start())[0] for markers in (near, far, jumped)]
+    for guide in guides:
+        assert guide.gate == 1.0
+        np.testing.assert_array_equal(guide.weight, guide.valid.astype(np.float32))
+    ungated = MarkerPrior(replace(CONFIG, fusion="uniform"), BASELINE.spec)
+    assert ungated.observe(seeing(jumped), None)[0].gate < 0.1  # memory would be read instead
+    # Remembered lanes count fully, and only where nothing is detected.
+    _, bank = prior.observe(seeing(far), prior.start())
+    gap = prior.observe(seeing(None).replace(has_previous=np.asarray(True)), bank)[0]
+    assert gap.gate == 1.0
+    np.testing.assert_array_equal(gap.weight, gap.valid.astype(np.float32))
+    assert gap.valid.any()
 
 
 def test_a_zero_initialised_fusion_leaves_the_trained_host_unchanged():

@@ -13,7 +13,7 @@ from tflane_jax.geometry import pose_matrix
 from tflane_jax.priors.marker_memory import MarkerMemory, MarkerMemoryConfig, guidance, remember
 from tflane_jax.priors.markers import MarkerLanes
 
-CONFIG = MarkerMemoryConfig(frames=4, decay=0.5, exponent=0.5, threshold=0.2)
+CONFIG = MarkerMemoryConfig(frames=4, decay=0.5, exponent=0.5, threshold=0.2, gate="strongest")
 LANES, POINTS = 3, 2
 HERE = np.eye(4, dtype=np.float32)
 step = jax.jit(remember, static_argnums=4)
@@ -111,6 +111,22 @@ def test_remembered_lanes_stay_where_they_are_on_the_ground():
     np.testing.assert_allclose(moved, [0.0, -2.0], atol=1e-6)
     _, out = run(frames, replace(CONFIG, compensation="none"), poses)
     np.testing.assert_array_equal(out[1].points.reshape(4, LANES, POINTS, 2)[1, 0, 0], [5.0, 0.0])
+
+
+@pytest.mark.parametrize("exponent", [1.0, 0.5])
+def test_a_remembered_token_is_scaled_once(exponent):
+    """Gate times weight is the decayed confidence; with one marker all lanes have the weight 1, as in its own frame."""
+    config = replace(CONFIG, gate="once", exponent=exponent)
+    _, (present, gap) = run([seen(0.8), NOTHING], config)
+    assert present.gate == pytest.approx(0.8)
+    assert gap.gate == pytest.approx(0.4)
+    for used in (present, gap):
+        np.testing.assert_allclose(used.weight[used.valid], 1.0, rtol=1e-6)
+    _, (*_, both) = run([seen(0.8), seen(0.1, lanes=1, at=3.0), NOTHING], config)
+    total = both.gate * both.weight.reshape(4, LANES)
+    np.testing.assert_allclose(total[2, :2], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(total[1, 0], 0.2 * (0.05 / 0.2) ** exponent, rtol=1e-6)
+    assert MarkerMemoryConfig().gate == "once"
 
 
 def test_without_decay_confidence_stays_and_the_gate_can_be_one():

@@ -1,5 +1,7 @@
 """Marker observations as lanes with a confidence."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -110,6 +112,17 @@ def test_the_raw_score_counts_if_configured():
     markers = observations(markers=1)
     plain, scored = (select_marker_lanes(markers, MarkerPriorConfig(3, use_score=use)) for use in (False, True))
     np.testing.assert_allclose(scored.confidence, plain.confidence * markers.score, rtol=1e-6)
+
+
+def test_all_markers_can_be_trusted_alike():
+    """Then neither distance, residual nor score tells them apart, and they keep the order in which they come."""
+    markers = observations()
+    markers.residual[:] = [25.0, 0.0]
+    chosen = select_marker_lanes(markers, replace(CONFIG, trust="all", use_score=True))
+    np.testing.assert_array_equal(chosen.confidence, chosen.valid.astype(float))
+    assert chosen.frame_confidence == 1.0
+    first = markers.lanes[0, np.flatnonzero(markers.lane_valid[0])[0]]
+    np.testing.assert_array_equal(chosen.points[0, [0, -1]], first[[0, -1], :2])
 
 
 def test_too_few_points_are_refused():

@@ -9,7 +9,8 @@ from tests.world import camera_scene
 from tests.world.camera_scene import scene, street
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import project
-from tflane_jax.markers.detection import DetectorConfig, detect
+from tflane_jax.markers.detection import detect
+from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.scene.logs import PlacedMarkers
 from tflane_jax.scene.marker_patterns import MarkerFamily, board_cells, board_size, marker_cells
 from tflane_jax.world.cameras.markers import marker_bodies

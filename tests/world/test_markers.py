@@ -10,6 +10,7 @@ from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene.logs import VectorMap
 from tflane_jax.world import simulate as simulate_module
+from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.markers import PlacementConfig, place_markers
 from tflane_jax.world.simulate import WorldConfig, simulate
@@ -44,6 +45,54 @@ def test_a_marker_stands_right_of_the_approach_and_faces_its_traffic():
     driver = transform_points(invert_pose(pose), np.array([[-20.0, -1.75, 1.5]]))[0]
     assert driver[2] == pytest.approx(20.0)
     assert (driver[:2] < 0.0).all()
+
+
+def test_a_surveyor_walks_back_until_the_board_is_seen():
+    """A mast hides all places within 5 m of the junction; the lane is 50 m long."""
+    lanes = two_lanes()
+    asked = []
+
+    def visible(place, heading):
+        asked.append(place.copy())
+        assert heading == pytest.approx(0.0)
+        return 1.0 if place[0] < -5.0 else 0.3
+
+    (pose,) = place_markers(lanes, 0, EXACT, visible).pose
+    np.testing.assert_allclose(pose[:3, 3], [-6.0, -3.5 - 0.5 - 0.8, 3.0], atol=1e-9)
+    assert [round(float(place[0])) for place in asked] == [0, 0, -3, -3, -6]
+    np.testing.assert_array_equal(pose[:3, :3], place_markers(lanes, 0, EXACT).pose[0, :3, :3])
+    # Where nothing is clear, the best place; where all is, the junction.
+    (best,) = place_markers(lanes, 0, EXACT, lambda place, _: 0.5 if abs(place[0] + 15.0) < 0.1 else 0.2).pose
+    assert best[0, 3] == pytest.approx(-15.0)
+    (first,) = place_markers(lanes, 0, EXACT, lambda *_: 1.0).pose
+    np.testing.assert_array_equal(first, place_markers(lanes, 0, EXACT).pose[0])
+
+
+def test_boards_beyond_a_junction_are_moved_on():
+    crossing = lane_map(
+        segment(4, [(0, -1.75), (20, -1.75)], [5], is_intersection=True),
+        segment(5, [(20, -1.75), (60, -1.75)]),
+    )
+    placed = place_markers(crossing, 0, replace(EXACT, side="both"), lambda place, _: float(place[0] > 25.0))
+    assert placed.pose[0, 0, 3] == pytest.approx(26.0)
+
+
+@pytest.mark.parametrize("scene", [200_000_000, 200_000_005])
+def test_surveyed_boards_are_seen_better(scene):
+    pytest.importorskip("cv2")
+    world = WorldConfig(markers=PlacementConfig(side="both"), traffic=EMPTY)
+    plain = simulate(scene, world)
+    clear = simulate(scene, replace(world, markers=replace(world.markers, site="clear")))
+    seen = visible_places(plain.map, plain.seed)
+
+    def worst(log):
+        # The heading of the traffic is against the board's, but for the toe-in.
+        return [seen(pose[:3, 3], float(np.arctan2(-pose[1, 2], -pose[0, 2]) + np.deg2rad(5.0))) for pose in log]
+
+    before, after = (np.array(worst(log.markers.pose)) for log in (plain, clear))
+    assert len(before) == len(after)
+    assert before.min() < 0.8 < after.mean()
+    assert after.mean() > before.mean()
 
 
 def test_boards_behind_a_junction_face_crossing_traffic():

@@ -11,7 +11,7 @@ import numpy as np
 from tflane_jax.datasets.argoverse2_log import load_log
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.errors import UserError
-from tflane_jax.markers.store import load_store, save_store
+from tflane_jax.markers.store_files import load_store, save_store
 from tflane_jax.plots.tables import format_table
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.simulate import simulate

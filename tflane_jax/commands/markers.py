@@ -22,10 +22,12 @@ from jaxtyping import Float, UInt8
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
-from tflane_jax.files.images import list_photos, opencv, read_image
+from tflane_jax.files.images import list_photos, opencv, read_image, undistorted
 from tflane_jax.geometry.cameras import project
 from tflane_jax.markers.curves import CurveConfig, measure, summarise
-from tflane_jax.markers.detection import DetectedMarkers, DetectorConfig, detect, marker_outline
+from tflane_jax.markers.detection import DetectedMarkers, detect
+from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.square_pose import marker_outline
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.marker_curves import save_error_curves
 from tflane_jax.scene import CameraViews
@@ -39,7 +41,13 @@ _OUTLINE = (255, 210, 0)
 def find(options: argparse.Namespace) -> int:
     """Detect markers in photos of one calibrated camera; print a table, write pictures and detections.json."""
     photos = list_photos(options.images)
-    config = DetectorConfig(_family(options.family), options.size, corners=options.corners, enlarge=options.enlarge)
+    config = DetectorConfig(
+        _family(options.family),
+        options.size,
+        corners=options.corners,
+        enlarge=options.enlarge,
+        search=options.search,
+    )
     config.validate()
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)
@@ -114,9 +122,7 @@ def _without_distortion(
         return photo
     if len(distortion) not in (4, 5, 8):
         raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
-    # OpenCV's pixel origin is the centre of the first pixel, ours its corner.
-    shifted = intrinsics - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
-    return opencv().undistort(photo, shifted, np.array(distortion))
+    return undistorted(photo, intrinsics, distortion)
 
 
 def _views(

@@ -12,6 +12,7 @@ from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.scene.logs import Log
@@ -36,7 +37,8 @@ class ExampleConfig:
         sensor: bird's-eye-view evidence; None leaves it out.
         cameras: camera ring of the built-in world; None leaves it out. With cameras, the traffic elements are those
             visible in the first camera, with their boxes in its image, as in OpenLane-V2.
-        markers: fiducial-marker prior with simulated detections (marker paper, section IV-A); None leaves it out.
+        markers: fiducial-marker prior with simulated detections (marker paper, section IV-A), or with those in native
+            images: `MarkerConfig(pixels=PixelConfig())`, for which "pixels" is short. None leaves it out.
         lanes, lane_points: merged centerlines and points on each.
         segments, segment_points: lane segments and points on each.
         areas, area_points: crossings with road boundaries and points on each.
@@ -74,6 +76,11 @@ class ExampleConfig:
     bike_lanes: Literal["include", "exclude"] = "include"
     sd_map: SdMapConfig | None = None
     map_lines: MapLinesConfig | None = None
+
+    def __post_init__(self) -> None:
+        """Replace the short form "pixels" of `markers`."""
+        if isinstance(self.markers, str) and self.markers == "pixels":
+            object.__setattr__(self, "markers", MarkerConfig(pixels=PixelConfig()))
 
     @property
     def ground(self) -> PerceptionRange:

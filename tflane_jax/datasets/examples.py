@@ -161,7 +161,12 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         markers=None
         if config.markers is None
         else marker_observations(
-            log, keyframe, config.markers, config.range, bike_lanes=config.bike_lanes == "include"
+            log,
+            keyframe,
+            config.markers,
+            config.range,
+            bike_lanes=config.bike_lanes == "include",
+            cameras=config.cameras,
         ),
         sd_map=sd_map,
         lanes=lanes.graph,

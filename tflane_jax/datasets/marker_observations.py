@@ -1,4 +1,4 @@
-"""The marker prior at a log's key frames: its markers, their store of lanes, and simulated detections."""
+"""The marker prior at a log's key frames: its markers, their store of lanes, and detections, simulated or of images."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ import weakref
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.geometry import PerceptionRange, relative_pose
-from tflane_jax.markers.observe import observe
+from tflane_jax.markers.detection import DetectedMarkers
+from tflane_jax.markers.observe import Detected, observe
+from tflane_jax.markers.pixels import PixelConfig, detect_in_world
 from tflane_jax.markers.simulation import MarkerConfig, moment_before, simulate_detections
 from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.scene import MarkerObservations
-from tflane_jax.scene.logs import Log, PlacedMarkers
+from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
+from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.roads.markers import place_markers
 
+# Detections in images by log, track frame and settings: key frames are also the earlier moment of later ones.
+_DETECTED: dict[tuple[int, int, CameraRigConfig, PixelConfig], DetectedMarkers] = {}
 _REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = {}
 
 
@@ -60,24 +65,48 @@ def _remembered(log: Log, radius: float, bike_lanes: bool) -> tuple[PlacedMarker
     return _REMEMBERED[key]
 
 
-def marker_observations(
-    log: Log, keyframe: int, config: MarkerConfig, range_: PerceptionRange, *, bike_lanes: bool
-) -> MarkerObservations:
-    """Return the detected markers with their lanes from the store at a key frame; detections are simulated.
+def _detected(
+    log: Log, moment: KeyFrame, markers: PlacedMarkers, rig: CameraRigConfig, config: PixelConfig
+) -> DetectedMarkers:
+    """Return the detections in the images of a moment, made once."""
+    key = (id(log), moment.track_frame, rig, config)
+    if key not in _DETECTED:
+        _DETECTED[key] = detect_in_world(log, moment, markers, rig, config)
+        weakref.finalize(log, _DETECTED.pop, key, None)
+    return _DETECTED[key]
 
-    Warns (`TruncationWarning`) if more markers or lanes are in range than a capacity.
+
+def marker_observations(
+    log: Log,
+    keyframe: int,
+    config: MarkerConfig,
+    range_: PerceptionRange,
+    *,
+    bike_lanes: bool,
+    cameras: CameraRigConfig | None = None,
+) -> MarkerObservations:
+    """Return the detected markers with their lanes from the store at a key frame.
+
+    Detections are simulated, or found in native images of `cameras` (`MarkerConfig.pixels`). Warns
+    (`TruncationWarning`) if more markers or lanes are in range than a capacity.
     """
     simulation, (markers, store) = config.simulation, _remembered(log, config.radius, bike_lanes)
     moment, before = log.keyframes[keyframe], moment_before(log, keyframe, simulation.residual_interval)
+
+    def detected(then: KeyFrame) -> Detected:
+        if config.pixels is None:
+            return simulate_detections(log, then, markers, simulation)
+        return _detected(log, then, markers, config.pixels.native(cameras), config.pixels)
+
     observed = observe(
-        simulate_detections(log, moment, markers, simulation),
+        detected(moment),
         store,
         range_,
         markers=config.markers,
         lanes=config.lanes,
         points=config.points,
         first_residual=simulation.first_residual,
-        previous=None if before is None else simulate_detections(log, before, markers, simulation),
+        previous=None if before is None else detected(before),
         now_from_previous=None if before is None else relative_pose(moment.global_from_ego, before.global_from_ego),
     )
     for name, dropped in (("markers", observed.markers_dropped), ("lanes", observed.lanes_dropped)):

@@ -87,8 +87,8 @@ def member(record: Any, name: str, where: str) -> Any:
     if not isinstance(record, Mapping):
         raise UserError(f"{where} is {_kind(record)}, expected a mapping with the entry {name!r}")
     if name not in record:
-        shown = ", ".join(map(reprlib.repr, list(record)[:6]))
-        raise UserError(f"{where} lacks the entry {name!r} (it has {shown or 'none'})")
+        there = ", ".join(map(reprlib.repr, list(record)[:6]))
+        raise UserError(f"{where} lacks the entry {name!r} (it has {there or 'none'})")
     return record[name]
 
 
@@ -220,9 +220,17 @@ def whole_number(value: Any, low: int, high: int, where: str) -> int:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     if not _is_number(value) or not low <= value <= high or value != int(value):
-        shown = "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
-        raise UserError(f"{where} is {shown:.40}, expected a whole number from {low} to {high}")
+        text = "an integer of many digits" if isinstance(value, int) and abs(value) >= 2**63 else reprlib.repr(value)
+        raise UserError(f"{where} is {text:.40}, expected a whole number from {low} to {high}")
     return int(value)
+
+
+def shown(value: Any) -> str:
+    """Return at most 40 characters of a value for a message, whatever it is."""
+    try:
+        return f"{reprlib.repr(value):.40}"
+    except (RecursionError, ValueError):
+        return _kind(value)
 
 
 def _at(index: tuple[int, ...]) -> str:

@@ -6,12 +6,12 @@ decoding and its rounding, so another library would give other pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from tflane_jax.errors import UserError
 
@@ -73,6 +73,23 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
             f"{path} is damaged or no image of a known format: open it in an image viewer and save it as JPEG or PNG"
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def undistorted(
+    image: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], distortion: Sequence[float]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return an image as a pinhole camera would take it.
+
+    Args:
+        image: of a camera with lens distortion.
+        intrinsics: pixels from the corner of the image; those of the result too.
+        distortion: OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6; empty returns the image itself.
+    """
+    if not len(distortion):
+        return image
+    # OpenCV's pixel origin is the centre of the first pixel, ours its corner.
+    shifted = intrinsics - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+    return opencv().undistort(image, shifted, np.array(distortion))
 
 
 def resize(image: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[np.ndarray, "height width 3"]:

@@ -13,7 +13,11 @@ _SPREAD, _STEPS, _REACH, _DOUBT = 0.8, 12, 0.6, 0.15
 
 
 def refine_corners(
-    grey: UInt8[np.ndarray, "h w"], corners: Float[np.ndarray, "4 2"], cells: Bool[np.ndarray, "n n"]
+    grey: UInt8[np.ndarray, "h w"],
+    corners: Float[np.ndarray, "4 2"],
+    cells: Bool[np.ndarray, "n n"],
+    known: Bool[np.ndarray, "n n"] | None = None,
+    shaded: Bool[np.ndarray, "m m"] | None = None,
 ) -> Float[np.ndarray, "4 2"]:
     """Return the corners (pixels) of the black square for which its cells fit the image best.
 
@@ -26,6 +30,8 @@ def refine_corners(
         grey: image.
         corners: a first guess, in the order of `ImageMarkers`.
         cells: of the marker, as `marker_cells`.
+        known: cells that count; None: all.
+        shaded: cells in a shadow, those of the margin included, which have a brightness and contrast of their own.
     """
     cv2 = opencv()
     n = len(cells)
@@ -51,7 +57,15 @@ def refine_corners(
         extra = float(np.sqrt(spread**2 - _SPREAD**2))
         picture = cv2.GaussianBlur(picture, (0, 0), extra, borderType=cv2.BORDER_REPLICATE)
     square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], np.float32)
-    now, weight = corners.astype(np.float64), np.ones_like(s)
+    # 1 for the points of each light: two columns of unknowns.
+    lights = np.ones((len(s), 1))
+    if shaded is not None and shaded.any() and not shaded.all():
+        dark = np.kron(shaded, np.ones((fine, fine)))[edge:-edge, edge:-edge].ravel()
+        lights = np.stack([1.0 - dark, dark], -1)
+    counted = np.ones_like(s)
+    if known is not None:
+        counted = np.kron(np.pad(known, 1, constant_values=True), np.ones((fine, fine)))[edge:-edge, edge:-edge].ravel()
+    now, weight = corners.astype(np.float64), counted
     for _ in range(_STEPS):
         # The image and its gradient, at the points and at half a pixel to either side.
         image_from_square = cv2.getPerspectiveTransform(square, now.astype(np.float32))
@@ -77,20 +91,21 @@ def refine_corners(
         )
         by_corner = np.linalg.inv(at_corners.transpose(2, 0, 1).reshape(8, 8))
         along = np.einsum("cp,ckp->pk", slope, moves) @ by_corner
-        unknown = np.column_stack([along, -np.ones_like(s), -template])
+        unknown = np.column_stack([along, -lights, -template[:, None] * lights])
         brightness = seen(0.0, 0.0)
         weighted = (unknown * weight[:, None]).T
         matrix = weighted @ unknown
-        if np.linalg.matrix_rank(matrix) != 10:
+        if np.linalg.matrix_rank(matrix) != len(matrix):
             return corners
         step = np.linalg.solve(matrix, -weighted @ brightness)
-        if not step[9] > 0.0:
+        contrast = step[-lights.shape[1] :]
+        if not contrast.min() > 0.0:
             return corners
         now = now + step[:8].reshape(4, 2)
         if np.abs(now - corners).max() > max(_REACH * cell, 1.0) or not np.isfinite(now).all():
             return corners
         # Occluded parts of the board have large residuals and get small weights.
-        weight = 1.0 / (1.0 + ((unknown @ step + brightness) / (_DOUBT * step[9])) ** 2)
+        weight = counted / (1.0 + ((unknown @ step + brightness) / (_DOUBT * (lights @ contrast))) ** 2)
         # cv2.remap interpolates at steps of 1/32 pixel.
         if np.abs(step[:8]).max() < 0.02:
             return now

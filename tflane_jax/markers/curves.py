@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, yaw_pose
-from tflane_jax.markers.detection import DetectorConfig, find_markers, marker_outline, solve_square
+from tflane_jax.markers.image_search import DetectorConfig, find_markers
+from tflane_jax.markers.square_pose import marker_outline, solve_square
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, PlacedMarkers, Tracks, VectorMap
 from tflane_jax.scene.marker_patterns import marker_count

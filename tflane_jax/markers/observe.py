@@ -6,8 +6,9 @@ Used for detections in images (`markers.detection`) and for simulated ones (`mar
 from __future__ import annotations
 
 import datetime
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +17,15 @@ from tflane_jax.geometry import PerceptionRange, clip_to_range, resample_lines, 
 from tflane_jax.markers.store import MarkerStore, StoredMarker, look_up
 from tflane_jax.scene import MarkerObservations
 
+Outcome = Literal["used", "unknown", "stale", "contradictory", "dropped"]
+"""What became of a detected marker: it gives a prior; its id is not in the store; its entry is out of date; its id was
+read at two places; there were too many nearer ones."""
+
 
 class Detected(Protocol):
     """Markers detected at one moment; satisfied by `MarkerObservations` too.
+
+    A row that `contradictory` marks, where there is such a column, gives no prior (see `DetectedMarkers`).
 
     Attributes:
         marker_id: (D,) identity.
@@ -43,9 +50,11 @@ class Observed:
 
     Attributes:
         markers: the prior.
-        unknown, stale: number of detected ids that are not in the store, and of ids whose entry is out of date.
+        unknown, stale, contradictory: number of detected ids that are not in the store, whose entry is out of date,
+            and that were read at two places.
         markers_dropped: markers beyond the capacity (the farthest).
         lanes_dropped: lanes beyond the capacity (of each marker, the farthest from it).
+        outcomes: by detected id.
     """
 
     markers: MarkerObservations
@@ -53,6 +62,8 @@ class Observed:
     stale: int
     markers_dropped: int
     lanes_dropped: int
+    contradictory: int
+    outcomes: Mapping[int, Outcome]
 
 
 def observe(
@@ -92,7 +103,13 @@ def observe(
     if previous is not None and now_from_previous is None:
         raise ValueError("previous detections need the vehicle's motion since: give now_from_previous")
     rows = _best(detected)
-    looked = look_up(store, np.asarray(detected.marker_id)[rows], today=today, max_age_days=max_age_days)
+    ids = np.asarray(detected.marker_id)
+    outcomes: dict[int, Outcome] = {int(ids[row]): "contradictory" for row in rows if _contradictory(detected)[row]}
+    rows = np.array([row for row in rows if int(ids[row]) not in outcomes], int)
+    contradictory = len(outcomes)
+    looked = look_up(store, ids[rows], today=today, max_age_days=max_age_days)
+    for row, entry in zip(rows, looked.found, strict=True):
+        outcomes[int(ids[row])] = "used" if entry else "stale" if int(ids[row]) in store.markers else "unknown"
     known = [(row, entry) for row, entry in zip(rows, looked.found, strict=True) if entry is not None]
     poses = {int(row): np.asarray(detected.pose[row], np.float64) for row, _ in known}
     known.sort(key=lambda pair: np.hypot(*poses[int(pair[0])][:2, 3]))
@@ -109,7 +126,21 @@ def observe(
         )
         out.valid[slot] = True
         lanes_dropped += _fill_lanes(out, slot, entry, pose, range_)
-    return Observed(out, looked.unknown, looked.stale, max(len(known) - markers, 0), lanes_dropped)
+    outcomes |= {entry.marker_id: "dropped" for _, entry in known[markers:]}
+    beyond = max(len(known) - markers, 0)
+    return Observed(out, looked.unknown, looked.stale, beyond, lanes_dropped, contradictory, outcomes)
+
+
+def frame_before(times_ns: Sequence[int] | np.ndarray, now_ns: int, interval: float) -> int | None:
+    """Return which of some earlier times is nearest to `interval` seconds before now, for the residual.
+
+    None where it differs from that by more than half the interval: at a gap, or at the start of a drive.
+    """
+    if not len(times_ns):
+        return None
+    off = np.abs(np.asarray(times_ns, np.int64) - (now_ns - interval * 1e9))
+    frame = int(off.argmin())
+    return None if off[frame] > 0.5e9 * interval else frame
 
 
 def pose_residual(entry: StoredMarker, pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"]) -> float:
@@ -127,6 +158,11 @@ def _best(detected: Detected) -> np.ndarray:
     rows = np.flatnonzero(np.asarray(detected.valid))
     rows = rows[np.argsort(-np.asarray(detected.score)[rows], kind="stable")]
     return rows[np.unique(np.asarray(detected.marker_id)[rows], return_index=True)[1]]
+
+
+def _contradictory(detected: Detected) -> np.ndarray:
+    flags = getattr(detected, "contradictory", None)
+    return np.zeros(len(np.asarray(detected.valid)), bool) if flags is None else np.asarray(flags)
 
 
 def _pose_of(detected: Detected, marker_id: int) -> Float[np.ndarray, "4 4"] | None:

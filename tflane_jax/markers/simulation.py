@@ -13,8 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.markers.observe import frame_before
+from tflane_jax.markers.pixels import PixelConfig
+from tflane_jax.markers.visibility import seen_fraction
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount
+from tflane_jax.world.cameras.stage import static_boxes
 
 ROOT = 20_251_123
 
@@ -39,9 +44,14 @@ class MarkerSimulationConfig:
             5 pixels for each of the 7 cells of a 5x5 ArUco marker.
         range: largest distance at which a marker is visible, metres (the paper's curves end at 60 m).
         field_of_view: full angle of view ahead, degrees.
+        cameras: the whole square must lie in the image of one of them, with the calibration of the log; None asks for
+            the field of view alone, which has no upper end.
         frontal: largest angle, from straight at the face, of both the line of sight and the vehicle's heading, degrees:
             a marker is visible only to a vehicle that approaches it frontally.
-        occlusion: "line_of_sight": road users and buildings hide markers; "none": nothing does.
+        occlusion: "bodies": road users, buildings, masts, signs, lamp posts and trees hide markers (needs OpenCV; of
+            real logs the first two are known); "line_of_sight": road users and buildings hide the middle of a marker;
+            "none": nothing does.
+        least_seen: with "bodies", smallest visible fraction of a square that is detected.
         score: range from which the detection score is drawn (uniform).
         residual_interval: r compares with the observation this many seconds before (the paper's frames come at 2 Hz);
             None compares with the previous key frame.
@@ -61,7 +71,9 @@ class MarkerSimulationConfig:
     range: float = 60.0
     field_of_view: float = 120.0
     frontal: float = 60.0
-    occlusion: Literal["line_of_sight", "none"] = "line_of_sight"
+    cameras: tuple[CameraMount, ...] | None = None
+    occlusion: Literal["bodies", "line_of_sight", "none"] = "line_of_sight"
+    least_seen: float = 0.75
     score: tuple[float, float] = (1.0, 1.0)
     residual_interval: float | None = 0.5
     first_residual: float = 0.0
@@ -82,14 +94,15 @@ PERFECT = MarkerSimulationConfig(forward_sigma=0.0, yaw_sigma=0.0, pitch_sigma=0
 
 @dataclass(frozen=True)
 class MarkerConfig:
-    """The marker prior of an example.
+    """The marker prior of an example: detections are simulated, or found in images with `pixels`.
 
     Attributes:
         markers, lanes, points: capacities M and J, and points P on each lane. In 2000 frames of the test world never
             more than one marker was detected, with at most 34 lanes in range. Beyond the capacities the
             farthest markers, and the lanes farthest from their marker, are dropped.
         radius: lanes within this distance of a marker are stored, metres.
-        simulation: of the detections.
+        simulation: of the detections; with `pixels` only its residual settings apply.
+        pixels: detect the boards in native images of the built-in world's cameras instead; None simulates.
     """
 
     markers: int = 2
@@ -97,6 +110,7 @@ class MarkerConfig:
     points: int = 11
     radius: float = 50.0
     simulation: MarkerSimulationConfig = MarkerSimulationConfig()
+    pixels: PixelConfig | None = None
 
 
 class SimulatedMarkers(NamedTuple):
@@ -126,6 +140,11 @@ def simulate_detections(
     """
     true = relative_pose(moment.global_from_ego, markers.pose)
     seen = visible(true, config)
+    if config.cameras is not None or config.occlusion == "bodies":
+        mounts = config.cameras or ARGOVERSE2_RING
+        bodies = static_boxes(log) if config.occlusion == "bodies" else None
+        shown = seen_fraction(log, moment, true[seen], markers.size, mounts, bodies, framed=config.cameras is not None)
+        seen[seen] = shown >= (config.least_seen if config.occlusion == "bodies" else 1.0)
     if config.occlusion == "line_of_sight":
         seen[seen] = ~_hidden(log, moment, true[seen])
     count = len(seen)
@@ -163,12 +182,8 @@ def moment_before(log: Log, keyframe: int, interval: float | None) -> KeyFrame |
     if interval is None:
         return log.keyframes[keyframe - 1] if keyframe > 0 else None
     earlier = log.timestamps_ns[: moment.track_frame]
-    if not len(earlier):
-        return None
-    off = np.abs(earlier - (moment.timestamp_ns - interval * 1e9))
-    frame = int(off.argmin())
-    # At a gap or at the start of the log the nearest frame is too far from the requested time.
-    if off[frame] > 0.5e9 * interval:
+    frame = frame_before(earlier, moment.timestamp_ns, interval)
+    if frame is None:
         return None
     return KeyFrame(int(earlier[frame]), log.global_from_ego[frame], frame)
 

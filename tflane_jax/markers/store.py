@@ -1,34 +1,21 @@
 """The on-board store: marker id -> local lane graph around the marker (marker paper, section III).
 
-A store is built from any lane graph (`store_of`), kept in a JSON file (`save_store`, `load_store`; docs/markers.md has
-the format) and queried by id (`look_up`). An unknown id, or one whose entry is out of date, gives no prior.
+A store is built from any lane graph (`store_of`), kept in a JSON file (`markers.store_files`) and queried by id
+(`look_up`). An unknown id, or one whose entry is out of date, gives no prior.
 """
 
 from __future__ import annotations
 
 import datetime
-import json
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_text
-from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry import invert_pose, resample_lines, transform_points
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers
-
-FORMAT, VERSION = "tflane-marker-store", 1
-# Length units that a file may be in, metres.
-UNITS = {"metre": 1.0, "millimetre": 0.001, "foot": 0.3048}
-# Decimals of a coordinate in a file: millimetres.
-_DECIMALS = 3
-_LARGEST_ID = 2**31 - 1
 
 
 class UnknownMarkerWarning(UserWarning):
@@ -49,7 +36,7 @@ class StoredMarker:
             pose comes from the detection.
         lanes: (J, P, 3) float64 centerlines in driving direction, **marker frame** (see `tflane_jax.markers`), metres.
         successor: (J, J) [i, j] true where the end of lane i is the start of lane j.
-        size: side of the black square, metres.
+        size: side of the black square, metres; a detector needs it to know the distance (`sizes`).
         surveyed: day of the survey.
         expires: first day on which the entry is invalid.
     """
@@ -82,6 +69,11 @@ class MarkerStore:
 
     markers: Mapping[int, StoredMarker]
     source: str = "marker store"
+
+    @property
+    def sizes(self) -> dict[int, float]:
+        """Side of the black square of each marker by its id, metres."""
+        return {number: marker.size for number, marker in self.markers.items()}
 
 
 @dataclass(frozen=True)
@@ -215,105 +207,3 @@ def _clip_to_circle(
         np.concatenate([a[i : i + 1] + enter[i] * step[i], stop[i : j + 1]]) for i, j in zip(first, last, strict=True)
     ]
     return [p for p in pieces if (p[1:, :2] != p[:-1, :2]).any()]
-
-
-def save_store(store: MarkerStore, path: Path, *, frame: Literal["marker", "survey"] = "marker") -> Path:
-    """Write a store atomically; raises UserError if that fails.
-
-    Args:
-        store: what to write.
-        path: a .json file, replaced where there is one.
-        frame: of the lanes in the file: the marker frame, or the frame of the survey.
-    """
-    records = [
-        {
-            "id": marker.marker_id,
-            "size": marker.size,
-            "global_from_marker": marker.global_from_marker.tolist(),
-            "surveyed": marker.surveyed and marker.surveyed.isoformat(),
-            "expires": marker.expires and marker.expires.isoformat(),
-            "lanes": _in_frame(marker, frame).round(_DECIMALS).tolist(),
-            "successors": np.argwhere(marker.successor).tolist(),
-        }
-        for _, marker in sorted(store.markers.items())
-    ]
-    head = {"format": FORMAT, "version": VERSION, "unit": "metre", "frame": frame, "source": store.source}
-    # One line for each marker, so that two versions of a store can be compared as text.
-    body = ",\n".join(json.dumps(record, separators=(",", ":"), allow_nan=False) for record in records)
-    text = json.dumps(head)[:-1] + ', "markers": [\n' + body + "\n]}\n"
-    return write_text(path, text)
-
-
-def _in_frame(marker: StoredMarker, frame: Literal["marker", "survey"]) -> Float[np.ndarray, "j p 3"]:
-    if frame == "marker":
-        return marker.lanes
-    return transform_points(marker.global_from_marker, marker.lanes.reshape(-1, 3)).reshape(marker.lanes.shape)
-
-
-def load_store(path: Path) -> MarkerStore:
-    """Read a store and check all of it; raises one UserError that names the file, the marker and the field."""
-    record, where = load_json(path), str(path)
-    if member(record, "format", where) != FORMAT:
-        raise UserError(f"{where}: format is {record['format']!r:.40}, expected {FORMAT!r}: this is no marker store")
-    if member(record, "version", where) != VERSION:
-        raise UserError(
-            f"{where}: version is {record['version']!r:.40}, this program reads {VERSION}: write the store again with "
-            "tflane markers store, or install the program that wrote it"
-        )
-    unit = _one_of(record, "unit", tuple(UNITS), where)
-    frame = _one_of(record, "frame", ("marker", "survey"), where)
-    markers: dict[int, StoredMarker] = {}
-    for i, entry in enumerate(items(record, "markers", where)):
-        place = f"{where}: markers[{i}]"
-        number = whole_number(member(entry, "id", place), 0, _LARGEST_ID, f"{place}: id")
-        if number in markers:
-            raise UserError(f"{where}: marker {number}: id occurs twice; a store holds a marker once")
-        markers[number] = _read_marker(entry, number, UNITS[unit], frame, f"{where}: marker {number}")
-    return MarkerStore(markers, where)
-
-
-def _read_marker(entry: Any, number: int, unit: float, frame: str, where: str) -> StoredMarker:
-    pose = numbers(member(entry, "global_from_marker", where), (4, 4), f"{where}: global_from_marker")
-    pose = pose * np.array([[1.0, 1.0, 1.0, unit]] * 3 + [[1.0] * 4])
-    rotation = pose[:3, :3]
-    if not (
-        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-        and np.linalg.det(rotation) > 0.0
-        and np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
-    ):
-        raise UserError(
-            f"{where}: global_from_marker is no pose: expected a rotation and a translation over the row 0 0 0 1"
-        )
-    size = unit * float(numbers(member(entry, "size", where), (), f"{where}: size"))
-    if size <= 0.0:
-        raise UserError(f"{where}: size is {size:g}, expected more than 0")
-    lanes = unit * numbers(items(entry, "lanes", where), (None, None, 3), f"{where}: lanes")
-    if len(lanes) and lanes.shape[1] < 2:
-        raise UserError(f"{where}: lanes have {lanes.shape[1]} points, expected at least 2")
-    if frame == "survey":
-        lanes = transform_points(invert_pose(pose), lanes.reshape(-1, 3)).reshape(lanes.shape)
-    edges = numbers(items(entry, "successors", where), (None, 2), f"{where}: successors")
-    wrong = (edges != np.floor(edges)) | (edges < 0) | (edges >= len(lanes))
-    if wrong.any():
-        raise UserError(
-            f"{where}: successors holds {edges[wrong][0]:g}, which is no lane: the marker has 0 to {len(lanes) - 1}"
-        )
-    successor = np.zeros((len(lanes), len(lanes)), bool)
-    successor[tuple(edges.astype(int).T)] = True
-    surveyed, expires = (_date(entry, name, where) for name in ("surveyed", "expires"))
-    return StoredMarker(number, pose, lanes, successor, size, surveyed, expires)
-
-
-def _one_of(record: Any, name: str, allowed: Sequence[str], where: str) -> str:
-    value = member(record, name, where)
-    if value not in allowed:
-        raise UserError(f"{where}: {name} is {value!r:.40}, expected one of {', '.join(allowed)}")
-    return value
-
-
-def _date(entry: Any, name: str, where: str) -> datetime.date | None:
-    text = entry.get(name)
-    try:
-        return None if text is None else datetime.date.fromisoformat(text)
-    except (TypeError, ValueError):
-        raise UserError(f"{where}: {name} is {text!r:.40}, expected a day such as 2025-07-11, or null") from None

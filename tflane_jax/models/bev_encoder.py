@@ -52,6 +52,8 @@ class BevFormerConfig:
         cameras: largest number of cameras; each has its own embedding.
         capacity: largest number of queries that one camera serves, None for all (see `layers.bev_attention`);
             `bevformer.check_capacity` checks it against a frame.
+        memory: "previous": temporal attention reads the BEV features of the previous frame; "off": every frame stands
+            alone, as in a host that was trained on single frames. The parameters are the same.
         align: how previous features are brought into the present frame, see the module docstring.
         rotation_center: centre of the rotation as (column, row), in cells from the grid's corner, unless `align` is
             "warp"; None: the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
@@ -81,6 +83,7 @@ class BevFormerConfig:
     precision: Literal["float32", "bfloat16"] = "float32"
     attention: Literal["deformable", "kernel"] = "deformable"
     kernel: tuple[int, int] = (3, 5)
+    memory: Literal["previous", "off"] = "previous"
 
     @property
     def dtype(self) -> Any:

@@ -74,7 +74,7 @@ class EncoderOutput(NamedTuple):
     Attributes:
         bev: (h, w, C) BEV features, row 0 at the smallest y, column 0 at the smallest x.
         front: features of the front camera; None without cameras.
-        memory: BEV memory for the next frame; None without cameras.
+        memory: BEV memory for the next frame; None without cameras, or with memory off.
     """
 
     bev: Float[Array, "h w c"]
@@ -101,8 +101,9 @@ class CameraEncoder(nn.Module):
         if isinstance(self.config.bev, LiftConfig):
             bev, following = LiftEncoder(self.config.bev, name="bev")(levels, cameras, train=train, fuse=fuse), None
         else:
-            bev = self._bevformer(self.config.bev, levels, example, memory, train, fuse)
-            following = BevMemory(bev, jnp.ones((), bool))
+            remembers = self.config.bev.memory == "previous"
+            bev = self._bevformer(self.config.bev, levels, example, memory if remembers else None, train, fuse)
+            following = BevMemory(bev, jnp.ones((), bool)) if remembers else None
         if self.config.cells:
             LaneCellHead(name="cells")(bev)
         size = jnp.where(cameras.valid[0], cameras.size[0], 0)

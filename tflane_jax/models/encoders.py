@@ -51,7 +51,7 @@ def encode_example(
 def start_bev_memory(config: EncoderConfig) -> BevMemory | None:
     """Return the BEV memory before the first frame of a sequence; None for an encoder without memory."""
     if isinstance(config, CameraEncoderConfig) and isinstance(config.bev, BevFormerConfig):
-        return BevMemory.empty(config.bev)
+        return BevMemory.empty(config.bev) if config.bev.memory == "previous" else None
     return None
 
 

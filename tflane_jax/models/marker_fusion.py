@@ -3,8 +3,8 @@
 Lanes of a frame's markers -> memory (`priors.marker_memory`) -> one token per lane (III-A) -> in every layer of the BEV
 encoder, after spatial attention, BEV features attend to the tokens, gated by the confidence (III-B).
 
-Without marker lanes, BEV features stay exactly as they are, so that the model equals the one without markers; Eq. (3)
-as written would apply its LayerNorm.
+Without marker lanes, BEV features stay exactly as they are, so that the model equals the one without markers. Eq. (3)
+as written applies its LayerNorm in every frame: `as_written`.
 """
 
 from __future__ import annotations
@@ -45,14 +45,17 @@ class MarkerFusionConfig:
             coordinates, "mlp" a perceptron on all raw coordinates of a line.
         lines: sizes of the transformer; `dim` is that of a token.
         fusion: "gated" is Eq. (3); "uniform" sets c = 1; "hard" sets c = 1 from `hard_threshold` on and ignores
-            markers below (Table II).
+            markers below (Table II). c is only the factor in Eq. (3): confidence also scales tokens (Eq. 4) and decides
+            when memory is read. `uniform_fusion` removes it from there too.
         hard_threshold: lowest confidence at which "hard" uses markers.
         heads: of the attention to the tokens.
         width: channels of that attention; None: those of the BEV features.
-        norm: position of the LayerNorm in Eq. (3). "sum": around the sum, as written. "query": on the attention's
-            queries, F + c Attn(LayerNorm(F), ..), with a zero-initialised output, so that training can continue from a
-            host without markers. BEVFormer normalises its features before the fusion; the evidence encoder does not,
-            and for a host trained without markers, Eq. (3) as written changes all features at once.
+        norm: position of the LayerNorm in Eq. (3). "written": around the sum, in every frame, so that a host without
+            markers in sight differs from one without this module. "sum": the same in frames with lanes of markers;
+            others stay as they are. "query": on the attention's queries, F + c Attn(LayerNorm(F), ..), with a
+            zero-initialised output, so that training can continue from a host without markers. BEVFormer normalises its
+            features before the fusion; the evidence encoder does not, and for a host trained without markers, Eq. (3)
+            as written changes all features at once.
         radius: a BEV cell attends only to lanes that pass within this many metres. None: to all lanes, as in Eq. (3);
             the cell must then learn from the tokens which lanes are near, which takes small models too long.
         query_position: add position encodings to the attention's queries. Eq. (3) has none, SMERF has; without, BEV
@@ -68,7 +71,7 @@ class MarkerFusionConfig:
     hard_threshold: float = 0.5
     heads: int = 4
     width: int | None = None
-    norm: Literal["sum", "query"] = "sum"
+    norm: Literal["written", "sum", "query"] = "sum"
     radius: float | None = None
     query_position: bool = True
     connectivity: bool = False
@@ -87,6 +90,24 @@ SMALL_MARKER_FUSION = MarkerFusionConfig(
         dim=64, layers=2, hidden=128, dropout=0.0, bands=32, layout="interleaved", attend="points"
     ),
 )
+
+
+def uniform_fusion(config: MarkerFusionConfig) -> MarkerFusionConfig:
+    """Return the ablation in which every marker, seen or remembered, counts fully (Table II, "uniform fusion").
+
+    c = 1 in Eq. (3), all weights of Eq. (4) are 1, and memory is read only when nothing is detected.
+    """
+    memory = None if config.memory is None else replace(config.memory, decay=1.0)
+    return replace(config, fusion="uniform", prior=replace(config.prior, trust="all"), memory=memory)
+
+
+def as_written(config: MarkerFusionConfig) -> MarkerFusionConfig:
+    """Return Eq. (3) exactly as the paper writes it, with the same encoder, fusion and memory.
+
+    LayerNorm(F + c Attn(F, M, M)) in every frame, from every cell to every lane, as wide as the BEV features, without
+    positions in the queries.
+    """
+    return replace(config, norm="written", width=None, radius=None, query_position=False)
 
 
 class FusedMarkers(NamedTuple):
@@ -210,7 +231,9 @@ class MarkerFusion(nn.Module):
         mask: Bool[Array, "#q n"],
         gate: Float[Array, ""],
     ) -> Float[Array, "q c"]:
-        """Return the BEV features after the fusion; they stay exactly as they are if the mask admits no token.
+        """Return the BEV features after the fusion.
+
+        They stay exactly as they are if the mask admits no token, but for the LayerNorm of `norm` "written".
 
         Args:
             bev, position: features of the cells and their position encoding.
@@ -226,7 +249,8 @@ class MarkerFusion(nn.Module):
         )
         found = attention(query + position if config.query_position else query, tokens, tokens, mask)
         fused = bev + gate * found
-        return jnp.where(mask.any(), fused if added else norm(fused), bev)  # Eq. (3)
+        after = fused if added else norm(fused)  # Eq. (3)
+        return after if config.norm == "written" else jnp.where(mask.any(), after, bev)
 
 
 def fusion_gate(lanes: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Float[Array, ""], Bool[Array, " n"]]:

@@ -8,8 +8,10 @@ Choices that the paper leaves open (the first two are options):
 
 - The paper mentions no compensation of the ego motion. `compensation="ego_motion"` transforms stored lanes into the
   present ego frame; "none" keeps their coordinates.
-- Eq. (3) has one confidence c, but every stored token has its own. `gate="strongest"` takes the largest decayed
-  confidence; "one" leaves the scaling to Eq. (4).
+- Eq. (3) has one confidence c, but every stored token has its own, and Eq. (4) has scaled it already. `gate="once"`
+  takes the largest decayed confidence for c and scales tokens relative to it, as those of a frame with several markers
+  are: a token enters with its decayed confidence. "strongest" takes the same c and scales by Eq. (4) as written, so
+  that a token enters with about the square. "one" leaves all scaling to Eq. (4).
 - T, gamma, alpha and epsilon are not given; the defaults are ours.
 - With several markers in a frame, c_t is the highest confidence; lanes of the others are scaled relative to it.
 """
@@ -39,7 +41,7 @@ class MarkerMemoryConfig:
         lanes: largest number of prior tokens, those with the largest weights; None is the whole union of Eq. (4), T L
             lanes. The encoder's time grows with this number.
         compensation: of the ego motion, for stored lanes.
-        gate: c of Eq. (3) for tokens from the bank.
+        gate: c of Eq. (3) for tokens from the bank, and what their weights are relative to; see above.
     """
 
     frames: int = 6
@@ -48,7 +50,7 @@ class MarkerMemoryConfig:
     threshold: float = 0.1
     lanes: int | None = None
     compensation: Literal["ego_motion", "none"] = "ego_motion"
-    gate: Literal["strongest", "one"] = "strongest"
+    gate: Literal["once", "strongest", "one"] = "once"
 
 
 @struct.dataclass
@@ -141,10 +143,11 @@ def remember(
     decayed = bank.confidence * (config.decay**age)[:, None]  # c-hat of III-C
     alone = guidance(observed, config.exponent)
     retrieve = alone.gate < config.threshold
-    weight = jnp.where(retrieve, _power(decayed, config.exponent), 0.0)  # Eq. (4)
-    weight = weight.at[0].set(jnp.where(retrieve, weight[0], alone.weight))
     strongest = decayed.max(initial=0.0)
-    from_bank = strongest if config.gate == "strongest" else jnp.where(strongest > 0, 1.0, 0.0)
+    scale = jnp.where(strongest > 0, strongest, 1.0) if config.gate == "once" else 1.0
+    weight = jnp.where(retrieve, _power(decayed / scale, config.exponent), 0.0)  # Eq. (4)
+    weight = weight.at[0].set(jnp.where(retrieve, weight[0], alone.weight))
+    from_bank = jnp.where(strongest > 0, 1.0, 0.0) if config.gate == "one" else strongest
     used = bank.valid & (retrieve | (age == 0))[:, None]
     gate = jnp.where(retrieve, from_bank, alone.gate)
     return bank, _union(bank, jnp.where(used, weight, 0.0), used, gate, config.lanes)

@@ -7,6 +7,7 @@ in numpy or under jit, depending on the arrays.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from flax import struct
@@ -26,6 +27,9 @@ class MarkerPriorConfig:
         distance_scale: tau_d of Eq. (2), metres.
         residual_scale: tau_r of Eq. (2), metres.
         use_score: multiply the confidence by the detector's raw score, an addition that the paper mentions.
+        trust: "confidence" is Eq. (2). "all" gives every detected marker the confidence 1, so that nothing that depends
+            on it tells markers apart: their order (then by distance), their share in a frame, and when memory is read
+            (then only when nothing is detected).
     """
 
     points: int = 11
@@ -33,6 +37,7 @@ class MarkerPriorConfig:
     distance_scale: float = 40.0
     residual_scale: float = 10.0
     use_score: bool = False
+    trust: Literal["confidence", "all"] = "confidence"
 
 
 @struct.dataclass
@@ -78,7 +83,9 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     residual = xp.where(markers.valid, markers.residual, 0.0)
     # The prior ignores the vertical coordinate (section III-A).
     trust = confidence(xp.sqrt((pose[:, :2, 3] ** 2).sum(-1)), residual, config)
-    if config.use_score:
+    if config.trust == "all":
+        trust = xp.ones_like(trust)
+    elif config.use_score:
         trust = trust * xp.where(markers.valid, markers.score, 0.0)
     valid = (markers.lane_valid & markers.valid[:, None]).reshape(-1)
     flat = markers.lanes[..., :2].reshape(count * lanes, points, 2)[:, stride(points, config.points)]

@@ -14,9 +14,10 @@ from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.scene.logs import KeyFrame, Log, Tracks
+from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
+from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.roads.map_networks import build_map_network
-from tflane_jax.world.roads.markers import PlacementConfig, place_markers
+from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
 from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, build_road_network
 from tflane_jax.world.roads.road_map import RoadMap
 from tflane_jax.world.traffic.signals import element_states, show_signals
@@ -81,6 +82,10 @@ class Place:
     sees: float
 
 
+def _chosen_by_sight(vector_map: VectorMap, scene_id: int, config: WorldConfig) -> tuple[Visible, ...]:
+    return (visible_places(vector_map, scene_id),) if config.markers.site == "clear" else ()
+
+
 def simulate(
     scene_id: int, config: WorldConfig = WorldConfig(), history: int = HISTORY, place: Place | None = None
 ) -> Log:
@@ -141,7 +146,7 @@ def simulate(
         weather=float(weather),
         paint_wear=float(paint_wear),
         seed=scene_id,
-        markers=place_markers(network.map, scene_id, config.markers),
+        markers=place_markers(network.map, scene_id, config.markers, *_chosen_by_sight(network.map, scene_id, config)),
     )
 
 

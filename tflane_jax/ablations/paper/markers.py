@@ -16,6 +16,26 @@ def _row(name: str, ablation: str, host: str = "TopoNet host") -> TableRow:
     return TableRow(name, f"markers/toponet_markers:{ablation}", start=host)
 
 
+# Other forms of the module, as the ends of names of ablations: every cell sees every lane; Eq. (3) to the letter.
+_FORMS = {"no radius": "everywhere", "as written": "as_written"}
+
+
+def _forms(*rows: tuple[str, str]) -> tuple[TableRow, ...]:
+    """Return rows of a table (name, ablation) and the paper's system once more, in every other form."""
+    found = []
+    for form, end in _FORMS.items():
+        found += [_row(f"{name}, {form}", f"{ablation}_{end}") for name, ablation in rows]
+        found.append(_row(f"{_OURS.name}, {form}", end))
+    return tuple(found)
+
+
+def _claims(*names: str) -> tuple[Claim, ...]:
+    """Return the claims that the paper's system is better than these rows, in every other form."""
+    return tuple(
+        Claim(f"{_OURS.name}, {form}", f"{name}, {form}", f"the same, {form}") for form in _FORMS for name in names
+    )
+
+
 def _table(
     number: str,
     title: str,
@@ -69,10 +89,18 @@ TABLES = (
     _table(
         "2",
         "confidence-gated fusion",
-        (_row("uniform fusion", "uniform"), _row("hard masking", "hard"), _OURS),
+        (
+            _row("uniform fusion", "uniform"),
+            _row("hard masking", "hard"),
+            _OURS,
+            _row("only c = 1", "ungated"),
+            *_forms(("uniform fusion", "uniform"), ("hard masking", "hard")),
+        ),
         (
             Claim(_OURS.name, "uniform fusion", "gating is better than uniform fusion (+12.9 DET_l)"),
             Claim(_OURS.name, "hard masking", "gating is better than hard masking (+9.7 DET_l)"),
+            Claim(_OURS.name, "only c = 1", "the factor c alone"),
+            *_claims("uniform fusion", "hard masking"),
         ),
         _COLUMNS,
         {
@@ -84,10 +112,16 @@ TABLES = (
     _table(
         "3",
         "temporal memory of markers",
-        (_row("no memory", "no_memory"), _row("memory without decay", "no_decay"), _OURS),
+        (
+            _row("no memory", "no_memory"),
+            _row("memory without decay", "no_decay"),
+            _OURS,
+            *_forms(("no memory", "no_memory"), ("memory without decay", "no_decay")),
+        ),
         (
             Claim(_OURS.name, "no memory", "memory helps (+9.7 DET_l)"),
             Claim(_OURS.name, "memory without decay", "decay helps (+1.9 DET_l)"),
+            *_claims("no memory", "memory without decay"),
         ),
         _COLUMNS,
         {
@@ -99,10 +133,16 @@ TABLES = (
     _table(
         "4",
         "encoding of a marker's polyline",
-        (_row("MLP", "mlp"), _row("transformer", "transformer"), _OURS),
+        (
+            _row("MLP", "mlp"),
+            _row("transformer", "transformer"),
+            _OURS,
+            *_forms(("MLP", "mlp"), ("transformer", "transformer")),
+        ),
         (
             Claim("transformer", "MLP", "a transformer is better than an MLP (+7.7 DET_l)"),
             Claim(_OURS.name, "transformer", "positional encoding helps (+8.0 DET_l)"),
+            *_claims("MLP", "transformer"),
         ),
         _COLUMNS,
         {

@@ -14,6 +14,7 @@ def markers(commands) -> None:
     )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
     _marker_store(inner)
+    _drive(inner)
     detect = command(
         inner, "detect", "detect markers in photos of a calibrated camera", module="markers", function="find"
     )
@@ -71,6 +72,12 @@ def markers(commands) -> None:
         help="sigma_d of the paper's detection curve in the picture, metres (default 40)",
     )
     curves.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
+    detect.add_argument(
+        "--search",
+        choices=("outlines", "all"),
+        default="outlines",
+        help="all also finds partly hidden boards, more slowly (default outlines)",
+    )
     for parser, many in ((detect, False), (curves, True)):
         parser.add_argument("--family", default="ARUCO_5X5_100", help="marker family (default ARUCO_5X5_100)")
         parser.add_argument(
@@ -89,6 +96,36 @@ def markers(commands) -> None:
             parser.add_argument(
                 "--corners", choices=methods, default="pattern", help="corner refinement (default pattern)"
             )
+
+
+def _drive(inner) -> None:
+    run = command(
+        inner, "run", "follow a drive: markers, their lanes, and a model's lanes", module="marker_run", function="run"
+    )
+    run.add_argument("--store", metavar="FILE", type=Path, required=True, help="store of the markers' lanes")
+    run.add_argument("--images", metavar="DIR", type=Path, required=True, help="folder of the images, at native size")
+    run.add_argument(
+        "--poses", metavar="FILE", type=Path, required=True, help="cameras, times and poses (docs/markers.md)"
+    )
+    run.add_argument("--model", metavar="RUN", type=Path, help="run folder of a model with cameras; default none")
+    run.add_argument("--today", metavar="YYYY-MM-DD", help="day on which entries are valid (default the present day)")
+    run.add_argument(
+        "--search", choices=("all", "outlines"), default="all", help="all also finds partly hidden boards (default)"
+    )
+    run.add_argument("--family", default="ARUCO_5X5_100", help="marker family (default ARUCO_5X5_100)")
+    run.add_argument(
+        "--threshold", type=float, default=0.3, help="lowest score of a lane that is drawn and written (default 0.3)"
+    )
+    run.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/drive"), help="default runs/drive")
+    render = command(
+        inner, "render", "write a drive of the built-in world with its store", module="marker_run", function="render"
+    )
+    render.add_argument("--log", metavar="SCENE", type=int, required=True, help="number of the scene")
+    render.add_argument("--frames", type=int, default=8, help="frames, half a second apart (default 8)")
+    render.add_argument("--ring", choices=("argoverse2", "nuscenes"), default="argoverse2", help="default argoverse2")
+    render.add_argument("--cameras", type=int, default=3, help="first cameras of the ring (default 3)")
+    render.add_argument("--scale", type=float, default=1.0, help="size of the images, 1 is native (default 1)")
+    render.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder to write")
 
 
 def _marker_store(inner) -> None:

@@ -17,7 +17,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.cameras import crop_intrinsics
 from tflane_jax.scene import CameraViews
-from tflane_jax.scene.logs import Log
+from tflane_jax.scene.logs import KeyFrame, Log
 from tflane_jax.world.cameras.depth import render_depth
 from tflane_jax.world.cameras.elements import element_bodies, element_boxes, unhidden
 from tflane_jax.world.cameras.ground import sample_ground
@@ -34,6 +34,8 @@ from tflane_jax.world.render.weather import Weather
 _PICTURE = 640.0
 # The rays of images up to this many pixels are cached.
 _FEW_PIXELS = 500_000
+# Added to a track frame's number in the random stream of a moment that is given by its track frame.
+_BETWEEN = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -91,12 +93,19 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
 
 
 def render_window(
-    log: Log, keyframe: int, config: CameraRigConfig, corner: tuple[int, int], size: tuple[int, int], *, camera: int = 0
+    log: Log,
+    keyframe: int | KeyFrame,
+    config: CameraRigConfig,
+    corner: tuple[int, int],
+    size: tuple[int, int],
+    *,
+    camera: int = 0,
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return a part of one camera's image: as drawn by `render_cameras`, but with other rain and noise.
 
     Args:
-        log, keyframe, config: as for `render_cameras`.
+        log, config: as for `render_cameras`.
+        keyframe: number of the key frame, or any moment of the log.
         corner: column and row of the part's upper left pixel.
         size: its width and height.
         camera: index in the rig.
@@ -112,8 +121,13 @@ def render_window(
         )
     part = replace(whole, width=width, height=height, intrinsics=crop_intrinsics(whole.intrinsics, corner))
     stage = stage_of(log, config)
-    picture = _draw(stage, moment_of(log, keyframe, stage, config), _view(part, config.supersample), config)
-    rng = camera_stream(log.seed, config.cameras[camera], Stream.PICTURE, keyframe, left, top)
+    if isinstance(keyframe, KeyFrame):
+        number = _BETWEEN + keyframe.track_frame
+        moment = moment_of(replace(log, keyframes=(keyframe,)), 0, stage, config)
+    else:
+        number, moment = keyframe, moment_of(log, keyframe, stage, config)
+    picture = _draw(stage, moment, _view(part, config.supersample), config)
+    rng = camera_stream(log.seed, config.cameras[camera], Stream.PICTURE, number, left, top)
     return _develop(rng, picture, part, stage.weather, max(whole.width, whole.height))
 
 

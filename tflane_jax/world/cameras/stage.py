@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tflane_jax.scene.logs import Log
-from tflane_jax.world.cameras.elements import mast_bodies
+from tflane_jax.files.images import opencv
+from tflane_jax.scene.logs import Log, VectorMap
+from tflane_jax.world.cameras.elements import element_bodies, mast_bodies
 from tflane_jax.world.cameras.ground import Ground, draw_ground
 from tflane_jax.world.cameras.ground_window import window_around
 from tflane_jax.world.cameras.light import cast, draw_panorama, log_weather
@@ -29,6 +30,8 @@ SHADE_TEXEL = 0.25
 # Above this image scale the sky, and the ground near the vehicle, are drawn at a finer resolution.
 LARGE = 0.25
 _MOST_WORN = 0.88
+# Height of the buildings of a real log, metres.
+_TOWER = 100.0
 
 
 class Stream(enum.IntEnum):
@@ -118,6 +121,39 @@ def _set_stage(log: Log, config: CameraRigConfig) -> Stage:
         looks=log_stream(log, Stream.LOOKS).random((len(log.actors.size), 8)),
         ground=ground,
     )
+
+
+_BOXES: dict[tuple[int, int], np.ndarray] = {}
+
+
+def static_boxes(log: Log) -> Float[np.ndarray, "b 7"]:
+    """Return the boxes of all that stands beside the roads of a log but boards: as `Bodies.boxes`, global frame.
+
+    Nothing is drawn, but OpenCV is needed. Of real logs, which have no scenery, buildings alone are known.
+    """
+    return map_boxes(log.map, log.seed) if log.markers is not None else _buildings(log)
+
+
+def map_boxes(vector_map: VectorMap, seed: int) -> Float[np.ndarray, "b 7"]:
+    """Return `static_boxes` of the world's scene with this map and seed; cached for the lifetime of the map."""
+    key = id(vector_map), seed
+    if key in _BOXES:
+        return _BOXES[key]
+    opencv()
+    scenery = draw_scenery(np.random.default_rng([ROOT, seed, Stream.SCENERY]), vector_map, 0.0)
+    masts = mast_bodies(vector_map.elements, vector_map.road_boundaries)
+    shown = np.array([element.attribute for element in vector_map.elements], int)
+    boxes = [scenery.bodies.boxes, masts.boxes]
+    if len(shown):
+        boxes.append(element_bodies(vector_map.elements, shown).boxes)
+    _BOXES[key] = np.concatenate(boxes)
+    weakref.finalize(vector_map, _BOXES.pop, key, None)
+    return _BOXES[key]
+
+
+def _buildings(log: Log) -> Float[np.ndarray, "b 7"]:
+    blocks = np.asarray(log.map.buildings, np.float64).reshape(-1, 5)
+    return np.column_stack([blocks, np.zeros(len(blocks)), np.full(len(blocks), _TOWER)])
 
 
 def log_stream(log: Log, stream: Stream) -> np.random.Generator:

@@ -6,6 +6,7 @@ markers change nothing else in a scene.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +25,9 @@ _FARTHEST_KERB = 8.0
 _NO_KERB = 0.5
 # A board nearer than this to a centerline would be on the road, metres.
 _CLEAR = 2.0
+# Where a surveyor looks for a clear place: distances along the lane, and farther behind the kerb, metres. The first
+# place of which drivers see this fraction is taken.
+_AWAY, _FARTHER_BACK, _ENOUGH = (0.0, 3.0, 6.0, 10.0, 15.0, 20.0), 0.8, 0.98
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,9 @@ class PlacementConfig:
         toe_in: yaw of the board from facing the traffic towards the road, degrees.
         jitter: largest deviation of a board's yaw (uniform), degrees.
         dictionary: number of ids, from 0; a map never has more markers than ids.
+        site: "junction": at the end of the lane, whatever stands before it. "clear": where a surveyor would put it, the
+            first place along the lane that drivers see from `world.cameras.marker_sites.VIEWS` without a mast, sign,
+            lamp post, tree or building before it (needs OpenCV).
     """
 
     per: Literal["approach", "scene"] = "approach"
@@ -51,9 +58,19 @@ class PlacementConfig:
     toe_in: float = 5.0
     jitter: float = 3.0
     dictionary: int = 100
+    site: Literal["junction", "clear"] = "junction"
 
 
-def place_markers(vector_map: VectorMap, seed: int, config: PlacementConfig = PlacementConfig()) -> PlacedMarkers:
+Visible = Callable[[Float[np.ndarray, "3"], float], float]
+"""(middle of a board, heading of the traffic it faces) -> fraction of it that drivers see, 0 to 1."""
+
+
+def place_markers(
+    vector_map: VectorMap,
+    seed: int,
+    config: PlacementConfig = PlacementConfig(),
+    visible: Visible | None = None,
+) -> PlacedMarkers:
     """Return the markers of a map, in no particular order: to the right of each approach, facing its traffic.
 
     An approach is all lanes that end side by side where an intersection, a split or a merge begins. The marker stands
@@ -61,17 +78,18 @@ def place_markers(vector_map: VectorMap, seed: int, config: PlacementConfig = Pl
     middle of another lane is skipped.
 
     The same map and seed give the same bits. A map without approaches has no markers.
+
+    Args:
+        vector_map, seed, config: see above.
+        visible: chooses among places along a lane; None takes the end of each lane.
     """
     lanes = vector_map.segments
-    sides = [_roadside([lanes[i] for i in _approach_lanes(lanes)], end=-1)]
-    if config.side == "both":
-        sides.append(_roadside([lanes[i] for i in _exit_lanes(lanes)], end=0))
-    right, heading = (np.concatenate(values) for values in zip(*sides, strict=True))
-    sideways = np.stack([np.sin(heading), -np.cos(heading)], -1)
-    to_kerb = _kerb_distance(right[:, :2], sideways, vector_map.road_boundaries)
-    place = right + np.pad((to_kerb + config.setback)[:, None] * sideways, ((0, 0), (0, 1)))
-    place[:, 2] += config.height
-    clear = _off_lanes(place[:, :2], vector_map)
+    ends = [(lanes[i], -1) for i in _approach_lanes(lanes)], [(lanes[i], 0) for i in _exit_lanes(lanes)]
+    chosen = [_rightmost_lanes(side) for side in ends[: 2 if config.side == "both" else 1]]
+    sites = [site for side in chosen for site in side]
+    place, heading, clear = _places(sites, 0.0, config.setback, vector_map, config)
+    if visible is not None:
+        place, heading, clear = _most_visible(sites, (place, heading, clear), vector_map, config, visible)
     place, heading = place[clear], heading[clear]
 
     rng = np.random.default_rng([ROOT, seed])
@@ -111,14 +129,71 @@ def _exit_lanes(segments: dict[int, LaneSegment]) -> list[int]:
     return [i for i, s in segments.items() if i in onward and s.vehicle and not s.is_intersection]
 
 
-def _roadside(segments: list[LaneSegment], *, end: int) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Return the end (-1) or the start (0) of the right boundary of the rightmost lanes, and their headings there."""
-    right = np.array([s.right[end] for s in segments]).reshape(-1, 3)
+_Site = tuple[LaneSegment, int]
+_Places = tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]
+
+
+def _places(sites: list[_Site], away: float, setback: float, vector_map: VectorMap, config: PlacementConfig) -> _Places:
+    """Return places of boards, the headings of their traffic, and which places are not on a lane.
+
+    Args:
+        sites: lanes, each with its end (-1) or its start (0) at the junction.
+        away: from the junction along the lane, metres.
+        setback: from the kerb, metres.
+        vector_map, config: see `place_markers`.
+    """
+    ends = [_roadside(lane, end, away) for lane, end in sites]
+    right = np.array([point for point, _ in ends]).reshape(-1, 3)
+    heading = np.array([angle for _, angle in ends])
+    sideways = np.stack([np.sin(heading), -np.cos(heading)], -1)
+    to_kerb = _kerb_distance(right[:, :2], sideways, vector_map.road_boundaries)
+    place = right + np.pad((to_kerb + setback)[:, None] * sideways, ((0, 0), (0, 1)))
+    place[:, 2] += config.height
+    return place, heading, _off_lanes(place[:, :2], vector_map)
+
+
+def _most_visible(
+    sites: list[_Site], start: _Places, vector_map: VectorMap, config: PlacementConfig, visible: Visible
+) -> _Places:
+    """Return the first clear place of each site, or the one that is seen best."""
+    place, heading, clear = (array.copy() for array in start)
+    best = np.array([visible(p, h) if c else -1.0 for p, h, c in zip(place, heading, clear, strict=True)])
+    for away in _AWAY:
+        for setback in (config.setback, config.setback + _FARTHER_BACK):
+            waiting = np.flatnonzero(best < _ENOUGH)
+            if not len(waiting) or (away == 0.0 and setback == config.setback):
+                continue
+            others = _places([sites[i] for i in waiting], away, setback, vector_map, config)
+            for i, there, angle, free in zip(waiting.tolist(), *others, strict=True):
+                long_enough = _length(sites[i][0].right) > away + _CLEAR
+                seen = visible(there, float(angle)) if free and long_enough else -1.0
+                if seen > best[i]:
+                    place[i], heading[i], clear[i], best[i] = there, angle, True, seen
+    return place, heading, clear
+
+
+def _roadside(lane: LaneSegment, end: int, away: float) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return a point of a lane's right boundary, `away` metres from its end (-1) or its start (0), and the heading."""
+    if away > 0.0:
+        line = lane.right if end == 0 else lane.right[::-1]
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1))])
+        point, after = (np.array([np.interp(s, along, line[:, k]) for k in range(3)]) for s in (away, away + 1.0))
+        step = after - point if end == 0 else point - after
+        if np.hypot(step[0], step[1]) > 0.0:
+            return point, float(np.arctan2(step[1], step[0]))
     first = -2 if end else 0
-    step = np.array([s.centerline[first + 1] - s.centerline[first] for s in segments]).reshape(-1, 3)
-    heading = np.arctan2(step[:, 1], step[:, 0])
-    chosen = _rightmost(right, heading)
-    return right[chosen], heading[chosen]
+    step = lane.centerline[first + 1] - lane.centerline[first]
+    return lane.right[end], float(np.arctan2(step[1], step[0]))
+
+
+def _length(line: Float[np.ndarray, "n 3"]) -> float:
+    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1).sum())
+
+
+def _rightmost_lanes(sites: list[_Site]) -> list[_Site]:
+    ends = [_roadside(lane, end, 0.0) for lane, end in sites]
+    right = np.array([point for point, _ in ends]).reshape(-1, 3)
+    return [sites[i] for i in _rightmost(right, np.array([angle for _, angle in ends])).tolist()]
 
 
 def _rightmost(right: Float[np.ndarray, "n 3"], heading: Float[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:

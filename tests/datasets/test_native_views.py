@@ -1,0 +1,71 @@
+"""Native images at the sizes that a trained model reads."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.markers.test_detection import AHEAD, photo, pose, views
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.native_views import fitted_views
+from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.view_images import ImageConfig
+from tflane_jax.errors import UserError
+from tflane_jax.geometry.cameras import project
+from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig
+
+pytest.importorskip("cv2")
+
+MOUNT = CameraMount("front", 0.0, 0.0, 1.5, 0.0, 0.0, 900.0, 960, 540)
+
+
+def world(*mounts, **more):
+    return ProceduralConfig(example=ExampleConfig(sensor=None, cameras=CameraRigConfig(cameras=mounts, **more)))
+
+
+@pytest.fixture(scope="module")
+def native():
+    return views((AHEAD, photo(AHEAD, {3: pose(12.0, 1.0, 2.0)})))
+
+
+def test_images_are_scaled_and_padded_like_the_rigs(native):
+    small = fitted_views(native, world(MOUNT, scale=0.25, multiple=16))
+    small.validate()
+    assert small.image.shape == (1, 144, 240, 3)  # 135 rows, padded to a multiple of 16
+    assert small.size.tolist() == [[240, 135]]
+    assert not small.image[0, 135:].any()
+    point = np.array([[12.0, 1.0, 2.0]])
+    pixel, reduced = (
+        project(point, np.asarray(v.intrinsics[0], np.float64), np.asarray(v.camera_from_ego[0], np.float64))[0][0]
+        for v in (native, small)
+    )
+    np.testing.assert_allclose(reduced, pixel / 4.0, atol=1e-3)
+    # Pixels are averages of the native ones.
+    block = np.asarray(native.image[0], float).reshape(135, 4, 240, 4, 3).mean((1, 3))
+    assert np.abs(small.image[0, :135] - block).max() <= 1.0
+
+
+def test_a_missing_image_stays_missing(native):
+    nothing = fitted_views(native.replace(valid=np.array([False])), world(MOUNT, scale=0.25))
+    assert nothing.valid.tolist() == [False]
+    assert not nothing.image.any()
+
+
+def test_images_fit_the_settings_of_a_dataset(native):
+    source = SimpleNamespace(image=ImageConfig(front_rows=(100, 500), scale=0.5, divisor=32))
+    fitted = fitted_views(native, source)
+    assert fitted.size.tolist() == [[480, 200]]
+    assert fitted.image.shape == (1, 224, 480, 3)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (world(MOUNT, MOUNT, scale=0.25), "trained with 2 cameras"),
+        (world(CameraMount("front", 0.0, 0.0, 1.5, 0.0, 0.0, 900.0, 960, 300), scale=0.25), "crop them first"),
+        (ProceduralConfig(), "leave --model out"),
+    ],
+)
+def test_models_that_these_images_do_not_suit_are_refused(native, source, message):
+    with pytest.raises(UserError, match=message):
+        fitted_views(native, source)

@@ -1,0 +1,122 @@
+"""Boards that are partly hidden or in the shadow, which OpenCV's search does not find."""
+
+import numpy as np
+import pytest
+
+from tests.markers.test_detection import AHEAD, photo, pose
+from tflane_jax.markers.image_search import DetectorConfig, find_markers
+from tflane_jax.markers.occluded_search import find_occluded
+from tflane_jax.markers.square_pose import marker_outline
+from tflane_jax.scene.marker_patterns import MarkerFamily
+
+cv2 = pytest.importorskip("cv2")
+
+ARUCO = MarkerFamily.ARUCO_5X5_100
+TRUTH = pose(9.0, -0.2, 1.8, 20.0)
+CORNERS = marker_outline(TRUTH, 1.0, AHEAD.intrinsics, AHEAD.camera_from_ego)
+# Part of the image around the board, whose square is about 97 pixels wide.
+LEFT, TOP, RIGHT, BOTTOM = (int(v) for v in (*CORNERS.min(0) - 90, *CORNERS.max(0) + 90))
+
+
+def board(number=21):
+    """Return the part of a photo that shows the board, and the board's corners in it."""
+    grey = photo(AHEAD, {number: TRUTH}).mean(-1).astype(np.uint8)
+    return grey[TOP:BOTTOM, LEFT:RIGHT].copy(), CORNERS - [LEFT, TOP]
+
+
+def bar(grey, corners, share, tone=60):
+    """Draw a post before the board."""
+    middle, width = corners.mean(0), np.ptp(corners[:, 0])
+    x = round(float(middle[0] - 0.12 * width))
+    grey[:, x : x + max(2, round(share * width))] = tone
+
+
+def leaf(grey, corners):
+    """Cover the lower right corner."""
+    cv2.circle(grey, tuple(np.round(corners[2]).astype(int).tolist()), round(0.33 * np.ptp(corners[:, 0])), 70, -1)
+
+
+def side(grey, corners):
+    low = corners.min(0)
+    grey[:, : round(float(low[0] + 0.1 * np.ptp(corners[:, 0])))] = 70
+
+
+def shadow(grey, corners):
+    x, y = corners.mean(0)
+    rows, columns = np.mgrid[: grey.shape[0], : grey.shape[1]]
+    dark = (columns - x) + 0.6 * (rows - y) > 5.0
+    grey[dark] = (0.35 * grey[dark]).astype(np.uint8)
+
+
+def none(grey, corners):
+    del grey, corners
+
+
+DAMAGE = {
+    "none": (none, 0.2),
+    "bar 2 %": (lambda g, c: bar(g, c, 0.02), 0.3),
+    "bar 10 %": (lambda g, c: bar(g, c, 0.1), 0.3),
+    "bar 18 %": (lambda g, c: bar(g, c, 0.18), 0.4),
+    "leaf": (leaf, 0.5),
+    "side": (side, 0.8),
+    "shadow": (shadow, 0.8),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_board_is_found_at_its_place(name):
+    grey, corners = board()
+    damage, within = DAMAGE[name]
+    damage(grey, corners)
+    if name != "none":
+        assert not len(find_markers(grey, DetectorConfig(search="outlines")).marker_id)
+    (found,) = find_occluded(grey, ARUCO, 8.0, ids=range(40))
+    assert found.marker_id == 21
+    assert np.abs(found.corners - corners).max() < within
+    assert found.wrong_bits <= 5
+    assert found.explained > 0.85
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_corners_follow_the_pattern_of_a_turned_board(turns):
+    grey, corners = board()
+    bar(grey, corners, 0.05)
+    assert find_markers(grey, DetectorConfig(search="all")).marker_id.tolist() == [21]
+    (found,) = find_occluded(np.ascontiguousarray(np.rot90(grey, turns)), ARUCO, 8.0)
+    assert found.marker_id == 21
+    for _ in range(turns):
+        corners, grey = np.stack([corners[:, 1], grey.shape[1] - corners[:, 0]], -1), np.rot90(grey)
+    assert np.abs(found.corners - corners).max() < 0.4
+
+
+def test_only_possible_ids_are_found():
+    grey, corners = board()
+    bar(grey, corners, 0.1)
+    assert find_occluded(grey, ARUCO, 8.0, ids=(3, 4)) == []
+    assert find_occluded(grey, ARUCO, 8.0, ids=()) == []
+
+
+@pytest.mark.parametrize("seed", [2])
+def test_rectangles_and_noise_hold_no_markers(seed):
+    """Dark panes in bright frames, some with bright cells in them."""
+    rng = np.random.default_rng(seed)
+    grey = np.full((240, 320), 120, np.uint8)
+    for _ in range(12):
+        x, y, size = (int(v) for v in (*rng.integers(0, (260, 180)), rng.integers(18, 70)))
+        cv2.rectangle(grey, (x, y), (x + size, y + size), 210, -1)
+        edge = size // 9 + 1
+        cv2.rectangle(grey, (x + edge, y + edge), (x + size - edge, y + size - edge), 30, -1)
+        inner = rng.integers(0, 2, (3, 3)) * 180 + 30
+        cell = (size - 6 * edge) // 3
+        if cell > 1:
+            start = slice(y + 3 * edge, y + 3 * edge + 3 * cell), slice(x + 3 * edge, x + 3 * edge + 3 * cell)
+            shown = np.kron(inner, np.ones((cell, cell)))
+            part = grey[start]
+            part[:] = shown[: part.shape[0], : part.shape[1]]
+    grey = np.clip(grey + 5.0 * rng.standard_normal(grey.shape), 0, 255).astype(np.uint8)
+    assert find_occluded(grey, ARUCO, 8.0) == []
+
+
+@pytest.mark.parametrize("shape", [(5, 5), (40, 40)])
+def test_small_and_empty_images(shape):
+    assert find_occluded(np.full(shape, 100, np.uint8), ARUCO, 8.0) == []

@@ -1,0 +1,98 @@
+"""`tflane markers run`: from images, poses and a store to pictures and frames.json."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.markers.test_detection import AHEAD, pose
+from tests.markers.test_reader import BOARDS, LANES, SECOND, ego, seen_from
+from tflane_jax.cli import main
+from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, save_drive
+from tflane_jax.geometry import invert_pose
+from tflane_jax.markers.store import store_of
+from tflane_jax.markers.store_files import save_store
+from tflane_jax.priors.markers import MarkerPriorConfig, confidence
+from tflane_jax.scene.logs import PlacedMarkers
+
+cv2 = pytest.importorskip("cv2")
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """Four frames half a second apart: board 3 in two of them, then none, then an unknown one with an old one."""
+    folder = tmp_path_factory.mktemp("drive")
+    boards = PlacedMarkers(np.array([3]), BOARDS[3][None])
+    near, old = store_of(LANES, boards), store_of(LANES, PlacedMarkers(np.array([8]), BOARDS[8][None]))
+    store = json.loads(save_store(near, folder / "store.json").read_text())
+    expired = json.loads(save_store(old, folder / "old.json").read_text())["markers"][0]
+    store["markers"].append(expired | {"expires": "2026-01-01"})
+    (folder / "store.json").write_text(json.dumps(store))
+    shown = [(0.0, {3: BOARDS[3]}), (2.0, {3: BOARDS[3]}), (4.0, {}), (6.0, {8: BOARDS[8], 40: pose(25.0, -3.0, 3.0)})]
+    frames = []
+    for number, (x, there) in enumerate(shown):
+        file = folder / f"{number}.png"
+        cv2.imwrite(str(file), np.asarray(seen_from(x, there).image[0])[..., ::-1])
+        frames.append(DriveFrame(number * SECOND // 2, ego(x), {"front": file}))
+    cameras = (DriveCamera("front", AHEAD.intrinsics, invert_pose(AHEAD.camera_from_ego)),)
+    save_drive(Drive(cameras, tuple(frames)), folder / "poses.json", folder)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+
+
+def arguments(folder, out, **changed):
+    options = {"store": folder / "store.json", "images": folder, "poses": folder / "poses.json", "out": out}
+    options["search"] = "outlines"  # whole boards; the search for hidden ones takes seconds an image
+    options |= {"today": "2026-02-01"} | changed
+    return ["markers", "run", *(text for name, value in options.items() for text in (f"--{name}", str(value)))]
+
+
+def test_a_drive_from_pixels_to_lanes(drive, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(arguments(drive, out)) == 0
+    record = json.loads((out / "frames.json").read_text())
+    first, second, gap, last = record["frames"]
+    assert [frame["picture"] for frame in record["frames"]] == ["000.png", "001.png", "002.png", "003.png"]
+    assert all(cv2.imread(str(out / frame["picture"])) is not None for frame in record["frames"])
+    (board,) = second["boards"]
+    assert (board["id"], board["outcome"], board["size"]) == (3, "used", 1.0)
+    np.testing.assert_allclose(board["position"], [18.0, -5.0, 2.5], atol=0.1)
+    trust = confidence(np.array([board["distance"]]), np.array([board["residual"]]), MarkerPriorConfig())[0]
+    assert board["confidence"] == pytest.approx(trust, abs=1e-3)
+    assert second["gate"] == pytest.approx(trust, abs=1e-3)
+    assert not second["remembered"]
+    # Without a board the lanes of the frames before, moved with the vehicle and trusted less.
+    assert gap["boards"] == []
+    assert gap["remembered"]
+    assert gap["gate"] == pytest.approx(0.9 * second["gate"], abs=1e-3)
+    for points in (np.array(lane["points"]) for lane in gap["guidance"]):
+        np.testing.assert_allclose(points[:, 1], -2.0, atol=0.6)
+    assert {board["id"]: board["outcome"] for board in last["boards"]} == {8: "stale", 40: "unknown"}
+    assert all("confidence" not in board for board in last["boards"])
+    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[4].split("|")[1:-1]]
+    assert row == ["4", "4", "2", "2", "1", "1", "0", "0"]
+    assert first["guidance"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"store": "gone.json"}, "gone.json"),
+        ({"poses": "gone.json"}, "gone.json"),
+        ({"images": "gone"}, "there is no image"),
+        ({"today": "July"}, "--today"),
+        ({"family": "QR"}, "ARUCO_5X5_100"),
+        ({"model": "gone"}, "gone"),
+    ],
+)
+def test_errors_are_one_message(drive, tmp_path, capsys, change, words):
+    assert main(arguments(drive, tmp_path / "out", **change)) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,209 @@
+"""`tflane markers run` and `tflane markers render`.
+
+`run` reads a drive (`datasets.drive_files`) and a store, and writes a picture for each frame and frames.json:
+    {"store", "model", "threshold", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
+     "boards": [{"id", "outcome", "score", "size", "position", "distance", "residual", "confidence"}, ...],
+     "guidance": [{"weight", "points": [[x, y], ...]}, ...],
+     "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...]}
+    "outcome" is one of `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior,
+    "lanes" with a model. Coordinates are in the ego frame, metres.
+
+`render` writes such a drive of the built-in world, with its store.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import warnings
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from tflane_jax.commands.sources import make_folder
+from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive
+from tflane_jax.datasets.marker_cache import search_views
+from tflane_jax.datasets.marker_observations import store_of_log
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
+from tflane_jax.files.images import opencv
+from tflane_jax.geometry import PerceptionRange, invert_pose
+from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.reader import MarkerReader, ReaderConfig
+from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMarkerWarning
+from tflane_jax.markers.store_files import load_store, save_store
+from tflane_jax.plots import format_table
+from tflane_jax.plots.marker_drive import save_drive_frame
+from tflane_jax.runs import open_run
+from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
+from tflane_jax.tasks.lane_pictures import lanes_of
+from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, check_model
+from tflane_jax.training.runtime import configure_jax
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
+from tflane_jax.world.cameras.sensor import render_cameras
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.simulate import WorldConfig, simulate
+
+_RINGS = {"argoverse2": ARGOVERSE2_RING, "nuscenes": NUSCENES_RING}
+
+
+def run(options: argparse.Namespace) -> int:
+    """Follow a drive: markers, store, confidence, memory and, with a model, lanes."""
+    configure_jax()
+    store, drive = load_store(options.store), load_drive(options.poses, options.images)
+    model = None if options.model is None else _model(options.model)
+    range_ = PerceptionRange() if model is None else model.source.example.range
+    detector = _detector(options, store)
+    config = _with_capacities(ReaderConfig(detector, range_, today=_day(options)), model)
+    steps = MarkerDrive(MarkerReader(store, config), model)
+    make_folder(options.out)
+    frames, outcomes = [], Counter()
+    with warnings.catch_warnings():
+        # The table counts them.
+        warnings.simplefilter("ignore", UnknownMarkerWarning)
+        warnings.simplefilter("ignore", StaleMarkerWarning)
+        for number, frame in enumerate(tqdm(drive.frames, desc="drive", unit="frame")):
+            views = drive.views(frame)
+            found = search_views(views, detector)
+            step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, found)
+            outcomes.update(step.reading.observed.outcomes.values())
+            picture = f"{number:03d}.png"
+            record = {"timestamp_ns": frame.timestamp_ns, "picture": picture}
+            frames.append(record | _record(step, options.threshold))
+            save_drive_frame(
+                options.out / picture,
+                views,
+                step.reading.detected,
+                step.reading.observed.outcomes,
+                _confidence(step),
+                step.guidance,
+                None if step.prediction is None else lanes_of(step.prediction),
+                view=range_,
+                names=[camera.name for camera in drive.cameras],
+                title=f"frame {number}, {'remembered' if step.remembered else 'seen'}, c = {step.guidance.gate:.2f}",
+                threshold=options.threshold,
+            )
+    head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
+    write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames})
+    boards = {f"boards {name}": outcomes[name] for name in ("used", "unknown", "stale", "contradictory", "dropped")}
+    guided = sum(bool(frame["guidance"]) for frame in frames)
+    remembered = sum(frame["remembered"] for frame in frames)
+    rows = [{"frames": len(frames), "with lanes": guided, "from memory": remembered} | boards]
+    print(format_table(rows, title=f"{options.poses}: markers of {options.store}"))
+    print(f"\nwritten to {options.out}")
+    return 0
+
+
+def _model(folder: Path) -> DriveModel:
+    trained = open_run(folder)
+    return DriveModel(check_model(trained.config.task), trained.params[0], trained.config.data.source("test"))
+
+
+def _with_capacities(config: ReaderConfig, model: DriveModel | None) -> ReaderConfig:
+    """Return the configuration with the sizes that a model was trained with."""
+    markers = None if model is None else model.source.example.markers
+    if markers is None:
+        return config
+    sizes = {name: getattr(markers, name) for name in ("markers", "lanes", "points")}
+    return replace(config, **sizes, first_residual=markers.simulation.first_residual)
+
+
+def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig:
+    if options.family not in MarkerFamily.__members__:
+        raise UserError(f"there is no marker family {options.family}: one of {', '.join(MarkerFamily.__members__)}")
+    family = MarkerFamily[options.family]
+    # Of a partly hidden board only these ids can be told apart; whole ones are read whatever their id.
+    ids = tuple(number for number in sorted(store.markers) if number < marker_count(family))
+    return DetectorConfig(family, search=options.search, ids=ids)
+
+
+def _day(options: argparse.Namespace) -> datetime.date:
+    if options.today is None:
+        return datetime.date.today()
+    try:
+        return datetime.date.fromisoformat(options.today)
+    except ValueError:
+        raise UserError(f"--today {options.today} is no day: write it like 2025-07-11") from None
+
+
+def _confidence(step: DriveStep) -> dict[int, float]:
+    markers = step.reading.observed.markers
+    return {int(markers.marker_id[k]): float(step.confidence[k]) for k in np.flatnonzero(markers.valid)}
+
+
+def _record(step: DriveStep, threshold: float) -> dict[str, Any]:
+    """Return a frame as plain values."""
+    detected, markers, guidance = step.reading.detected, step.reading.observed.markers, step.guidance
+    residual = {int(markers.marker_id[k]): float(markers.residual[k]) for k in np.flatnonzero(markers.valid)}
+    trust = _confidence(step)
+    boards = []
+    for k in np.flatnonzero(detected.valid).tolist():
+        number, position = int(detected.marker_id[k]), detected.pose[k, :3, 3].astype(float)
+        prior = {"residual": residual[number], "confidence": trust[number]} if number in trust else {}
+        boards.append(
+            {
+                "id": number,
+                "outcome": step.reading.observed.outcomes[number],
+                "score": round(float(detected.score[k]), 4),
+                "size": round(float(detected.size[k]), 4),
+                "position": position.round(3).tolist(),
+                "distance": round(float(np.hypot(*position[:2])), 3),
+                **{name: round(value, 4) for name, value in prior.items()},
+            }
+        )
+    lanes = [
+        {"weight": round(float(guidance.weight[i]), 4), "points": np.asarray(guidance.points[i]).round(3).tolist()}
+        for i in np.flatnonzero(guidance.valid)
+    ]
+    record: dict[str, Any] = {
+        "gate": round(float(guidance.gate), 4),
+        "remembered": step.remembered,
+        "boards": boards,
+        "guidance": lanes,
+    }
+    if step.prediction is not None:
+        found = lanes_of(step.prediction)
+        scores = 1.0 / (1.0 + np.exp(-np.asarray(found.logits, np.float64).max(-1)))
+        best = [q for q in np.argsort(-scores, kind="stable") if scores[q] >= threshold]
+        record["lanes"] = [
+            {"score": round(float(scores[q]), 4), "points": np.asarray(found.points[q]).round(3).tolist()} for q in best
+        ]
+    return record
+
+
+def render(options: argparse.Namespace) -> int:
+    """Write a drive of the built-in world: images, poses.json and store.json."""
+    if options.frames < 1 or not options.scale > 0.0:
+        raise UserError("--frames must be at least 1 and --scale positive")
+    world = WorldConfig(
+        duration_s=2.1 + 0.5 * options.frames, keyframes=options.frames, markers=PlacementConfig(side="both")
+    )
+    log = simulate(options.log, world)
+    store = store_of_log(log, radius=50.0, bike_lanes=True)
+    if not store.markers:
+        raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
+    mounts = _RINGS[options.ring][: options.cameras]
+    rig = CameraRigConfig(cameras=mounts, scale=options.scale, markers=True)
+    cv2, images = opencv(), options.out / "images"
+    make_folder(images)
+    frames = []
+    for number, moment in enumerate(tqdm(log.keyframes, desc="render", unit="frame")):
+        views, files = render_cameras(log, number, rig), {}
+        for place, mount in enumerate(mounts):
+            width, height = views.size[place].tolist()
+            files[mount.name] = images / f"{number:03d}-{mount.name}.png"
+            picture = np.asarray(views.image)[place, :height, :width, ::-1]
+            files[mount.name].write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        frames.append(DriveFrame(moment.timestamp_ns, moment.global_from_ego, files))
+    cameras = tuple(
+        DriveCamera(mount.name, camera.intrinsics, invert_pose(camera.camera_from_ego))
+        for mount, camera in zip(mounts, draw_rig(log.seed, rig), strict=True)
+    )
+    save_drive(Drive(cameras, tuple(frames)), options.out / "poses.json", images)
+    save_store(store, options.out / "store.json")
+    print(f"{len(frames)} frames of {len(mounts)} cameras written to {options.out}: images/, poses.json, store.json")
+    return 0

@@ -1,0 +1,201 @@
+"""A drive as a folder of images and one JSON file with calibration, times and poses: input of `tflane markers run`.
+
+The file (lengths in metres, pixels from the corner of the image):
+
+    {"format": "tflane-drive", "version": 1,
+     "cameras": [{"name": "front", "intrinsics": [fx, fy, cx, cy], "ego_from_camera": 4 x 4,
+                  "distortion": [k1, k2, p1, p2, ...]}, ...],
+     "frames": [{"timestamp_ns": 0, "global_from_ego": 4 x 4, "images": {"front": "000-front.png"}}, ...]}
+
+A camera looks along its z axis, x to the right and y down. "distortion" (OpenCV's) may be left out, and a frame may
+lack images. Whatever a file holds, reading it gives a drive or one UserError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
+from tflane_jax.files.fields import items, load_json, member, numbers, shown, whole_number
+from tflane_jax.files.images import read_image, undistorted
+from tflane_jax.geometry import invert_pose
+from tflane_jax.scene import CameraViews
+
+FORMAT, VERSION = "tflane-drive", 1
+# Largest coordinate of a pose, metres.
+_FARTHEST = 1e8
+_LONGEST_NAME = 200
+
+
+@dataclass(frozen=True)
+class DriveCamera:
+    """A calibrated camera of a drive.
+
+    Attributes:
+        name: of the camera.
+        intrinsics: (3, 3) pixels.
+        ego_from_camera: (4, 4) metres.
+        distortion: OpenCV's coefficients, empty for none.
+    """
+
+    name: str
+    intrinsics: Float[np.ndarray, "3 3"]
+    ego_from_camera: Float[np.ndarray, "4 4"]
+    distortion: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class DriveFrame:
+    """A moment of a drive.
+
+    Attributes:
+        timestamp_ns: time.
+        global_from_ego: (4, 4) float64 pose, metres.
+        images: file of each camera that has one, by the camera's name.
+    """
+
+    timestamp_ns: int
+    global_from_ego: Float[np.ndarray, "4 4"]
+    images: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Cameras and frames, in order of time."""
+
+    cameras: tuple[DriveCamera, ...]
+    frames: tuple[DriveFrame, ...]
+
+    def views(self, frame: DriveFrame) -> CameraViews:
+        """Read the images of a frame, without lens distortion; a camera without an image is not valid.
+
+        Raises UserError for an image that cannot be read.
+        """
+        images: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
+        for number, camera in enumerate(self.cameras):
+            if camera.name in frame.images:
+                image = read_image(frame.images[camera.name])
+                images[number] = undistorted(image, camera.intrinsics, camera.distortion)
+        height = max((image.shape[0] for image in images.values()), default=1)
+        width = max((image.shape[1] for image in images.values()), default=1)
+        count = len(self.cameras)
+        views = CameraViews(
+            image=np.zeros((count, height, width, 3), np.uint8),
+            size=np.zeros((count, 2), np.int32),
+            intrinsics=np.stack([camera.intrinsics for camera in self.cameras]).astype(np.float32),
+            camera_from_ego=np.stack([invert_pose(c.ego_from_camera) for c in self.cameras]).astype(np.float32),
+            valid=np.array([number in images for number in range(count)]),
+        )
+        for number, image in images.items():
+            views.image[number, : image.shape[0], : image.shape[1]] = image
+            views.size[number] = image.shape[1::-1]
+        return views
+
+
+def load_drive(path: Path, images: Path) -> Drive:
+    """Read and check a drive.
+
+    Args:
+        path: the JSON file.
+        images: folder that the names of images are relative to.
+
+    Raises UserError that names file, place and fault; a file name that leads out of the folder is one.
+    """
+    record, where = load_json(path), str(path)
+    if member(record, "format", where) != FORMAT:
+        raise UserError(f"{where}: format is {shown(record['format'])}, expected {FORMAT!r}: this is no drive")
+    version = member(record, "version", where)
+    if isinstance(version, bool) or version != VERSION:
+        raise UserError(f"{where}: version is {shown(version)}, this program reads {VERSION}")
+    cameras = tuple(_camera(entry, f"{where}: cameras[{i}]") for i, entry in enumerate(items(record, "cameras", where)))
+    names = [camera.name for camera in cameras]
+    if not cameras or len(set(names)) < len(names):
+        raise UserError(f"{where}: cameras need distinct names, at least one: {', '.join(names) or 'there is none'}")
+    frames = tuple(
+        _frame(entry, names, images, f"{where}: frames[{i}]") for i, entry in enumerate(items(record, "frames", where))
+    )
+    if not frames:
+        raise UserError(f"{where}: frames is empty: a drive has at least one")
+    for i in range(1, len(frames)):
+        if frames[i].timestamp_ns <= frames[i - 1].timestamp_ns:
+            raise UserError(f"{where}: frames[{i}] is not later than the frame before: put frames in order of time")
+    return Drive(cameras, frames)
+
+
+def _camera(entry: Any, where: str) -> DriveCamera:
+    name = _text(member(entry, "name", where), f"{where}: name")
+    fx, fy, cx, cy = numbers(member(entry, "intrinsics", where), (4,), f"{where}: intrinsics").tolist()
+    if not (0.0 < fx < 1e6 and 0.0 < fy < 1e6 and abs(cx) < 1e6 and abs(cy) < 1e6):
+        raise UserError(f"{where}: intrinsics are fx, fy, cx, cy in pixels, with positive fx and fy below a million")
+    distortion = numbers(entry.get("distortion") or [], (None,), f"{where}: distortion")
+    if len(distortion) not in (0, 4, 5, 8):
+        raise UserError(f"{where}: distortion has {len(distortion)} numbers, OpenCV's has 4, 5 or 8")
+    intrinsics = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    pose = _pose(entry, "ego_from_camera", where)
+    return DriveCamera(name, intrinsics, pose, tuple(float(value) for value in distortion))
+
+
+def _frame(entry: Any, names: Sequence[str], folder: Path, where: str) -> DriveFrame:
+    time = whole_number(member(entry, "timestamp_ns", where), -(2**62), 2**62, f"{where}: timestamp_ns")
+    listed = member(entry, "images", where)
+    if not isinstance(listed, Mapping):
+        raise UserError(f"{where}: images is {shown(listed)}, expected a file for each camera")
+    images: dict[str, Path] = {}
+    for name, file in listed.items():
+        if name not in names:
+            raise UserError(f"{where}: images names the camera {name!r:.40}, which is none of {', '.join(names)}")
+        relative = Path(_text(file, f"{where}: images: {name}"))
+        if relative.is_absolute() or ".." in relative.parts:
+            raise UserError(f"{where}: image {file!r:.80} is not within the folder of --images: use a relative name")
+        images[name] = folder / relative
+        if not images[name].is_file():
+            raise UserError(f"{where}: there is no image {images[name]}: correct --images, or the file's name")
+    return DriveFrame(time, _pose(entry, "global_from_ego", where), images)
+
+
+def _pose(entry: Any, name: str, where: str) -> Float[np.ndarray, "4 4"]:
+    pose = numbers(member(entry, name, where), (4, 4), f"{where}: {name}").astype(np.float64)
+    rotation = pose[:3, :3]
+    if not (
+        np.abs(pose).max() < _FARTHEST
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+        and np.linalg.det(rotation) > 0.0
+        and np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
+    ):
+        raise UserError(f"{where}: {name} is no pose: expected a rotation and a translation over the row 0 0 0 1")
+    return pose
+
+
+def _text(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= _LONGEST_NAME:
+        raise UserError(f"{where} is {shown(value)}, expected a name")
+    return value
+
+
+def save_drive(drive: Drive, path: Path, images: Path) -> Path:
+    """Write a drive's JSON file; image names become relative to the folder `images`."""
+    cameras = [
+        {
+            "name": camera.name,
+            "intrinsics": [camera.intrinsics[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "ego_from_camera": camera.ego_from_camera.tolist(),
+            **({"distortion": list(camera.distortion)} if camera.distortion else {}),
+        }
+        for camera in drive.cameras
+    ]
+    frames = [
+        {
+            "timestamp_ns": int(frame.timestamp_ns),
+            "global_from_ego": np.asarray(frame.global_from_ego).tolist(),
+            "images": {name: file.relative_to(images).as_posix() for name, file in frame.images.items()},
+        }
+        for frame in drive.frames
+    ]
+    return write_json(path, {"format": FORMAT, "version": VERSION, "cameras": cameras, "frames": frames})

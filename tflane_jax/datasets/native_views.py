@@ -1,0 +1,86 @@
+"""Native images of a drive at the sizes that a trained model reads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tflane_jax.datasets.view_images import ImageFit, canvas_size, fit_image
+from tflane_jax.errors import UserError
+from tflane_jax.files.images import opencv
+from tflane_jax.scene import CameraViews
+from tflane_jax.world.cameras.ring import CameraRigConfig
+
+
+def fitted_views(views: CameraViews, source: Any) -> CameraViews:
+    """Return the images scaled for a model that was trained on this source, smaller ones padded.
+
+    Args:
+        views: native images; cameras in the order of the source's.
+        source: configuration of a split: of the built-in world with cameras, or one with an `ImageConfig` (`image`).
+
+    Raises UserError for a source without cameras, another number of cameras, or images of another shape.
+    """
+    image = getattr(source, "image", None)
+    if image is not None:
+        sizes = np.asarray(views.size).tolist()
+        fits = [
+            fit_image(size[0], size[1], image, front=place == 0) if valid else None
+            for place, (size, valid) in enumerate(zip(sizes, np.asarray(views.valid).tolist(), strict=True))
+        ]
+        width, height = canvas_size([fit.size for fit in fits if fit is not None], image.divisor)
+        return _scaled(views, fits, width, height)
+    rig = source.example.cameras
+    if rig is None:
+        raise UserError(
+            "the model reads BEV evidence, which images do not give: take a model with cameras, such as "
+            "markers/cameras, or leave --model out"
+        )
+    return _of_rig(views, rig)
+
+
+def _of_rig(views: CameraViews, rig: CameraRigConfig) -> CameraViews:
+    if len(views.valid) != len(rig.cameras):
+        raise UserError(
+            f"the model was trained with {len(rig.cameras)} cameras ({', '.join(m.name for m in rig.cameras)}), the "
+            f"drive has {len(views.valid)}: give images of the same cameras, in this order"
+        )
+    fits: list[ImageFit | None] = []
+    for number, mount in enumerate(rig.cameras):
+        if not views.valid[number]:
+            fits.append(None)
+            continue
+        width, height = np.asarray(views.size)[number].tolist()
+        scale, (most_wide, most_high) = round(mount.width * rig.scale) / width, rig.size(mount)
+        size = round(width * scale), round(height * scale)
+        if size[0] > most_wide or size[1] > most_high:
+            raise UserError(
+                f"images of camera {mount.name} are {width} x {height} pixels, which does not fit the shape of the "
+                f"model's, {mount.width} x {mount.height}: crop them first"
+            )
+        fits.append(ImageFit((width, height), (0, height), size))
+    wide, high = (max(rig.size(mount)[axis] for mount in rig.cameras) for axis in (0, 1))
+    return _scaled(views, fits, wide, high)
+
+
+def _scaled(views: CameraViews, fits: list[ImageFit | None], width: int, height: int) -> CameraViews:
+    count = len(fits)
+    out = CameraViews(
+        image=np.zeros((count, height, width, 3), np.uint8),
+        size=np.zeros((count, 2), np.int32),
+        intrinsics=np.asarray(views.intrinsics).copy(),
+        camera_from_ego=np.asarray(views.camera_from_ego),
+        valid=np.asarray(views.valid),
+    )
+    cv2 = opencv()
+    for number, fit in enumerate(fits):
+        if fit is None:
+            continue
+        columns, rows = np.asarray(views.size)[number].tolist()
+        kept = np.asarray(views.image)[number, :rows, :columns][fit.rows[0] : fit.rows[1]]
+        # Averaged: a lane line a pixel wide must not fall between samples.
+        out.image[number, : fit.size[1], : fit.size[0]] = cv2.resize(kept, fit.size, interpolation=cv2.INTER_AREA)
+        out.size[number] = fit.size
+        out.intrinsics[number] = fit.intrinsics(np.asarray(views.intrinsics, np.float64)[number])
+    return out

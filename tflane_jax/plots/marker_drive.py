@@ -1,0 +1,162 @@
+"""A frame of a drive with markers: boards and lanes in the cameras that see them, and from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry.cameras import project
+from tflane_jax.markers.detection import DetectedMarkers
+from tflane_jax.markers.observe import Outcome
+from tflane_jax.markers.square_pose import marker_outline
+from tflane_jax.plots import style
+from tflane_jax.plots.bev import draw_ego, draw_prediction, prepare
+from tflane_jax.plots.cameras import draw_projected
+from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.images import draw_image
+from tflane_jax.plots.lines import add_arrows, add_lines
+from tflane_jax.plots.segments import LanePrediction
+from tflane_jax.priors.marker_memory import MarkerGuidance
+from tflane_jax.scene import CameraViews
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Most cameras in a picture, and most pixels along the longer side of one.
+_CAMERAS, _PIXELS = 3, 900
+# Boards by what became of them; lanes of a marker from no to full confidence.
+OUTCOMES: dict[Outcome, str] = {
+    "used": "#34c759",
+    "unknown": "#ffcc00",
+    "stale": "#ff9d3c",
+    "contradictory": "#ff3b30",
+    "dropped": "#c8ccd4",
+}
+_DOUBTED, _TRUSTED = np.array([0.45, 0.30, 0.36]), np.array([1.0, 0.93, 0.35])
+
+
+def save_drive_frame(
+    path: Path,
+    views: CameraViews,
+    detected: DetectedMarkers,
+    outcomes: Mapping[int, Outcome],
+    confidence: Mapping[int, float],
+    guidance: MarkerGuidance,
+    prediction: LanePrediction | None = None,
+    *,
+    view: PerceptionRange,
+    names: Sequence[str] = (),
+    title: str = "",
+    threshold: float = 0.3,
+) -> Path:
+    """Write one frame and return the path.
+
+    A board's colour is its outcome (green used, yellow unknown, orange out of date, red read at two places, grey one
+    too many), its label id, outcome and confidence. Lanes of markers are yellow, the darker the less they are trusted;
+    predicted lanes are blue.
+
+    Args:
+        path: .png, .pdf or .svg.
+        views: native images.
+        detected: all markers.
+        outcomes, confidence: by id, see `markers.observe` and Eq. (2); ids without confidence give no prior.
+        guidance: lanes after gate and memory.
+        prediction: lanes of a model.
+        view: range that is shown from above.
+        names: of the cameras.
+        title: above the view from above.
+        threshold: lowest score of predicted lanes.
+    """
+    shown = _cameras(views, detected)
+    figure, axes = new_figure(1, len(shown) + 1, panel=(4.4, 3.6))
+    from matplotlib.colors import to_hex
+
+    weight = np.asarray(guidance.weight) * float(guidance.gate)
+    valid = np.asarray(guidance.valid)
+    lanes = np.pad(np.asarray(guidance.points)[valid], ((0, 0), (0, 0), (0, 1)))
+    share = np.clip(weight[valid], 0.0, 1.0)[:, None]
+    colours = [to_hex(colour) for colour in _DOUBTED + share * (_TRUSTED - _DOUBTED)]
+    for number, ax in zip(shown, axes[0], strict=False):
+        small, factor = _shrunk(views, number)
+        draw_image(ax, small, names[number] if names else f"camera {number}")
+        scaled = _at_scale(views, factor)
+        for line, colour in zip(lanes, colours, strict=True):
+            draw_projected(ax, scaled, number, line[None], colour=colour, width=1.0)
+        if prediction is not None and hasattr(prediction, "scores"):
+            found = np.asarray(prediction.points)[np.asarray(prediction.scores) >= threshold]
+            if found.shape[-1] == 3:
+                draw_projected(ax, scaled, number, found, colour=style.PREDICTION, width=0.9)
+        for k in np.flatnonzero(detected.valid & (detected.camera == number)).tolist():
+            _draw_board(ax, scaled, number, detected, k, outcomes, confidence)
+    above: Any = axes[0, -1]
+    prepare(above, view, title)
+    if len(lanes):
+        add_lines(above, lanes, colours, width=1.5, zorder=3.0)
+        add_arrows(above, lanes, colours, zorder=3.1)
+    if prediction is not None:
+        draw_prediction(above, prediction, threshold=threshold)
+    for k in np.flatnonzero(detected.valid).tolist():
+        number = int(detected.marker_id[k])
+        x, y = detected.pose[k, :2, 3].tolist()
+        above.plot([x], [y], "s", color=OUTCOMES[outcomes[number]], markersize=6, zorder=6.0)
+        above.annotate(
+            _label(number, outcomes, confidence), (x, y), color=OUTCOMES[outcomes[number]], fontsize=6, zorder=6.1
+        )
+    draw_ego(above)
+    return save_figure(figure, path)
+
+
+def _cameras(views: CameraViews, detected: DetectedMarkers) -> list[int]:
+    """Return the cameras that see boards, most boards first; the first camera if none does."""
+    seen = np.bincount(detected.camera[detected.valid], minlength=len(views.valid))
+    order = [number for number in np.argsort(-seen, kind="stable").tolist() if seen[number]]
+    valid = np.flatnonzero(views.valid).tolist()
+    return order[:_CAMERAS] or valid[:1]
+
+
+def _shrunk(views: CameraViews, number: int) -> tuple[np.ndarray, int]:
+    width, height = np.asarray(views.size)[number].tolist()
+    factor = max(1, -(-max(width, height) // _PIXELS))
+    return np.asarray(views.image)[number, :height, :width][::factor, ::factor], factor
+
+
+def _at_scale(views: CameraViews, factor: int) -> CameraViews:
+    """Return the calibration of images reduced by a factor."""
+    small: Float[np.ndarray, "3 3"] = np.diag([1.0 / factor, 1.0 / factor, 1.0])
+    return CameraViews(
+        image=views.image,
+        size=np.asarray(views.size) // factor,
+        intrinsics=small @ np.asarray(views.intrinsics, np.float64),
+        camera_from_ego=views.camera_from_ego,
+        valid=views.valid,
+    )
+
+
+def _draw_board(
+    ax: Axes,
+    views: CameraViews,
+    number: int,
+    detected: DetectedMarkers,
+    k: int,
+    outcomes: Mapping[int, Outcome],
+    confidence: Mapping[int, float],
+) -> None:
+    intrinsics = np.asarray(views.intrinsics, np.float64)[number]
+    camera_from_ego = np.asarray(views.camera_from_ego, np.float64)[number]
+    pose, marker = np.asarray(detected.pose[k], np.float64), int(detected.marker_id[k])
+    outline = marker_outline(pose, float(detected.size[k]), intrinsics, camera_from_ego)
+    colour = OUTCOMES[outcomes[marker]]
+    ax.plot(*np.concatenate([outline, outline[:1]]).T, color=colour, linewidth=1.2, zorder=4.0)
+    foot = project(pose[None, :3, 3] - [0.0, 0.0, float(detected.size[k])], intrinsics, camera_from_ego)[0][0]
+    label = _label(marker, outcomes, confidence)
+    ax.annotate(label, foot, color=colour, fontsize=6, ha="center", va="top", zorder=4.1, clip_on=True)
+
+
+def _label(marker: int, outcomes: Mapping[int, Outcome], confidence: Mapping[int, float]) -> str:
+    outcome = outcomes[marker]
+    return f"{marker}: {confidence[marker]:.2f}" if marker in confidence else f"{marker}: {outcome}"

@@ -1,0 +1,129 @@
+"""A drive with fiducial markers, frame by frame: images -> markers -> store -> confidence -> memory -> model.
+
+Each step is a function of another file; this one only calls them in order, so that a live system can do the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.native_views import fitted_views
+from tflane_jax.datasets.openlane_example import blank
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import relative_pose
+from tflane_jax.markers.image_search import ImageMarkers
+from tflane_jax.markers.reader import MarkerReader, Reading
+from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior
+from tflane_jax.models.parameters import Params
+from tflane_jax.models.prior import HostSpec
+from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemoryConfig
+from tflane_jax.priors.markers import confidence
+from tflane_jax.scene import CameraViews, Prediction
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+# Gate and memory that are shown without a model.
+SHOWN = MarkerFusionConfig(memory=MarkerMemoryConfig(lanes=32))
+
+
+@dataclass(frozen=True)
+class DriveModel:
+    """A trained model for a drive.
+
+    Attributes:
+        task, params: the model.
+        source: configuration of a split that it was trained on.
+    """
+
+    task: LaneGraphTask
+    params: Params
+    source: Any
+
+
+class DriveStep(NamedTuple):
+    """What one frame of a drive gives.
+
+    Attributes:
+        reading: detections, and the prior.
+        confidence: (M,) Eq. (2) of each marker of the prior, 0 where not valid.
+        guidance: prior tokens after gate and memory: the frame's lanes, or remembered ones.
+        remembered: the lanes come from earlier frames.
+        prediction: of the model; None without one.
+    """
+
+    reading: Reading
+    confidence: Float[np.ndarray, " m"]
+    guidance: MarkerGuidance
+    remembered: bool
+    prediction: Prediction | None
+
+
+class MarkerDrive:
+    """The markers of a drive and a model's lanes, frame by frame.
+
+    Args:
+        reader: of the store.
+        model: with or without a marker prior; None shows the prior alone.
+
+    Raises UserError for a model that cannot run on images.
+    """
+
+    def __init__(self, reader: MarkerReader, model: DriveModel | None = None):
+        self.reader, self.model = reader, model
+        sizes = ExampleConfig(range=reader.config.range) if model is None else model.source.example
+        self._sizes: ExampleConfig = sizes
+        configured = None if model is None else model.task.model.priors.markers
+        spec = HostSpec(1, sizes.range, sizes.range) if model is None else model.task.model.spec
+        self._prior = MarkerPrior(configured or SHOWN, spec)
+        self._observe = jax.jit(self._prior.observe)
+        self._bank = self._prior.start()
+        self._memory = None if model is None else model.task.start()
+        self._step = None if model is None else jax.jit(model.task.step)
+        self._pose: Float[np.ndarray, "4 4"] | None = None
+
+    def step(
+        self,
+        views: CameraViews,
+        timestamp_ns: int,
+        global_from_ego: Float[np.ndarray, "4 4"],
+        found: Sequence[ImageMarkers] | None = None,
+    ) -> DriveStep:
+        """Return the markers and lanes of the next frame; arguments as of `MarkerReader.read`."""
+        reading = self.reader.read(views, timestamp_ns, global_from_ego, found)
+        markers = reading.observed.markers
+        before = global_from_ego if self._pose is None else self._pose
+        example = replace(
+            blank(self._sizes, governed="lanes", views=None, traffic=True),
+            markers=markers,
+            previous_from_ego=relative_pose(before, global_from_ego).astype(np.float32),
+            has_previous=np.asarray(self._pose is not None),
+        )
+        self._pose = np.asarray(global_from_ego, np.float64)
+        guidance, self._bank = self._observe(example, self._bank)
+        guidance = jax.device_get(guidance)
+        prediction = None
+        if self.model is not None and self._step is not None:
+            example = replace(example, cameras=fitted_views(views, self.model.source))
+            self._memory, prediction = self._step(self.model.params, self._memory, example)
+            prediction = jax.device_get(prediction)
+        config = self._prior.config
+        trust = confidence(np.hypot(*markers.pose[:, :2, 3].T), markers.residual, config.prior)
+        trust = np.where(markers.valid, trust, 0.0)
+        # As `remember` decides; without a memory nothing is remembered.
+        threshold = 0.0 if config.memory is None else config.memory.threshold
+        seen = float(trust[markers.lane_valid.any(-1)].max(initial=0.0))
+        remembered = bool(guidance.valid.any()) and seen < threshold
+        return DriveStep(reading, trust, guidance, remembered, prediction)
+
+
+def check_model(task: Any) -> LaneGraphTask:
+    """Return the task of a model for drives; raises UserError for one that predicts no lanes around the vehicle."""
+    if not isinstance(task, LaneGraphTask):
+        raise UserError("the model reads single photos: give --model a run of a host with cameras")
+    return task

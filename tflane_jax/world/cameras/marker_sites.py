@@ -1,0 +1,49 @@
+"""Places for marker boards that drivers see: a surveyor does not put a board behind a mast."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.scene.logs import VectorMap
+from tflane_jax.world.bev.line_of_sight import hidden_points
+from tflane_jax.world.cameras.stage import map_boxes
+from tflane_jax.world.roads.markers import Visible
+
+# Where drivers look from: distances before the board, and to its left, metres; height of a camera.
+VIEWS = tuple((ahead, aside) for ahead in (8.0, 14.0, 22.0, 35.0, 50.0) for aside in (3.0, 6.0))
+_EYE = 1.45
+# Points of a board of 1 m that are looked at, from its middle, metres.
+_ACROSS = np.linspace(-0.6, 0.6, 7)
+
+
+def visible_places(vector_map: VectorMap, seed: int) -> Visible:
+    """Return the function that says which fraction of a board drivers see, in the scene of this map and seed.
+
+    The mean over `VIEWS` of the fraction of the board that no static body hides; a surveyor knows no road users.
+    """
+    boxes = map_boxes(vector_map, seed)
+    reach = max(ahead for ahead, _ in VIEWS) + 10.0
+
+    def visible(place: Float[np.ndarray, "3"], heading: float) -> float:
+        along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+        near = boxes[np.hypot(*(boxes[:, :2] - place[:2]).T) < reach + 0.5 * np.hypot(boxes[:, 2], boxes[:, 3])]
+        x, y, length, width, yaw, low, high = near.T
+        across, up = (axis.ravel() for axis in np.meshgrid(_ACROSS, _ACROSS))
+        points = place[:2] + across[:, None] * left
+        hidden = []
+        for ahead, aside in VIEWS:
+            eye = place[:2] - ahead * along + aside * left
+            occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
+            hidden.append(
+                hidden_points(
+                    points - eye,
+                    occluders,
+                    np.zeros((0, 5)),
+                    sensor_height=_EYE,
+                    target_height=place[2] + up,
+                ).mean()
+            )
+        return 1.0 - float(np.mean(hidden))
+
+    return visible

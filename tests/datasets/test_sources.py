@@ -182,12 +182,13 @@ def test_unsuitable_data_sources_are_refused(arguments, config, message):
 
 
 def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
+    logs = "argoverse2,openlane-v2,nuscenes,nuscenes-scenes"
     for arguments, names in (
         (
             ["eval", "--help"],
-            "{procedural,world-cameras,city,street,argoverse2,openlane-v2,nuscenes,nuscenes-scenes,front-views,tusimple}",
+            f"{{procedural,world-cameras,city,street,{logs},real-maps,recorded,front-views,tusimple}}",
         ),
-        (["data", "check", "--help"], "{argoverse2,openlane-v2,nuscenes,nuscenes-scenes,tusimple}"),
+        (["data", "check", "--help"], f"{{{logs},tusimple}}"),
     ):
         with pytest.raises(SystemExit) as ended:
             main(arguments)

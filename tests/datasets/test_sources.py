@@ -188,7 +188,7 @@ def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
             ["eval", "--help"],
             f"{{procedural,world-cameras,city,street,{logs},real-maps,recorded,front-views,tusimple}}",
         ),
-        (["data", "check", "--help"], f"{{{logs},tusimple}}"),
+        (["data", "check", "--help"], f"{{{logs},real-maps,tusimple}}"),
     ):
         with pytest.raises(SystemExit) as ended:
             main(arguments)

@@ -1,7 +1,6 @@
 """Several processes train one model: the numbers of one, one writer, agreed stops, resumes by another number."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -24,22 +23,20 @@ def together(folder, starts):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    flags = os.environ.get("XLA_FLAGS", "")
     command = [sys.executable, "-m", "tests.training.many_processes", str(folder), str(port), str(len(starts))]
     began = [
         subprocess.Popen(
             [*command, str(i), start],
             cwd=ROOT,
-            env=os.environ | {"XLA_FLAGS": flags},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         for i, start in enumerate(starts)
     ]
-    ended = [(process, *process.communicate(timeout=100)) for process in began]
-    for process, _, said in ended:
-        assert process.returncode == 0, said
+    ended = [(each, *each.communicate(timeout=100)) for each in began]
+    for each, _, errors in ended:
+        assert each.returncode == 0, errors
     return [json.loads(out.splitlines()[-1]) for _, out, _ in ended]
 
 

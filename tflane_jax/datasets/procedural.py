@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
@@ -48,13 +49,19 @@ class ProceduralConfig:
     example: ExampleConfig = field(default_factory=ExampleConfig)
 
 
-class ProceduralDataset:
-    """Examples made on request, in order of scene and time.
+class SimulatedDataset:
+    """Examples of simulated scenes, made on request, in order of scene and time; a subclass simulates a scene.
 
     Raises UserError for scenes outside the split's range of ids, or for cameras without OpenCV, which draws the images.
+
+    Attributes:
+        source: name of the source.
+        config: with `split`, `scenes`, `first`, `world` and `example`.
     """
 
-    def __init__(self, config: ProceduralConfig):
+    source: ClassVar[str]
+
+    def __init__(self, config: Any):
         if config.scenes < 0 or config.first < 0 or config.first + config.scenes > SCENES_PER_SPLIT:
             raise UserError(
                 f"{config.split} has scenes 0 to {SCENES_PER_SPLIT - 1}, not {config.first} to "
@@ -63,7 +70,7 @@ class ProceduralDataset:
         if config.example.cameras is not None:
             opencv()
         self.config = config
-        self.name = f"procedural-{config.split}"
+        self.name = f"{self.source}-{config.split}"
 
     def __len__(self) -> int:
         return self.config.scenes * self.config.world.keyframes
@@ -77,10 +84,10 @@ class ProceduralDataset:
         """Return where one example comes from."""
         log, keyframe = self._frame(index)
         moment = log.keyframes[keyframe]
-        return FrameInfo(log.source, log.name, moment.timestamp_ns, moment.global_from_ego)
+        return FrameInfo(self.source, log.name, moment.timestamp_ns, moment.global_from_ego)
 
     def drives(self) -> Iterator[Log]:
-        """Yield the logs of all scenes."""
+        """Yield the simulated logs of all scenes."""
         for scene in range(self.config.scenes):
             yield self._frame(scene * self.config.world.keyframes)[0]
 
@@ -90,12 +97,27 @@ class ProceduralDataset:
             raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
         return FIRST_SCENE[self.config.split] + self.config.first + index // self.config.world.keyframes
 
+    def simulated(self, scene_id: int) -> Log:
+        """Return the log of a scene."""
+        raise NotImplementedError
+
+    def history(self, world: WorldConfig) -> int:
+        """Return how many frames before a key frame a scene needs."""
+        example = self.config.example
+        return HISTORY if example.history_hz is None else example.history * example.history_stride(world.rate_hz)
+
     def _frame(self, index: int) -> tuple[Log, int]:
-        world, example = self.config.world, self.config.example
-        history = HISTORY
-        if example.history_hz is not None:
-            history = example.history * example.history_stride(world.rate_hz)
-        return _simulated(self.scene_id(index), world, history), index % world.keyframes
+        return self.simulated(self.scene_id(index)), index % self.config.world.keyframes
+
+
+class ProceduralDataset(SimulatedDataset):
+    """The built-in world."""
+
+    source = "procedural"
+
+    def simulated(self, scene_id: int) -> Log:
+        """Return the log of a scene."""
+        return _simulated(scene_id, self.config.world, self.history(self.config.world))
 
 
 @functools.lru_cache(maxsize=4)

@@ -8,29 +8,26 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
-from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.overlap import Drive
-from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
+from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
 from tflane_jax.errors import UserError
-from tflane_jax.files.images import opencv
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.presets import CITY, REAL_MAPS
 from tflane_jax.world.roads.map_networks import prepare_roads
 from tflane_jax.world.roads.road_map import RoadMap
-from tflane_jax.world.simulate import HISTORY, Place, WorldConfig, simulate
+from tflane_jax.world.simulate import Place, WorldConfig, simulate
 
 # Stream of a scene's number that decides between maps and generated roads.
 _ROOT = 20_261_122
@@ -67,19 +64,15 @@ class RealMapConfig:
     content: tuple[str, ...] = ()
 
 
-class RealMapDataset:
-    """Examples made on request, in order of scene and time.
+class RealMapDataset(SimulatedDataset):
+    """Scenes on recorded maps, named after their log and number.
 
-    Raises UserError where there is no map, a named one is missing, all are left out, scene numbers are outside the
-    split's range, or for cameras without OpenCV, which draws the images.
+    Raises UserError like `SimulatedDataset`, and where there is no map, a named one is missing or all are left out.
     """
 
+    source = "real-maps"
+
     def __init__(self, config: RealMapConfig):
-        if config.scenes < 0 or config.first < 0 or config.first + config.scenes > SCENES_PER_SPLIT:
-            raise UserError(
-                f"{config.split} has scenes 0 to {SCENES_PER_SPLIT - 1}, not {config.first} to "
-                f"{config.first + config.scenes - 1}: change `first` or `scenes`"
-            )
         if not 0.0 <= config.generated <= 1.0:
             raise UserError(f"generated is a fraction of the scenes between 0 and 1, not {config.generated}")
         if config.world.keyframes != config.generated_world.keyframes:
@@ -87,36 +80,9 @@ class RealMapDataset:
                 f"world has {config.world.keyframes} key frames, generated_world {config.generated_world.keyframes}: "
                 "give both the same number"
             )
-        if config.example.cameras is not None:
-            opencv()
+        super().__init__(config)
         self.maps = tuple(chosen_maps(config.maps, config.logs, config.without))
         self.config = replace(config, content=tuple(one.content() for one in self.maps))
-        self.name = f"real-maps-{config.split}"
-
-    def __len__(self) -> int:
-        return self.config.scenes * self.config.world.keyframes
-
-    def example(self, index: int) -> Example:
-        """Return one example. The last few scenes stay in memory, so reading a scene's frames in order is fast."""
-        log, keyframe = self._frame(index)
-        return make_example(log, keyframe, self.config.example)
-
-    def info(self, index: int) -> FrameInfo:
-        """Return where one example comes from: the scene is the name of its log with the scene's number."""
-        log, keyframe = self._frame(index)
-        moment = log.keyframes[keyframe]
-        return FrameInfo("real-maps", log.name, moment.timestamp_ns, moment.global_from_ego)
-
-    def drives(self) -> Iterator[Log]:
-        """Yield the simulated logs of all scenes."""
-        for scene in range(self.config.scenes):
-            yield self._frame(scene * self.config.world.keyframes)[0]
-
-    def scene_id(self, index: int) -> int:
-        """Return the world's scene number of one example; raises IndexError outside the dataset."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
-        return FIRST_SCENE[self.config.split] + self.config.first + index // self.config.world.keyframes
 
     def place(self, scene_id: int) -> MapFile | None:
         """Return the map of a scene; None for generated roads."""
@@ -124,14 +90,11 @@ class RealMapDataset:
         share, number = rng.random(), int(rng.integers(len(self.maps)))
         return None if share < self.config.generated else self.maps[number]
 
-    def _frame(self, index: int) -> tuple[Log, int]:
-        config, scene_id = self.config, self.scene_id(index)
+    def simulated(self, scene_id: int) -> Log:
+        """Return the log of a scene."""
         place = self.place(scene_id)
-        world = config.generated_world if place is None else config.world
-        history = HISTORY
-        if config.example.history_hz is not None:
-            history = config.example.history * config.example.history_stride(world.rate_hz)
-        return _simulated(scene_id, world, history, place, sees(config.example)), index % world.keyframes
+        world = self.config.generated_world if place is None else self.config.world
+        return _simulated(scene_id, world, self.history(world), place, sees(self.config.example))
 
 
 def sees(example: ExampleConfig) -> float:

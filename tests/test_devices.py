@@ -10,7 +10,7 @@ import pytest
 
 from tests.shared import ROOT
 from tests.slow import with_slow
-from tests.training.many_devices import BATCH, EVENLY, assignments, predicted
+from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, predicted
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
 
@@ -59,6 +59,14 @@ def test_each_device_matches_its_own_examples(forced):
 def test_devices_share_predictions_or_one_makes_them(forced):
     for found in (forced[1]["predicted"], forced[1]["predicted by one"]):
         np.testing.assert_allclose(found, predicted(BATCH), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_host_has_the_loss_and_the_gradient_of_one_device(forced):
+    if not (found := forced[1]["host"]):
+        pytest.skip("compiled for two devices only")
+    for name, value in host_terms().items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
 
 
 def test_a_batch_that_cannot_be_shared_evenly_is_refused(forced):

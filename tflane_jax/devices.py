@@ -71,8 +71,8 @@ def _put(leaf: Any, sharding: NamedSharding | None) -> Any:
     return jax.device_put(host) if sharding is None else jax.make_array_from_process_local_data(sharding, host)
 
 
-def on_host(tree: Any) -> Any:
-    """Return a tree that one process can work with: as it is, or without the devices of other processes."""
+def of_one_process(tree: Any) -> Any:
+    """Return a tree that is on every device so that one process alone can work with it."""
     return tree if processes.count() == 1 else replicated(tree, None)
 
 

@@ -14,12 +14,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from tests.models.cases import WITH_TRAFFIC, make_example
+from tests.parameters import random_params
 from tests.training.stub import LineTask, line_arrays
 from tests.training.stub_run import CONFIG, run
-from tflane_jax.devices import active, divided, training_mesh
+from tflane_jax.devices import active, divided, everywhere, replicated, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predictions
 from tflane_jax.matching import match
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 BATCH = 8
 EVENLY = dataclasses.replace(CONFIG, batch_size=BATCH, seeds=(0, 1))
@@ -55,6 +59,20 @@ def predicted(batch_size: int) -> list:
     return np.concatenate([answer for _, answer in predictions(Line(), params, arrays, batch_size)]).tolist()
 
 
+def host_terms() -> dict[str, float]:
+    """Return loss terms and gradient norm of a small TopoNet with traffic flow, of parameters without near-ties."""
+    task = LaneGraphTask(WITH_TRAFFIC)
+    params = random_params(task.init, make_example(), spread=0.1)
+    batch, mesh = stack_examples([make_example(i) for i in range(BATCH)]), training_mesh(BATCH)
+    with active(mesh):
+        program = jax.jit(jax.value_and_grad(task.loss, has_aux=True), out_shardings=everywhere(mesh))
+        (loss, terms), gradient = program(replicated(params, mesh), divided(batch, mesh), jax.random.key(0))
+    return {
+        "loss": float(loss),
+        "gradient": float(np.sqrt(sum(np.square(leaf).sum() for leaf in jax.tree.leaves(gradient)))),
+    } | {name: float(value) for name, value in terms.items()}
+
+
 def main() -> None:
     folder = Path(sys.argv[1])
     jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -69,6 +87,7 @@ def main() -> None:
         "refused": refused(),
         "predicted": predicted(BATCH),
         "predicted by one": predicted(BATCH - 1),
+        "host": host_terms() if jax.device_count() == 2 else {},  # compiling takes long
     }
     print(json.dumps(facts))
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from tflane_jax.config_io import first_difference
 from tflane_jax.datasets.batches import Prepare, batches, first_example
-from tflane_jax.devices import divided, on_host, replicated, share, training_mesh
+from tflane_jax.devices import divided, of_one_process, replicated, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.models.parameters import Params
@@ -229,7 +229,7 @@ def train(
             if adaptive is not None:
                 carried["cycles"] = [asdict(memory) for memory in memories]
             manifest = Manifest(step=step, config=resolved, metrics=evaluated, progress=carried)
-            kept = of_all_seeds([on_host(state) for state in states])
+            kept = of_all_seeds([of_one_process(state) for state in states])
             from_first(lambda: str(checkpoints.save(kept, manifest)))
 
         stepping, saved_step, stopped = 0.0, first, stop_signal(stop.signal, 0)

@@ -18,6 +18,7 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.limits import Count
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.bev.sensor import BevSensorConfig
@@ -135,9 +136,9 @@ class WorldData:
         example: what is in an example, and its capacities.
     """
 
-    train: int = 2000
-    val: int = 100
-    test: int = 200
+    train: Count = 2000
+    val: Count = 100
+    test: Count = 200
     world: WorldConfig = WorldConfig()
     example: ExampleConfig = ExampleConfig()
 

@@ -22,6 +22,7 @@ from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Count, Fraction
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.presets import CITY, REAL_MAPS
@@ -135,15 +136,15 @@ class RealMapData:
     """
 
     maps: Path = Path("data/maps")
-    train: int = 2000
-    val: int = 25
-    test: int = 100
+    train: Count = 2000
+    val: Count = 25
+    test: Count = 100
     val_logs: tuple[str, ...] = ()
     test_logs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     test_on: Literal["maps", "recordings"] = "maps"
     test_traffic: str = ""
-    generated: float = 0.0
+    generated: Fraction = 0.0
     world: WorldConfig = REAL_MAPS
     generated_world: WorldConfig = CITY
     example: ExampleConfig = RECORDED_EXAMPLE

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
+from tflane_jax.limits import Count, CountOrZero, Fraction, Positive
 from tflane_jax.markers.corner_refinement import refine_corners
 from tflane_jax.markers.occluded_search import find_occluded
 from tflane_jax.scene.marker_patterns import MarkerFamily, dictionary_of, marker_cells
@@ -45,16 +46,16 @@ class DetectorConfig:
     """
 
     family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
-    size: float = 1.0
-    capacity: int = 16
+    size: Positive = 1.0
+    capacity: Count = 16
     corners: Literal["pattern", "subpixel", "none"] = "pattern"
-    enlarge: int = 1
+    enlarge: Count = 1
     search: Literal["outlines", "all"] = "outlines"
-    ids: tuple[int, ...] | None = None
-    least_pixels: float = 8.0
-    ambiguous: float = 0.6
-    tilt: float = 0.05
-    turn: float = 0.8
+    ids: tuple[CountOrZero, ...] | None = None
+    least_pixels: Positive = 8.0
+    ambiguous: Fraction = 0.6
+    tilt: Positive = 0.05
+    turn: Positive = 0.8
 
     def validate(self) -> None:
         """Raise UserError for numbers out of range."""

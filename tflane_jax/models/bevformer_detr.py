@@ -7,6 +7,7 @@ relationship heads. A lane is 11 points or a Bezier curve.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_basis
+from tflane_jax.limits import at_least
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
@@ -42,7 +44,7 @@ class BevFormerDetrConfig(HostConfig):
     encoder: EncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
-    control_points: int | None = None
+    control_points: Annotated[int, at_least(2)] | None = None
     denoising: DenoisingConfig | None = None
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig
 from tflane_jax.layers.resnet import RESNET_50, ResNet, ResNetConfig
+from tflane_jax.limits import INCREASING, NOT_EMPTY, CountOrZero
 from tflane_jax.scene import CameraViews
 
 # ImageNet statistics, RGB, of values in [0, 255].
@@ -33,9 +34,9 @@ class ImageEncoderConfig:
     """
 
     backbone: ResNetConfig = ResNetConfig((1, 1, 1, 1), (16, 32, 64, 128))
-    stages: tuple[int, ...] = (2, 3)
+    stages: Annotated[tuple[CountOrZero, ...], INCREASING, NOT_EMPTY] = (2, 3)
     pyramid: FeaturePyramidConfig = FeaturePyramidConfig(64, 2)
-    frozen_stages: int = 0
+    frozen_stages: CountOrZero = 0
     remat: bool = False
     precision: Literal["float32", "bfloat16"] = "float32"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import Count, Limit, at_least
 from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 
@@ -42,12 +43,12 @@ class SegmentDecoderConfig(LaneDecoderConfig):
         others: see `LaneDecoderConfig`; `sampling_points` is a multiple of 8 or less than 8, `heads` is even.
     """
 
-    points: int = 10
-    sampling_points: int = 32
+    points: Annotated[int, at_least(2)] = 10
+    sampling_points: Count = 32
     refine: Literal["point", "iterative"] = "point"  # pyright: ignore[reportIncompatibleVariableOverride]
     offsets: Literal["ego", "lane"] = "ego"
     classes: Literal[1, 2] = 2
-    initial_score: float | None = None
+    initial_score: Annotated[float, Limit("above 0 and below 1", lambda value: 0 < value < 1)] | None = None
 
     def check(self) -> None:
         """Raise UserError where sizes do not fit together."""

@@ -20,6 +20,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
+from tflane_jax.limits import CountOrZero
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host
@@ -48,7 +49,7 @@ class MapTrV2Config(MapTrConfig):
         decoder, denoising, encoder, range, priors: see `MapTrConfig`.
     """
 
-    many: int = 0
+    many: CountOrZero = 0
     line_mask: bool = False
 
     @property

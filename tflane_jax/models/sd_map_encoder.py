@@ -17,6 +17,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.limits import Count, Positive
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
 from tflane_jax.scene import Example, SdMap
@@ -37,10 +38,10 @@ class SdMapModuleConfig:
 
     prior: SdMapPriorConfig = SdMapPriorConfig()
     lines: PolylineEncoderConfig = PolylineEncoderConfig()
-    heads: int = 4
-    width: int | None = None
+    heads: Count = 4
+    width: Count | None = None
     norm: Literal["sum", "query"] = "sum"
-    radius: float | None = None
+    radius: Positive | None = None
     absent: Literal["nothing", "reference"] = "nothing"
 
     def build(self, host: HostSpec) -> SdMapPrior:

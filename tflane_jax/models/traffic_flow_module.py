@@ -10,7 +10,7 @@ The paper leaves much open; docs/tf_lane.md lists what we chose, and the setting
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -22,6 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
 from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
@@ -58,15 +59,15 @@ class TrafficFlowModuleConfig:
         masking: restrictions of the masks.
     """
 
-    fusions: tuple[Fusion, ...] = LANE_FUSIONS
-    depth: int = 1
-    spatial_depth: int = 1
+    fusions: Annotated[tuple[Fusion, ...], NOT_EMPTY, DIFFERENT] = LANE_FUSIONS
+    depth: CountOrZero = 1
+    spatial_depth: Count = 1
     residual: Literal["fusion", "none"] = "fusion"
     token: Literal["mean_and_ends", "mean"] = "mean_and_ends"
     position_encoding: Literal["sine", "linear"] = "sine"
-    bands: int = 7
-    width: int = 32
-    heads: int = 4
+    bands: Count = 7
+    width: Count = 32
+    heads: Count = 4
     masking: TrafficMaskConfig = TrafficMaskConfig()
 
 

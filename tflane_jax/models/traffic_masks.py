@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.masks import SpatialMask, causal_mask, key_mask, nearest_mask, track_distance
+from tflane_jax.limits import Count, PositiveOrInfinite
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.priors.traffic_flow import TrafficFlowTokens
 
@@ -37,9 +38,9 @@ class TrafficMaskConfig:
     """
 
     softmax: Literal["quadrants", "joint"] = "quadrants"
-    window: float | None = None
-    nearest: int | None = None
-    head_windows: tuple[float, ...] = ()
+    window: PositiveOrInfinite | None = None
+    nearest: Count | None = None
+    head_windows: tuple[PositiveOrInfinite, ...] = ()
     temporal: Literal["all", "causal"] = "all"
 
     def check(self, heads: int) -> None:

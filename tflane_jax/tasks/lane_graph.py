@@ -25,6 +25,7 @@ from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
+from tflane_jax.limits import Count
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
@@ -57,7 +58,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     model: HostConfig = TopoNetConfig()
     losses: HostLossConfig = TopoNetLossConfig()
-    clip: int = 1
+    clip: Count = 1
     empty_frames: Literal["keep", "skip"] = "keep"
 
     columns: ClassVar[tuple[str, ...]] = score_names.COLUMNS

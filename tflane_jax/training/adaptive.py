@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Count, CountOrZero, Factor, Fraction, FractionBelowOne, PositiveOrZero
 
 Verdict = Literal["go on", "extend", "restart"]
 
@@ -46,13 +47,13 @@ class AdaptiveConfig:
 
     metric: str = "loss"
     mode: Literal["min", "max"] = "min"
-    threshold: float = 0.01
-    fraction: float = 0.5
-    extend: float = 0.5
-    max_extensions: int = 1
-    grace: float = 0.25
-    patience: int = 3
-    shrink: float = 0.7
+    threshold: FractionBelowOne = 0.01
+    fraction: Fraction = 0.5
+    extend: PositiveOrZero = 0.5
+    max_extensions: CountOrZero = 1
+    grace: Fraction = 0.25
+    patience: Count = 3
+    shrink: Factor = 0.7
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -23,6 +23,7 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, replicated, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import apart, arrays_from_first, from_first, is_first, stop_signal
 from tflane_jax.training.adaptive import Memory
@@ -65,13 +66,13 @@ class TrainingConfig:
         init_partly: whether that run's model may have other modules; those that it lacks start from random parameters.
     """
 
-    steps: int = 10_000
-    batch_size: int = 8
-    seeds: tuple[int, ...] = (0,)
-    log_every: int = 50
-    eval_every: int = 1000
-    checkpoint_every: int = 500
-    keep_checkpoints: int = 2
+    steps: Count = 10_000
+    batch_size: Count = 8
+    seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)
+    log_every: Count = 50
+    eval_every: Count = 1000
+    checkpoint_every: Count = 500
+    keep_checkpoints: Count = 2
     best_metric: str = "all/DET_l"
     init_from: str | None = None
     init_partly: bool = False

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Fraction, at_least, below
 from tflane_jax.training.adaptive import AdaptiveConfig, Memory, check_adaptive, judge
 
 _LONGEST = 2**29  # steps; twice that still is an int32
@@ -42,9 +43,9 @@ class RestartsConfig:
         adaptive: rule that changes cycles by the evaluations; None for fixed cycles.
     """
 
-    cycle_steps: int = 1000
-    factor: float = 2.0
-    floor: float = 0.0
+    cycle_steps: Annotated[int, at_least(1), below(_LONGEST)] = 1000
+    factor: Annotated[float, at_least(1)] = 2.0
+    floor: Fraction = 0.0
     last_cycle: Literal["cut", "fit"] = "cut"
     adaptive: AdaptiveConfig | None = None
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,18 @@ import optax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import (
+    INCREASING,
+    NOT_EMPTY,
+    Count,
+    CountOrZero,
+    Factor,
+    Fraction,
+    FractionBelowOne,
+    Positive,
+    PositiveOrInfinite,
+    PositiveOrZero,
+)
 from tflane_jax.training.muon import scale_by_muon
 from tflane_jax.training.restarts import (
     Cycle,
@@ -39,8 +51,8 @@ class DropsConfig:
         factor: on the rate at each drop.
     """
 
-    steps: tuple[int, ...] = (450_000,)
-    factor: float = 0.1
+    steps: Annotated[tuple[Count, ...], NOT_EMPTY, INCREASING] = (450_000,)
+    factor: Factor = 0.1
 
 
 @dataclass(frozen=True)
@@ -67,20 +79,20 @@ class OptimConfig:
         drops: steps at which a constant rate drops, in place of the cosine; None for none.
     """
 
-    lr: float = 2e-4
-    warmup_steps: int = 500
-    warmup_ratio: float = 1 / 3
-    final_ratio: float = 1e-3
-    weight_decay: float = 0.01
+    lr: Positive = 2e-4
+    warmup_steps: CountOrZero = 500
+    warmup_ratio: Fraction = 1 / 3
+    final_ratio: Fraction = 1e-3
+    weight_decay: PositiveOrZero = 0.01
     decay: Literal["decoupled", "coupled"] = "decoupled"
     optimizer: Literal["adam", "muon"] = "adam"
     muon_kernels: Literal["dense", "dense_and_convolution"] = "dense"
-    clip_norm: float = 35.0
-    b1: float = 0.9
-    b2: float = 0.999
-    eps: float = 1e-8
-    ema_decay: float = 0.999
-    epoch_steps: int = 0
+    clip_norm: PositiveOrInfinite = 35.0
+    b1: FractionBelowOne = 0.9
+    b2: FractionBelowOne = 0.999
+    eps: Positive = 1e-8
+    ema_decay: FractionBelowOne = 0.999
+    epoch_steps: CountOrZero = 0
     restarts: RestartsConfig | None = None
     drops: DropsConfig | None = None
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 import functools
 import zlib
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import NOT_EMPTY, Count, Fraction, Positive, PositiveOrZero
 from tflane_jax.world.render.camera import FrontCamera, camera_pose
 from tflane_jax.world.render.weather import FrontWeatherConfig
 
@@ -43,9 +45,9 @@ class CameraMount:
     z: float
     yaw: float
     pitch: float
-    focal: float
-    width: int
-    height: int
+    focal: Positive
+    width: Count
+    height: Count
 
 
 ARGOVERSE2_RING = (
@@ -85,15 +87,15 @@ class CameraRigConfig:
             learns it in cells of 32); None leaves it out.
     """
 
-    cameras: tuple[CameraMount, ...] = NUSCENES_RING
-    scale: float = 0.1
-    multiple: int = 1
-    jitter: float = 1.0
-    severity: float = 1.0
+    cameras: Annotated[tuple[CameraMount, ...], NOT_EMPTY] = NUSCENES_RING
+    scale: Positive = 0.1
+    multiple: Count = 1
+    jitter: PositiveOrZero = 1.0
+    severity: Fraction = 1.0
     weather: FrontWeatherConfig = FrontWeatherConfig()
-    element_pixels: float = 8.0
+    element_pixels: PositiveOrZero = 8.0
     markers: bool = False
-    depth_cell: int | None = None
+    depth_cell: Count | None = None
 
     @property
     def supersample(self) -> int:

@@ -7,6 +7,7 @@ Configurations of older versions go through `migrations.migrate` first.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import enum
 import importlib
 import json
@@ -84,6 +85,20 @@ def subclasses(kind: type) -> dict[str, type]:
     return found
 
 
+def part_classes(kind: type) -> dict[str, type]:
+    """Return the classes of all configurations that one of class `kind` can hold, at any depth, by name."""
+    found: dict[str, type] = {}
+    waiting: list[Any] = [kind]
+    while waiting:
+        hint = waiting.pop()
+        waiting += typing.get_args(hint)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint) and hint.__name__ not in found:
+            found[hint.__name__] = hint
+            waiting += typing.get_type_hints(hint).values()
+            waiting += subclasses(hint).values() if getattr(hint, "open_base", False) else ()
+    return found
+
+
 def added_settings(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
     """Return a line for each setting that only the second of two configurations (JSON) has, with its value there.
 
@@ -124,7 +139,9 @@ def _dataclass(kind: Any, content: Any, path: str) -> Any:
     names = {field.name for field in dataclasses.fields(kind)}
     unknown = sorted(content.keys() - names - {"class"})
     if unknown:
-        raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax")
+        close = difflib.get_close_matches(unknown[0], names, 3)
+        hint = f"; did you mean {' or '.join(path + name for name in close)}?" if close else ""
+        raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax{hint}")
     values = {name: _value(hints[name], content[name], path + name) for name in names & content.keys()}
     return kind(**values)
 

@@ -116,6 +116,11 @@ Range = Annotated[tuple[PositiveOrZero, PositiveOrZero], ASCENDING]
 """(low, high) of a quantity that is not negative, from which a value is drawn; both may be equal."""
 
 
+def splits(setting: str, parts: int, name: str, whole: int) -> tuple[str, bool, str]:
+    """Return the rule that `parts`, the value of a setting, divides `whole`, which is called `name`."""
+    return setting, whole % parts == 0, f"a divisor of {name} ({whole})"
+
+
 def check_settings(config: Any, prefix: str = "") -> None:
     """Raise SettingError for the first setting of a configuration that breaks a limit.
 

@@ -26,7 +26,9 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import from_first
+from tflane_jax.run_checks import check_run
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
+from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
@@ -59,7 +61,9 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     """
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
     task = config.task
-    _check_metrics(config)
+    check_run(config)
+    if config.training.init_from is not None and start != "resume":
+        check_origins(config.training.init_from, config.training.seeds)
     data: Any = task.load(config.data.source("train"), progress=progress)
     task.check(config.data, data)
     arrays = task.examples(data)
@@ -83,19 +87,6 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         draw=_drawing(config),
         progress=progress,
     )
-
-
-def _check_metrics(config: RunConfig) -> None:
-    """Raise UserError if a setting names a score that the evaluation does not compute."""
-    known = config.task.score_names(config.data, config.evaluation)
-    adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
-    named = {"training.best_metric": config.training.best_metric}
-    if adaptive is not None:
-        named["optim.restarts.adaptive.metric"] = adaptive.metric
-    for setting, name in named.items():
-        if name not in known:
-            listed = ", ".join(sorted(score for score in known if "@" not in score))
-            raise UserError(f"{setting} is {name}, which the evaluation does not compute: choose one of {listed}")
 
 
 def build_data(source: Any) -> None:

@@ -18,11 +18,11 @@ from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.overlap import Drive
-from tflane_jax.datasets.procedural import SimulatedDataset
+from tflane_jax.datasets.procedural import SimulatedDataset, scene_limits
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
 from tflane_jax.errors import UserError
-from tflane_jax.limits import Count, Fraction
+from tflane_jax.limits import Count, Fraction, Rules
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.presets import CITY, REAL_MAPS
@@ -148,6 +148,12 @@ class RealMapData:
     world: WorldConfig = REAL_MAPS
     generated_world: WorldConfig = CITY
     example: ExampleConfig = RECORDED_EXAMPLE
+
+    def limits(self) -> Rules:
+        """Scenes are long enough for their key frames."""
+        yield from scene_limits(self.world, self.example, "world.")
+        if self.generated > 0.0:
+            yield from scene_limits(self.generated_world, self.example, "generated_world.")
 
     def source(self, split: Split) -> RealMapConfig | RecordedConfig:
         """Return the dataset of a split."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
-from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Positive
+from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Positive, Rules, splits
 
 Layout = Literal["blocks", "interleaved"]
 
@@ -65,6 +65,11 @@ class PolylineEncoderConfig:
     temperature: Positive = 1000.0
     layout: Layout = "blocks"
     attend: Literal["lines", "points"] = "lines"
+
+    def limits(self) -> Rules:
+        """Channels split over heads, and every frequency has a sine and a cosine."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        yield "bands", self.bands % 2 == 0, "even: every frequency has a sine and a cosine"
 
 
 # Marker fusion, section IV-C.

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.pointwise import convolve
-from tflane_jax.limits import NOT_EMPTY, Count
+from tflane_jax.limits import NOT_EMPTY, Count, Rules
 
 # PyTorch's default: uniform within 1 / sqrt(fan in).
 _INIT = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
@@ -45,6 +45,12 @@ class ResNetConfig:
     block: Literal["basic", "bottleneck"] = "basic"
     frozen_stem_norm: bool = False
     frozen_norms: bool = False
+
+    def limits(self) -> Rules:
+        """Every stage has blocks, channels and a stride."""
+        for name in ("channels", "strides"):
+            fits = len(getattr(self, name)) == len(self.blocks)
+            yield name, fits, f"as many numbers as there are stages (blocks has {len(self.blocks)})"
 
 
 RESNET_50 = ResNetConfig((3, 4, 6, 3), (64, 128, 256, 512), (1, 2, 2, 2), 64, "bottleneck")

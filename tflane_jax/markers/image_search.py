@@ -12,9 +12,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
-from tflane_jax.limits import Count, CountOrZero, Fraction, Positive
+from tflane_jax.limits import Count, CountOrZero, Fraction, Positive, check_settings
 from tflane_jax.markers.corner_refinement import refine_corners
 from tflane_jax.markers.occluded_search import find_occluded
 from tflane_jax.scene.marker_patterns import MarkerFamily, dictionary_of, marker_cells
@@ -57,15 +56,6 @@ class DetectorConfig:
     tilt: Positive = 0.05
     turn: Positive = 0.8
 
-    def validate(self) -> None:
-        """Raise UserError for numbers out of range."""
-        for name, least in (("capacity", 1), ("enlarge", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"DetectorConfig.{name} must be at least {least}, not {getattr(self, name)}")
-        for name in ("size", "least_pixels", "tilt", "turn"):
-            if not getattr(self, name) > 0.0:
-                raise UserError(f"DetectorConfig.{name} must be positive, not {getattr(self, name)}")
-
 
 class ImageMarkers(NamedTuple):
     """K markers found in one image, by ascending id; an id that was read at several places has a row for each.
@@ -90,7 +80,7 @@ def find_markers(
     An id found several times at one place is reported once, where its cells are read best; an id at several places is
     reported at each. Raises UserError without OpenCV or for an invalid config.
     """
-    config.validate()
+    check_settings(config, "DetectorConfig.")
     cv2 = opencv()
     if min(image.shape[:2]) < config.least_pixels:
         return ImageMarkers(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros(0, int))

@@ -28,7 +28,7 @@ from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
-from tflane_jax.limits import Count, FractionBelowOne
+from tflane_jax.limits import Count, FractionBelowOne, Rules, splits
 from tflane_jax.models.prior import BevHook
 
 
@@ -85,6 +85,17 @@ class BevFormerConfig:
     attention: Literal["deformable", "kernel"] = "deformable"
     kernel: tuple[Count, Count] = (3, 5)
     memory: Literal["previous", "off"] = "previous"
+
+    def limits(self) -> Rules:
+        """Channels split over heads, sampling points over anchors."""
+        yield "dim", self.dim % 2 == 0, "even: half of the position encoding is for rows, half for columns"
+        yield splits("heads", self.heads, "dim", self.dim)
+        if self.attention == "kernel":
+            yield splits("anchors", self.anchors, "dim", self.dim)
+            yield "levels", self.levels == 1, "1 with the geometry-guided kernel (attention)"
+        else:
+            multiple = self.spatial_points % self.anchors == 0
+            yield "spatial_points", multiple, f"a multiple of anchors ({self.anchors})"
 
     @property
     def dtype(self) -> Any:

@@ -22,7 +22,7 @@ from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import image_sine_encoding, inverse_sigmoid
 from tflane_jax.layers.transformer import FeedForward, Residual, TransformerConfig
-from tflane_jax.limits import Count, CountOrZero, FractionBelowOne
+from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Rules, splits
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ class ElementDecoderConfig:
     sampling_points: Count = 4
     hidden: Count = 128
     dropout: FractionBelowOne = 0.0
+
+    def limits(self) -> Rules:
+        """Channels split over heads, and over rows and columns."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        yield "dim", self.dim % 2 == 0, "even: half of the position encoding is for rows, half for columns"
 
 
 PAPER_ELEMENT_DECODER = ElementDecoderConfig(

@@ -37,7 +37,7 @@ from tflane_jax.layers.image_graph import (
     smooth,
 )
 from tflane_jax.layers.masks import key_mask
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, FractionBelowOne
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, FractionBelowOne, Rules
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,10 @@ class GtnEncoderConfig:
     head_dim: Count = 16
     hidden: Count = 128
     dropout: FractionBelowOne = 0.1
+
+    def limits(self) -> Rules:
+        """Every hop has edge types."""
+        yield "relations", bool(self.relations) or self.offers_similarity(0), "at least one, or similarity every_hop"
 
     def build(self, dim: int, name: str) -> GraphEncoder:
         """Return the Linen module for `dim` channels; raises UserError where they do not split."""

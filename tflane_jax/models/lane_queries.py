@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
-from tflane_jax.limits import Count, FractionBelowOne, Positive, PositiveOrZero, at_least
+from tflane_jax.limits import Count, FractionBelowOne, Positive, PositiveOrZero, Rules, at_least, splits
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,15 @@ class LaneDecoderConfig:
     metres: tuple[Positive, Positive, Positive] = (5.0, 5.0, 0.3)
     proposals: LaneProposalConfig | None = None
     dropout: FractionBelowOne = 0.0
+
+    def limits(self) -> Rules:
+        """Channels split over heads, sampling points over directions, and proposals are among the queries."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        star = self.sampling_points % min(self.sampling_points, 8) == 0
+        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
+        if self.proposals is not None:
+            fits = self.proposals.count <= self.queries
+            yield "proposals.count", fits, f"at most the decoder's queries ({self.queries})"
 
     @property
     def learned_queries(self) -> int:

@@ -23,7 +23,7 @@ from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.depth_net import DepthNet
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.limits import Count, FractionBelowOne, Positive
+from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import CameraViews
@@ -58,6 +58,15 @@ class LiftConfig:
     image_scale: Positive = 0.5
     supervised: bool = False
     border: Literal["exact", "published"] = "exact"
+
+    def limits(self) -> Rules:
+        """The depth bins follow each other."""
+        first, last, size = self.depth
+        yield (
+            "depth",
+            first + size <= last,
+            "(first, last, size of a bin), with a bin between first and last",
+        )
 
     @property
     def bins(self) -> int:

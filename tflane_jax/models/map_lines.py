@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
-from tflane_jax.limits import Count, FractionBelowOne, Positive, at_least
+from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules, at_least, splits
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, clipped
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
 from tflane_jax.models.lane_queries import spread_lanes
@@ -68,6 +68,12 @@ class LineDecoderConfig:
     output: Literal["sigmoid", "metric", "raw"] = "sigmoid"
     metres: tuple[Positive, Positive, Positive] = (5.0, 5.0, 0.3)
     dropout: FractionBelowOne = 0.0
+
+    def limits(self) -> Rules:
+        """Channels split over heads, sampling points over directions."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        star = self.sampling_points % min(self.sampling_points, 8) == 0
+        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
 
 
 PAPER_LINE_DECODER = LineDecoderConfig(dim=256, layers=6, queries=50, points=20, hidden=512, dropout=0.1)

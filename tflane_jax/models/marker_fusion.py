@@ -22,7 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
-from tflane_jax.limits import Count, Fraction, Positive
+from tflane_jax.limits import Count, Fraction, Positive, Rules, splits
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
@@ -76,6 +76,11 @@ class MarkerFusionConfig:
     radius: Positive | None = None
     query_position: bool = True
     connectivity: bool = False
+
+    def limits(self) -> Rules:
+        """Channels of the attention split over heads."""
+        if self.width is not None:
+            yield splits("heads", self.heads, "width", self.width)
 
     def build(self, host: HostSpec) -> MarkerPrior:
         """Return the prior for a host."""

@@ -17,12 +17,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
 from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
@@ -70,6 +69,12 @@ class TrafficFlowModuleConfig:
     heads: Count = 4
     masking: TrafficMaskConfig = TrafficMaskConfig()
 
+    def limits(self) -> Rules:
+        """Channels split over heads, and each head has its window."""
+        yield splits("heads", self.heads, "width", self.width)
+        fits = len(self.masking.head_windows) in (0, self.heads)
+        yield "masking.head_windows", fits, f"one window for each of the {self.heads} heads, or ()"
+
 
 @dataclass(frozen=True)
 class TrafficFlowConfig:
@@ -88,13 +93,14 @@ class TrafficFlowConfig:
     insert: Literal["before_decoder", "every_layer", "nowhere"] = "before_decoder"
     bev: TrafficRasterConfig | None = None
 
+    def limits(self) -> Rules:
+        """Traffic flow enters the model somewhere."""
+        somewhere = self.insert != "nowhere" or self.bev is not None
+        yield "insert", somewhere, "before_decoder or every_layer where bev is None: else traffic flow enters nowhere"
+
     def build(self, host: HostSpec) -> TrafficFlowPrior:
-        """Return the prior for a host; raises UserError where the traffic flow would enter nowhere."""
-        if self.insert == "nowhere" and self.bev is None:
-            raise UserError(
-                "traffic flow enters nowhere: choose traffic_flow.insert or traffic_flow.bev, or leave traffic_flow out"
-            )
-        self.module.masking.check(self.module.heads)
+        """Return the prior for a host; raises UserError for settings that break a limit."""
+        check_settings(self, "task.model.priors.traffic_flow.")
         return TrafficFlowPrior(self, host)
 
 

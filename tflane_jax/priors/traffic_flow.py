@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
-from tflane_jax.limits import Count, CountOrZero, Positive, within
+from tflane_jax.limits import Count, CountOrZero, Positive, Rules, within
 from tflane_jax.scene import TrafficFlow
 
 
@@ -43,6 +43,12 @@ class TrafficFlowPriorConfig:
     front_sector_deg: Annotated[float, within(0, 360)] = 60.0
     distance_scale: Positive = 25.0
     coordinates: Literal["normalised", "metres"] = "normalised"
+
+    def limits(self) -> Rules:
+        """An instance can have enough frames, and a slot."""
+        yield "min_valid_frames", self.min_valid_frames <= self.frames, f"at most frames ({self.frames})"
+        fits = self.top_instances is None or self.top_instances <= self.max_instances
+        yield "top_instances", fits, f"at most max_instances ({self.max_instances})"
 
 
 @struct.dataclass

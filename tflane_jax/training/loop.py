@@ -23,7 +23,7 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, replicated, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, check_settings
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import apart, arrays_from_first, from_first, is_first, stop_signal
 from tflane_jax.training.adaptive import Memory
@@ -150,7 +150,7 @@ def train(
         UserError: see `run_folder.claimed` and `Checkpoints`; settings out of range; a loss that is not finite, after
             the last good state was written.
     """
-    _check(config)
+    check_settings(config, "training.")
     progress = progress and is_first()
     mesh = training_mesh(config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
@@ -293,14 +293,6 @@ def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
     if not (steps := checkpoints.steps()):
         return None
     return {"step": steps[-1], "progress": checkpoints.manifest(steps[-1]).progress}
-
-
-def _check(config: TrainingConfig) -> None:
-    for name in ("steps", "batch_size", "log_every", "eval_every", "checkpoint_every", "keep_checkpoints"):
-        if getattr(config, name) < 1:
-            raise UserError(f"training.{name} is {getattr(config, name)}: it must be at least 1")
-    if not config.seeds or len(set(config.seeds)) < len(config.seeds):
-        raise UserError(f"training.seeds is {config.seeds}: give one or more different numbers")
 
 
 def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Fraction, at_least, below
-from tflane_jax.training.adaptive import AdaptiveConfig, Memory, check_adaptive, judge
+from tflane_jax.training.adaptive import AdaptiveConfig, Memory, judge
 
 _LONGEST = 2**29  # steps; twice that still is an int32
 
@@ -68,18 +68,6 @@ class Cycle(NamedTuple):
     period: Int[Array, "*seeds"]
     magnitude: Float[Array, "*seeds"]
     number: Int[Array, "*seeds"]
-
-
-def check_restarts(config: RestartsConfig) -> None:
-    """Raise UserError for a setting out of its range."""
-    if not 1 <= config.cycle_steps < _LONGEST:
-        raise UserError(f"optim.restarts.cycle_steps is {config.cycle_steps}: it must be at least 1 (and below 2^29)")
-    if not config.factor >= 1.0:
-        raise UserError(f"optim.restarts.factor is {config.factor}: it must be at least 1")
-    if not 0.0 <= config.floor <= 1.0:
-        raise UserError(f"optim.restarts.floor is {config.floor}: it is relative to optim.lr, from 0 to 1")
-    if config.adaptive is not None:
-        check_adaptive(config.adaptive)
 
 
 def first_cycle(config: RestartsConfig, start: int, steps: int) -> Cycle:

@@ -219,7 +219,7 @@ def test_mismatched_parts_are_errors():
         TopoNetConfig(elements=CAMERA_TOPONET.elements).build()
     with pytest.raises(UserError, match=r"elements\.layers is 3: it must be decoder\.layers \(2\)"):
         dataclasses.replace(CAMERA_TOPONET, elements=dataclasses.replace(CAMERA_TOPONET.elements, layers=3)).build()
-    with pytest.raises(UserError, match="decoder.refine is 'iterative': it must be fixed"):
+    with pytest.raises(UserError, match=r"decoder\.refine is 'iterative': it must be fixed"):
         dataclasses.replace(CAMERA_DETR, decoder=dataclasses.replace(CAMERA_DETR.decoder, refine="iterative")).build()
     unlabelled = batch_of(make_camera_example().replace(traffic_elements=None))
     with pytest.raises(UserError, match=r"set task\.model\.elements to None"):

@@ -144,7 +144,10 @@ def test_a_frame_hears_later_ones_only_if_it_may(temporal):
 @pytest.mark.parametrize(
     ("masking", "message"),
     [
-        (TrafficMaskConfig(head_windows=(1.0,)), r"masking\.head_windows is \(1\.0,\): it must be one window for each of the 4 heads"),
+        (
+            TrafficMaskConfig(head_windows=(1.0,)),
+            r"head_windows is \(1\.0,\): .*each of the 4 heads",
+        ),
         (TrafficMaskConfig(head_windows=(1.0, 2.0, 0.0, 3.0)), r"masking\.head_windows is .*above 0"),
         (TrafficMaskConfig(window=-1.0), r"masking\.window is -1\.0"),
         (TrafficMaskConfig(nearest=0), r"masking\.nearest is 0"),

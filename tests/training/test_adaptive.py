@@ -13,8 +13,8 @@ import pytest
 from tests.training.stub_run import CONFIG, OPTIM, run, score
 from tests.training.test_loop import arrays, timeless
 from tflane_jax.errors import UserError
-from tflane_jax.plots.curves import curves
 from tflane_jax.limits import check_settings
+from tflane_jax.plots.curves import curves
 from tflane_jax.training.adaptive import AdaptiveConfig, Memory, judge
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.restarts import RestartsConfig

@@ -132,7 +132,7 @@ def _shown(value: Any) -> str:
 
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
     if isinstance(content, dict) and getattr(kind, "open_base", False):
-        kind = subclasses(kind).get(content.get("class", ""), kind)
+        kind = subclasses(kind).get(str(content.get("class", "")), kind)
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
         raise UserError(f"setting {path or 'at the top'} should be a {kind.__name__}, not {content!r:.80}")
     hints = typing.get_type_hints(kind)
@@ -143,7 +143,14 @@ def _dataclass(kind: Any, content: Any, path: str) -> Any:
         hint = f"; did you mean {' or '.join(path + name for name in close)}?" if close else ""
         raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax{hint}")
     values = {name: _value(hints[name], content[name], path + name) for name in names & content.keys()}
+    missing = [f.name for f in dataclasses.fields(kind) if f.name not in values and _is_required(f)]
+    if missing:
+        raise UserError(f"setting {path}{missing[0]} is missing")
     return kind(**values)
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
 def _value(hint: Any, content: Any, path: str) -> Any:

@@ -23,6 +23,7 @@ from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import from_first
@@ -118,7 +119,18 @@ def _loaded(data: _TestData) -> Any:
 
 def resumable_config(folder: Path) -> RunConfig:
     """Return the configuration that a run was started with; raises UserError if the folder holds no run."""
-    return from_json(RunConfig, migrate(read_config(folder))[0])
+    return _read_config(folder / "config.json", read_config(folder))[0]
+
+
+def _read_config(path: Path, saved: dict[str, Any]) -> tuple[RunConfig, list[str]]:
+    """Return a saved configuration (JSON) and notices of its migration; raises UserError that names the file."""
+    try:
+        migrated, notices = migrate(saved)
+        config = from_json(RunConfig, migrated)
+        check_settings(config)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return config, notices
 
 
 def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -142,15 +154,18 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: the checkpoint is missing, damaged, or of an unreadable version.
     """
     plain = Checkpoints(folder / "checkpoints")
-    migrated, notices = migrate(plain.manifest(plain.find("last")).config)
+    step = plain.find("last")
+    config, notices = _read_config(plain.path(step) / "manifest.json", plain.manifest(step).config)
     for notice in notices:
         print(notice, file=sys.stderr)
-    config = from_json(RunConfig, migrated)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
     if which is None:
         which = "last" if checkpoints.best_step() is None else "best"
     step = checkpoints.find(which)
-    params = per_seed(checkpoints.params(step), config.training.seeds)
+    averaged, seeds = checkpoints.params(step), config.training.seeds
+    if len(seeds) > 1 and any(leaf.shape[:1] != (len(seeds),) for leaf in jax.tree.leaves(averaged)):
+        raise UserError(f"{checkpoints.path(step)} has not the parameters of {len(seeds)} seeds (training.seeds)")
+    params = per_seed(averaged, seeds)
     return Run(str(folder), config, step, tuple(params))
 
 

@@ -186,10 +186,10 @@ def train(
             states = per_seed(
                 arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole), config.seeds
             )
-            progress_so_far = latest["progress"]
-            window, seconds = _Window(**progress_so_far["window"]), progress_so_far["seconds"]
-            metrics = progress_so_far["metrics"]
-            memories = [Memory(**memory) for memory in progress_so_far.get("cycles", [])] or memories
+            try:
+                window, metrics, seconds, memories = _carried(latest["progress"], memories)
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
             fresh = states
             given = arrays_from_first(
@@ -293,6 +293,15 @@ def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
     if not (steps := checkpoints.steps()):
         return None
     return {"step": steps[-1], "progress": checkpoints.manifest(steps[-1]).progress}
+
+
+def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[_Window, dict[str, float], float, list[Memory]]:
+    """Return window, metrics, seconds and the memories of seeds from a checkpoint's progress."""
+    window = _Window(
+        int(saved["window"]["steps"]), {k: list(map(float, v)) for k, v in saved["window"]["sums"].items()}
+    )
+    metrics = {name: float(value) for name, value in saved["metrics"].items()}
+    return window, metrics, float(saved["seconds"]), [Memory(**one) for one in saved.get("cycles", [])] or fresh
 
 
 def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:

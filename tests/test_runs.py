@@ -69,7 +69,7 @@ def test_the_current_form_of_a_configuration_is_itself(config):
         ({"training": {"best_metric": "all/OLS"}}, r"training\.best_metric is 'all/OLS'"),
         (
             {"optim": {"restarts": RestartsConfig(adaptive=AdaptiveConfig(metric="loss"))}},
-            r"optim\.restarts\.adaptive\.metric is loss",
+            r"optim\.restarts\.adaptive\.metric is 'loss'",
         ),
     ],
 )

@@ -172,10 +172,8 @@ def _is_entry(entry: Any) -> bool:
         return False
     numbers = [value for scores in entry["ways"].values() for value in _values(scores)]
     counts = [pair for of_way in entry["ratios"].values() for pair in _values(of_way)]
-    paired = all(
-        isinstance(pair, list) and len(pair) == 2 and all(isinstance(p, list) for p in pair) for pair in counts
-    )
-    return "" in entry["ways"] and all(type(value) in (int, float) for value in numbers) and paired
+    paired = [isinstance(pair, list) and [type(half) for half in pair] == [list, list] for pair in counts]
+    return "" in entry["ways"] and all(type(value) in (int, float) for value in numbers) and all(paired)
 
 
 def _values(mapping: Any) -> list[Any]:

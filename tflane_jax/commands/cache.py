@@ -18,11 +18,10 @@ def show(options: argparse.Namespace) -> int:
         print(f"{root}: nothing is kept")
         return 0
     rows = [
-        {"name": one.path.name, "holds": one.kind, "MB": _megabytes(one), "days": f"{one.days:.0f}"} for one in entries
+        {"name": one.path.name, "holds": one.kind, "MB": _megabytes(one), "days unused": f"{one.days:.0f}"}
+        for one in entries
     ]
-    print(
-        format_table(rows, title=f"{root}: {sum(one.size for one in entries) / 1e6:.1f} MB (days since the last use)")
-    )
+    print(format_table(rows, title=f"{root}: {sum(one.size for one in entries) / 1e6:.1f} MB"))
     return 0
 
 
@@ -36,12 +35,13 @@ def clear(options: argparse.Namespace) -> int:
 
 
 def _chosen(entries: list[Entry], options: argparse.Namespace) -> list[Entry]:
+    made = [one for one in entries if one.made]  # what a user put there is deleted by name alone
     if options.all:
-        return entries
+        return made
     if options.older is not None:
         if not options.older >= 0.0:
             raise UserError(f"--older {options.older:g}: it must be a number of days, at least 0")
-        return [one for one in entries if one.days >= options.older]
+        return [one for one in made if one.days >= options.older]
     by_name = {one.path.name: one for one in entries}
     for name in options.names:
         if name not in by_name:

@@ -45,7 +45,7 @@ _SOURCES = ("scene", "geometry", "world", "markers", "datasets")
 
 _UNGUARDED = (
     'a script builds a dataset outside `if __name__ == "__main__":`, and worker processes import the script: put what '
-    "the script does below that line"
+    "it does below that line"
 )
 
 

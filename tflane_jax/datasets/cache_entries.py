@@ -36,6 +36,11 @@ class Entry:
     used: float
 
     @property
+    def made(self) -> bool:
+        """Whether tflane makes the content anew where it is missing."""
+        return self.path.name != "weights"
+
+    @property
     def days(self) -> float:
         """Days since it was last used."""
         return max(time.time() - self.used, 0.0) / 86_400.0

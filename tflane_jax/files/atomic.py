@@ -2,8 +2,8 @@
 
 The content is written under a hidden temporary name beside its destination and then renamed. A reader sees the old
 content or the new one, never a part. A killed process leaves the destination as it was, and at most a file or folder
-named `.<name>.<process>-<number>.tmp`. What was renamed survives a power failure: content is flushed to the device before,
-the folder after.
+named `.<name>.<process>-<number>.tmp`. What was renamed survives a power failure: the content is flushed to the device
+before, the folder after.
 """
 
 from __future__ import annotations

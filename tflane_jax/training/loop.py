@@ -297,9 +297,8 @@ def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
 
 def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[_Window, dict[str, float], float, list[Memory]]:
     """Return window, metrics, seconds and the memories of seeds from a checkpoint's progress."""
-    window = _Window(
-        int(saved["window"]["steps"]), {k: list(map(float, v)) for k, v in saved["window"]["sums"].items()}
-    )
+    sums = {name: list(map(float, values)) for name, values in saved["window"]["sums"].items()}
+    window = _Window(int(saved["window"]["steps"]), sums)
     metrics = {name: float(value) for name, value in saved["metrics"].items()}
     return window, metrics, float(saved["seconds"]), [Memory(**one) for one in saved.get("cycles", [])] or fresh
 

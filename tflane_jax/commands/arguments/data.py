@@ -131,11 +131,9 @@ def cache(commands) -> None:
     command(inner, "list", "list the entries, with size and age", module="cache", function="show", epilog=where)
     clear = command(inner, "clear", "delete entries", module="cache", function="clear", epilog=where)
     chosen = clear.add_mutually_exclusive_group(required=True)
-    chosen.add_argument(
-        "names", metavar="NAME", nargs="*", default=[], help="entries, as `tflane cache list` names them"
-    )
-    chosen.add_argument("--older", metavar="DAYS", type=float, help="all that were not used for so many days")
-    chosen.add_argument("--all", action="store_true", help="all entries")
+    chosen.add_argument("names", metavar="NAME", nargs="*", default=[], help="as `tflane cache list` gives them")
+    chosen.add_argument("--older", metavar="DAYS", type=float, help="all but weights that were not used for so long")
+    chosen.add_argument("--all", action="store_true", help="all entries but weights")
 
 
 def _moment(text: str) -> float:

@@ -1,0 +1,293 @@
+"""Damaged files of run folders, comparisons and caches: one message that names the file, or the file is made anew."""
+
+import errno
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from tests.fakes import FakeConfig, FakeDataset
+from tests.training.stub import LineTask, line_arrays
+from tflane_jax.ablations.declaration import Claim, Declaration, declare
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.scores import _read
+from tflane_jax.cli import main
+from tflane_jax.config import RunConfig
+from tflane_jax.config_io import to_json
+from tflane_jax.datasets import cache
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
+from tflane_jax.runs import open_run, resumable_config
+from tflane_jax.training import checkpoint
+from tflane_jax.training.checkpoint import Checkpoints, Manifest
+from tflane_jax.training.loop import _carried
+from tflane_jax.training.provenance import add_provenance
+from tflane_jax.training.records import RecordWriter, read_records
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import init_states
+
+PROGRESS = {"window": {"steps": 1, "sums": {"loss": [1.0]}}, "seconds": 1.0, "metrics": {}}
+CONFIG = RunConfig()
+FILES = ("config.json", "metrics.jsonl", "provenance.json", "checkpoints/step_00000002/manifest.json")
+# Whole contents of a file; None is a folder in its place, a function changes what was written.
+CONTENTS = {
+    "empty": b"",
+    "binary": bytes(range(256)),
+    "null": b"null",
+    "number": b"3",
+    "text": b'"text"',
+    "list": b"[]",
+    "nested list": b"[[1, 2], [3]]",
+    "object": b"{}",
+    "other object": b'{"class": ["RunConfig"], "step": {}}',
+    "too deep": b"[" * 100_000,
+    "objects too deep": b'{"config":' * 100_000,
+    "huge number": b"1" * 5000,
+    "cut short": lambda content: content[: len(content) // 2],
+    "two values": lambda content: content + content,
+    "a folder": None,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A run of two checkpoints, without training."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    example = jax.tree.map(lambda leaf: leaf[0], line_arrays())
+    (state,) = init_states(LineTask(), make_optimizer(OptimConfig(warmup_steps=0), 9), (0,), example)
+    checkpoints = Checkpoints(folder / "checkpoints")
+    for step in (1, 2):
+        manifest = Manifest(step=step, config=to_json(CONFIG), metrics={"all/DET_l": 0.5}, progress=PROGRESS)
+        checkpoints.save(state.replace(step=jnp.int32(step)), manifest)
+    write_json(folder / "config.json", to_json(CONFIG))
+    add_provenance(folder)
+    (folder / "metrics.jsonl").write_text('{"step": 1, "split": "train", "loss": 0.5}\n')
+    return folder
+
+
+@pytest.fixture
+def run(whole, tmp_path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "run"))
+
+
+def damage(path: Path, content) -> None:
+    """Replace a file by a content of `CONTENTS`."""
+    written = path.read_bytes()
+    path.unlink()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content(written) if callable(content) else content)
+
+
+def read_all(run: Path) -> list[str]:
+    """Read a run folder in every way that a command does, and return the messages; nothing else may be raised."""
+    found = []
+    job = Job(CONFIG, run, {}, {}, False, "run")
+    readers = (
+        lambda: resumable_config(run),
+        lambda: open_run(run),
+        lambda: open_run(run, "last"),
+        lambda: read_records(run / "metrics.jsonl"),
+        lambda: add_provenance(run),
+        job.difference,
+        job.step,
+        job.is_complete,
+    )
+    for reader in readers:
+        try:
+            reader()
+        except UserError as error:
+            found.append(str(error))
+    return found
+
+
+def test_a_whole_run_is_read_without_a_message(run):
+    assert read_all(run) == []
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+@pytest.mark.parametrize("file", FILES)
+def test_damaged_files_of_a_run_are_named(run, file, content):
+    damage(run / file, CONTENTS[content])
+    messages = read_all(run)
+    name = str(run / file).removesuffix("/manifest.json")
+    assert all(name in message for message in messages), messages
+    if file in (FILES[0], FILES[-1]):
+        assert messages
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: c.pop("class"), "should be a RunConfig"),
+        (lambda c: c["optim"].update(lr="fast"), "optim.lr cannot be 'fast'"),
+        (lambda c: c["optim"].update(lr=-1.0), "optim.lr is -1.0: it must be"),
+        (lambda c: c["optim"].update(lr=None), "optim.lr cannot be None"),
+        (lambda c: c["optim"].update(restarts=[1]), "optim.restarts cannot be"),
+        (lambda c: c["optim"].update(lrr=1.0), "optim.lrr is unknown"),
+        (lambda c: c["training"].update(seeds=0), "training.seeds cannot be 0"),
+        (lambda c: c["training"].update(seeds=[]), "training.seeds is ()"),
+        (lambda c: c["training"].update(steps=0), "training.steps is 0"),
+        (lambda c: c["task"].update(model=3), "task.model"),
+        (lambda c: c["task"]["model"].update({"class": ["TopoNetConfig"]}), "task.model"),
+        (lambda c: c["task"]["model"]["decoder"].update(heads=7), "task.model.decoder.heads is 7"),
+        (lambda c: c["task"]["model"].update(priors="none"), "task.model.priors"),
+        (lambda c: c.update(data={"class": "OpenLaneV2Data"}), "data.root is missing"),
+        (lambda c: c.update(data=[]), "data cannot be"),
+    ],
+)
+@pytest.mark.parametrize("file", ["config.json", FILES[-1]])
+def test_wrong_settings_of_a_run_are_named(run, file, change, words):
+    content = json.loads((run / file).read_text())
+    change(content if file == "config.json" else content["config"])
+    (run / file).write_text(json.dumps(content))
+    messages = read_all(run)
+    assert any(words in message for message in messages), messages
+
+
+@pytest.mark.parametrize("entry", ["step", "config", "metrics", "progress", "files", "version"])
+@pytest.mark.parametrize("value", [None, [], "text", {"a": None}])
+def test_wrong_entries_of_a_manifest_are_named(run, entry, value):
+    path = run / FILES[-1]
+    path.write_text(json.dumps(json.loads(path.read_text()) | {entry: value}))
+    if (entry, value) == ("progress", {"a": None}):  # read by the loop alone
+        return
+    messages = read_all(run)
+    assert any(str(path.parent) in message for message in messages), messages
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"window": None}, {"window": {"steps": 1}}, {"seconds": "long"}, {"metrics": []}, {"cycles": [{"x": 1}]}],
+)
+def test_wrong_progress_is_an_error_that_the_loop_names(change):
+    assert _carried(PROGRESS, [])[2] == 1.0
+    with pytest.raises((KeyError, TypeError, ValueError, AttributeError)):
+        _carried(PROGRESS | change, [])
+
+
+def test_a_damaged_run_ends_the_command_with_a_message(run, capsys):
+    damage(run / FILES[-1], b"[]")
+    assert main(["eval", str(run)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"{run}/checkpoints/step_00000002 is damaged" in error
+    assert "the run can go on from step 1" in error
+
+
+@pytest.mark.parametrize(
+    "line", ["", "x", "[]", "3", "{}", '{"step": "1", "split": "train"}', '{"step": 1, "split": "val", "loss": "low"}']
+)
+def test_records_end_at_the_first_line_that_is_none(run, line):
+    path = run / "metrics.jsonl"
+    path.write_text(f"{path.read_text()}{line}\n" + '{"step": 2, "split": "train", "loss": 1.0}\n')
+    assert [record["step"] for record in read_records(path)] == [1]
+
+
+def test_a_record_that_cannot_be_written_says_how_to_go_on(run):
+    with RecordWriter(run, 2) as writer:
+        writer._file.close()
+        writer._file = open("/dev/full", "w") if Path("/dev/full").exists() else pytest.skip("no /dev/full")
+        with pytest.raises(UserError, match=r"metrics\.jsonl: No space left on device; make room .* --resume"):
+            writer.write({"step": 2, "split": "train", "loss": 1.0})
+
+
+class TensorstoreError(Exception):
+    """As those of tensorstore, not an OSError."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError(errno.EROFS, "Read-only file system"),
+        TensorstoreError("RESOURCE_EXHAUSTED: No space left on device\nmore"),
+    ],
+)
+def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_ones(run, error, monkeypatch):
+    class Full:
+        def __enter__(self):
+            raise error
+
+        def __exit__(self, *_):
+            pass
+
+    checkpoints, example = Checkpoints(run / "checkpoints"), jax.tree.map(lambda leaf: leaf[0], line_arrays())
+    (state,) = init_states(LineTask(), make_optimizer(OptimConfig(warmup_steps=0), 9), (0,), example)
+    restored = checkpoints.restore(2, state)
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_checkpointer", Full)
+        with pytest.raises(UserError, match=r"step_00000003: .*(space left|Read-only).*--resume"):
+            checkpoints.save(restored, Manifest(step=3, config={}))
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["step_00000001", "step_00000002"]
+    assert len(checkpoints.arrays(2)) == len(checkpoints.arrays(1))
+    checkpoints.save(restored, Manifest(step=3, config={}))  # after room was made
+    assert checkpoints.steps() == [2, 3]
+
+
+def test_files_are_flushed_before_they_get_their_name(tmp_path, monkeypatch):
+    done = []
+    fsync, replaced = checkpoint.os.fsync, checkpoint.os.replace
+    monkeypatch.setattr("os.fsync", lambda handle: (done.append("flush"), fsync(handle)))
+    monkeypatch.setattr("os.replace", lambda *paths: (done.append("rename"), replaced(*paths)))
+    write_json(tmp_path / "a.json", {})
+    assert done == ["flush", "rename", "flush"]
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+def test_damaged_scores_are_measured_again(tmp_path, content):
+    path = tmp_path / "scores.json"
+    ways = {"": {"all/recall": 0.5}}
+    entry = {"code": "", "step": 1, "protocol": "", "ways": ways, "ratios": {"": {"all/recall": [[1], [2]]}}}
+    write_json(path, {"mark": entry})
+    assert dict(_read(path)) == {"mark": entry}
+    damage(path, CONTENTS[content])
+    assert dict(_read(path)) == {}
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+def test_a_damaged_declaration_is_named(tmp_path, content):
+    declaration = Declaration("all/recall", (Claim("a"),))
+    declare(declaration, {"a": []}, [0], tmp_path)
+    assert declare(declaration, {"a": []}, [0], tmp_path).seeds == (0,)
+    damage(tmp_path / "declaration.json", CONTENTS[content])
+    with pytest.raises(UserError, match=r"declaration\.json"):
+        declare(declaration, {"a": []}, [0], tmp_path)
+
+
+@pytest.mark.parametrize("content", CONTENTS)
+def test_a_damaged_cache_entry_is_built_again(tmp_path, content):
+    dataset = FakeDataset(FakeConfig())
+    first = cache.cached(dataset, root=tmp_path, workers=1, progress=False)
+    damage(first.folder / "index.json", CONTENTS[content])
+    again = cache.cached(dataset, root=tmp_path, workers=1, progress=False)
+    assert again.info(0).scene == dataset.info(0).scene
+    assert len(again) == len(dataset)
+
+
+def test_a_file_in_place_of_a_cache_entry_is_replaced(tmp_path):
+    folder = cache.cached(FakeDataset(FakeConfig()), root=tmp_path, workers=1, progress=False).folder
+    shutil.rmtree(folder)
+    folder.touch()
+    assert len(cache.cached(FakeDataset(FakeConfig()), root=tmp_path, workers=1, progress=False)) > 0
+
+
+@pytest.mark.parametrize("named", ["~no_such_user_here/cache", "{file}", "{file}/below"])
+def test_a_wrong_cache_folder_is_named(tmp_path, named, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TFLANE_CACHE", named.format(file=tmp_path / "file"))
+    with pytest.raises(UserError, match="TFLANE_CACHE"):
+        cache.cached(FakeDataset(FakeConfig()), workers=1, progress=False)
+
+
+def test_run_folders_that_cannot_be_used_are_told_before_any_work(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    config = replace(CONFIG, training=replace(CONFIG.training, steps=501))
+    monkeypatch.setattr(type(config.task), "load", None)
+    for out in (tmp_path / "file", tmp_path / "file" / "run"):
+        assert main(["train", "--config", "tf_lane/toponet", "--out", str(out)]) == 2

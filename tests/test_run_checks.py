@@ -26,7 +26,7 @@ REVERSED = PerceptionRange((50.0, -50.0), (-25.0, 25.0))
 # Configuration -> setting -> values that it must not have.
 WRONG = {
     "tf_lane/toponet_tfm": {
-        "optim.lr": (-1.0, 0.0, NAN, INF, "fast", None, True),
+        "optim.lr": (-1.0, NAN, INF, "fast", None, True),
         "optim.b1": (1.0, 1.5, -0.1, NAN),
         "optim.b2": (1.0, 2.0),
         "optim.eps": (0.0, -1e-8),
@@ -222,7 +222,7 @@ def test_there_are_enough_cases():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--optim.lr", "-1"], ["--optim.lr is -1.0", "above 0"]),
+        (["--optim.lr", "-1"], ["--optim.lr is -1.0", "at least 0"]),
         (["--task.model.decoder.heads", "7"], ["--task.model.decoder.heads is 7", "divisor of dim (64)"]),
         (["--data.test", "0"], ["--data.test is 0", "at least 1"]),
         (["--training.best_metric", "all/DETl"], ["training.best_metric is 'all/DETl'", "did you mean all/DET_l"]),

@@ -61,7 +61,7 @@ class OptimConfig:
     """Optimiser and averaging.
 
     Attributes:
-        lr: peak learning rate.
+        lr: peak learning rate; 0 changes nothing but running statistics and averages.
         warmup_steps: steps of linear rise from `warmup_ratio * lr` to `lr`.
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
         weight_decay: on kernels and embeddings only.
@@ -80,7 +80,7 @@ class OptimConfig:
         drops: steps at which a constant rate drops, in place of the cosine; None for none.
     """
 
-    lr: Positive = 2e-4
+    lr: PositiveOrZero = 2e-4
     warmup_steps: CountOrZero = 500
     warmup_ratio: Fraction = 1 / 3
     final_ratio: Fraction = 1e-3

@@ -1,14 +1,15 @@
 """Damaged files of run folders, comparisons and caches: one message that names the file, or the file is made anew."""
 
-import contextlib
 import errno
 import json
 import multiprocessing
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -193,16 +194,43 @@ def test_records_end_at_the_first_line_that_is_none(run, line):
     assert [record["step"] for record in read_records(path)] == [1]
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_a_record_that_cannot_be_written_says_how_to_go_on(run):
-    with RecordWriter(run, 2) as writer, open("/dev/full", "w") as full:
-        writer._file.close()
-        writer._file = full
-        with pytest.raises(UserError, match=r"metrics\.jsonl: No space left on device; make room .* --resume"):
+@pytest.mark.parametrize("file", ["_file", "_board"])
+def test_a_record_that_cannot_be_written_says_how_to_go_on(run, file, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with RecordWriter(run, 2) as writer:
+        wrapped = getattr(writer, file)
+        broken = SimpleNamespace(write=full, flush=full, close=full)
+        monkeypatch.setattr(writer, file, broken)
+        with pytest.raises(UserError, match=rf"records in {run}: No space left on device; make room .* --resume"):
             writer.write({"step": 2, "split": "train", "loss": 1.0})
-        writer._file = open(os.devnull, "w")  # noqa: SIM115 (closed by the writer)
-        with contextlib.suppress(OSError):
-            full.close()
+        wrapped.close()
+
+
+def test_scalars_for_tensorboard_are_written_and_purged(run):
+    from tensorboardX.proto.event_pb2 import Event
+
+    with RecordWriter(run, 1) as writer:
+        writer.write({"step": 2, "split": "val", "recall": [0.25, 0.5], "loss": 1.0})
+    (path,) = (run / "tensorboard").glob("events.*")
+    content, events = path.read_bytes(), []
+    while content:  # length, checksum, event, checksum
+        (size,) = struct.unpack("Q", content[:8])
+        events.append(Event.FromString(content[12 : 12 + size]))
+        content = content[16 + size :]
+    assert [event.step for event in events] == [0, 2, 2, 2, 2, 2]
+    values = {v.tag: v.simple_value for event in events for v in event.summary.value}
+    assert values == {"val/recall/0": 0.25, "val/recall/1": 0.5, "val/loss": 1.0}
+
+
+@pytest.mark.parametrize("place", ["tensorboard", "metrics.jsonl/x"])
+def test_records_that_have_no_place_are_named(tmp_path, place):
+    path = tmp_path / place
+    path.parent.mkdir(exist_ok=True)
+    path.touch()
+    with pytest.raises(UserError, match=str(tmp_path)):
+        RecordWriter(tmp_path, 0)
 
 
 class TensorstoreError(Exception):

@@ -191,11 +191,9 @@ def _fits(hint: Any, value: Any, *, finite: bool = True) -> bool:
         return isinstance(value, int | float) and not isinstance(value, bool) and (not finite or math.isfinite(value))
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
-    return isinstance(value, hint) if isinstance(hint, type) and not _is_protocol(hint) else True
-
-
-def _is_protocol(hint: type) -> bool:
-    return getattr(hint, "_is_protocol", False)
+    if hint is Any or not isinstance(hint, type) or getattr(hint, "_is_protocol", False):
+        return True
+    return isinstance(value, hint)
 
 
 _WORDS = {float: "a finite number", int: "a whole number", str: "text", bool: "True or False", type(None): "None"}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -58,33 +60,20 @@ class RecordWriter:
     """
 
     def __init__(self, folder: Path, step: int):
-        from tensorboardX import SummaryWriter
-
-        path = folder / "metrics.jsonl"
+        self._path = path = folder / "metrics.jsonl"
         self.records = [record for record in read_records(path) if record["step"] <= step]
         write_text(path, "".join(_line(record) for record in self.records))
-        self._path = path
-        self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
-        purge = step + 1 if self.records else None
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=purge, write_to_disk=True)
+        with self._told():
+            self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
+            self._board = _Board(folder / "tensorboard", step + 1 if self.records else None)
 
     def write(self, record: Record) -> None:
-        """Append one record and flush the file."""
+        """Append one record and flush the files; raises UserError where that fails."""
         self.records.append(record)
-        try:
+        with self._told():
             self._file.write(_line(record))
             self._file.flush()
-        except OSError as error:
-            raise UserError(
-                f"cannot write {self._path}: {error.strerror or error}; make room there and go on with --resume"
-            ) from error
-        for name, value in record.items():
-            if name in ("step", "split"):
-                continue
-            tag = f"{record['split']}/{name}"
-            tags = {f"{tag}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {tag: value}
-            for one, number in tags.items():
-                self._board.add_scalar(one, number, record["step"])
+            self._board.write(record)
 
     def __enter__(self) -> RecordWriter:
         return self
@@ -92,9 +81,59 @@ class RecordWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with contextlib.suppress(OSError):  # what could not be written has been told by `write`
-            self._file.close()
-        self._board.close()
+        for file in (self._file, self._board):
+            with contextlib.suppress(OSError):  # what could not be written has been told by `write`
+                file.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise UserError(
+                f"cannot write the records in {self._path.parent}: {error.strerror or error}; make room or give the "
+                "right to write there, and go on with --resume"
+            ) from error
+
+
+class _Board:
+    """Scalars for TensorBoard.
+
+    tensorboardX's own `SummaryWriter` writes in a thread, which dies on a full disk and leaves the program waiting.
+
+    Args:
+        folder: of the event files.
+        purge: TensorBoard hides events of earlier files from this step on; None hides none.
+    """
+
+    def __init__(self, folder: Path, purge: int | None):
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self._events = EventsWriter(str(folder / "events"))
+        if purge is not None:
+            self._events.write_event(Event(step=purge, file_version="brain.Event:2"))
+            self._events.write_event(Event(step=purge, session_log=SessionLog(status=SessionLog.START)))
+
+    def write(self, record: Record) -> None:
+        """Append the values of a record and flush the file."""
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.summary import scalar
+
+        for name, value in record.items():
+            if name in ("step", "split"):
+                continue
+            tag = f"{record['split']}/{name}"
+            tags = {f"{tag}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {tag: value}
+            for one, number in tags.items():
+                event = Event(step=record["step"], wall_time=time.time(), summary=scalar(one, number))
+                self._events.write_event(event)
+        self._events.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._events.close()
 
 
 class Unwritten:

@@ -64,8 +64,8 @@ class RecordWriter:
         self.records = [record for record in read_records(path) if record["step"] <= step]
         write_text(path, "".join(_line(record) for record in self.records))
         with self._told():
-            self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
             self._board = _Board(folder / "tensorboard", step + 1 if self.records else None)
+            self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
 
     def write(self, record: Record) -> None:
         """Append one record and flush the files; raises UserError where that fails."""

@@ -22,17 +22,17 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.runs import open_run, resumable_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.training import checkpoint
+from tflane_jax.training import checkpoint, provenance
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.loop import _carried
-from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import RecordWriter, read_records
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
 from tflane_jax.training.state import init_states
 
 PROGRESS = {"window": {"steps": 1, "sums": {"loss": [1.0]}}, "seconds": 1.0, "metrics": {}}
 CONFIG = RunConfig()
-FILES = ("config.json", "metrics.jsonl", "provenance.json", "checkpoints/step_00000002/manifest.json")
+MANIFEST = "checkpoints/step_00000002/manifest.json"
+FILES = ("config.json", "metrics.jsonl", "provenance.json", MANIFEST)
 # Whole contents of a file; None is a folder in its place, a function changes what was written.
 CONTENTS = {
     "empty": b"",
@@ -64,14 +64,21 @@ def whole(tmp_path_factory) -> Path:
         manifest = Manifest(step=step, config=to_json(CONFIG), metrics={"all/DET_l": 0.5}, progress=PROGRESS)
         checkpoints.save(state.replace(step=jnp.int32(step)), manifest)
     write_json(folder / "config.json", to_json(CONFIG))
-    add_provenance(folder)
+    provenance.add_provenance(folder)
     (folder / "metrics.jsonl").write_text('{"step": 1, "split": "train", "loss": 0.5}\n')
     return folder
 
 
 @pytest.fixture
 def run(whole, tmp_path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "run"))
+    """A copy of the run, without the arrays."""
+    return Path(shutil.copytree(whole, tmp_path / "run", ignore=shutil.ignore_patterns("state")))
+
+
+@pytest.fixture(autouse=True)
+def no_git(monkeypatch):
+    """Nothing here looks at the commit, and asking for it takes longer than the rest."""
+    monkeypatch.setattr(provenance, "_git", lambda: None)
 
 
 def damage(path: Path, content) -> None:
@@ -84,20 +91,16 @@ def damage(path: Path, content) -> None:
         path.write_bytes(content(written) if callable(content) else content)
 
 
-def read_all(run: Path) -> list[str]:
-    """Read a run folder in every way that a command does, and return the messages; nothing else may be raised."""
-    found = []
-    job = Job(CONFIG, run, {}, {}, False, "run")
-    readers = (
-        lambda: resumable_config(run),
-        lambda: open_run(run),
-        lambda: read_records(run / "metrics.jsonl"),
-        lambda: add_provenance(run),
-        job.difference,
-        job.step,
-        job.is_complete,
-    )
-    for reader in readers:
+def messages_of(run: Path, file: str) -> list[str]:
+    """Read a file in every way that a command does, and return the messages; nothing else may be raised."""
+    job, found = Job(CONFIG, run, {}, {}, False, "run"), []
+    readers = {
+        "config.json": (lambda: resumable_config(run), job.difference, job.is_complete),
+        "metrics.jsonl": (lambda: RecordWriter(run, 2).__exit__(None, None, None), job.step),
+        "provenance.json": (lambda: provenance.add_provenance(run), job.difference),
+        MANIFEST: (lambda: open_run(run), lambda: open_run(run, "last"), job.is_complete),
+    }
+    for reader in readers[file]:
         try:
             reader()
         except UserError as error:
@@ -105,18 +108,19 @@ def read_all(run: Path) -> list[str]:
     return found
 
 
-def test_a_whole_run_is_read_without_a_message(run):
-    assert read_all(run) == []
+def test_a_whole_run_is_read_without_a_message(whole, tmp_path):
+    run = Path(shutil.copytree(whole, tmp_path / "run"))
+    assert [message for file in FILES for message in messages_of(run, file)] == []
 
 
 @pytest.mark.parametrize("content", CONTENTS)
 @pytest.mark.parametrize("file", FILES)
 def test_damaged_files_of_a_run_are_named(run, file, content):
     damage(run / file, CONTENTS[content])
-    messages = read_all(run)
+    messages = messages_of(run, file)
     name = str(run / file).removesuffix("/manifest.json")
     assert all(name in message for message in messages), messages
-    if file in (FILES[0], FILES[-1]):
+    if file in ("config.json", MANIFEST):
         assert messages
 
 
@@ -140,19 +144,19 @@ def test_damaged_files_of_a_run_are_named(run, file, content):
         (lambda c: c.update(data=[]), "data cannot be"),
     ],
 )
-@pytest.mark.parametrize("file", ["config.json", FILES[-1]])
+@pytest.mark.parametrize("file", ["config.json", MANIFEST])
 def test_wrong_settings_of_a_run_are_named(run, file, change, words):
     content = json.loads((run / file).read_text())
     change(content if file == "config.json" else content["config"])
     (run / file).write_text(json.dumps(content))
-    messages = read_all(run)
+    messages = messages_of(run, file)
     assert any(words in message for message in messages), messages
 
 
 @pytest.mark.parametrize("entry", ["step", "config", "metrics", "progress", "files", "version"])
 @pytest.mark.parametrize("value", [None, [], "text"])
 def test_wrong_entries_of_a_manifest_are_named(run, entry, value):
-    path = run / FILES[-1]
+    path = run / MANIFEST
     path.write_text(json.dumps(json.loads(path.read_text()) | {entry: value}))
     with pytest.raises(UserError, match=f"{path.parent} is damaged .*{entry}"):
         open_run(run)
@@ -169,7 +173,7 @@ def test_wrong_progress_is_an_error_that_the_loop_names(change):
 
 
 def test_a_damaged_run_ends_the_command_with_a_message(run, capsys):
-    damage(run / FILES[-1], b"[]")
+    damage(run / MANIFEST, b"[]")
     assert main(["eval", str(run)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -237,7 +241,9 @@ class TensorstoreError(Exception):
         TensorstoreError("RESOURCE_EXHAUSTED: No space left on device\nmore"),
     ],
 )
-def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_ones(run, error, monkeypatch):
+def test_a_checkpoint_that_cannot_be_written_leaves_the_earlier_ones(whole, tmp_path, error, monkeypatch):
+    run = Path(shutil.copytree(whole, tmp_path / "run"))
+
     class Full:
         def __enter__(self):
             raise error

@@ -19,6 +19,14 @@ from tflane_jax.datasets.cache_entries import cache_entries, delete_entry
 from tflane_jax.errors import UserError
 
 
+@pytest.fixture(scope="module", autouse=True)
+def digest():
+    """Nothing here depends on the code of the world, whose digest takes a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "source_digest", lambda: "")
+        yield
+
+
 @pytest.fixture(scope="module")
 def entry(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("cache")

@@ -12,6 +12,7 @@ from tests.shared import ROOT
 # From the ground up. A file imports from its own package and from the lines above its own, never from its own line.
 FLOORS = (
     "errors",
+    "limits",
     "config_io config_files migrations processes",
     "devices",
     "geometry",
@@ -39,6 +40,7 @@ FLOORS = (
     "tasks",
     "convert",
     "config",
+    "run_checks",
     "runs",
     "summary export",
     "ablations",

@@ -20,6 +20,7 @@ from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
+from tflane_jax.run_checks import check_run
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 GOLDEN = Path(__file__).parent / "golden_configs"
@@ -52,10 +53,13 @@ def test_shipped_configurations_have_not_changed_silently(name, reference, monke
 
 
 @pytest.mark.parametrize("reference", [reference for reference in shipped().values() if reference])
-def test_checkpoints_are_rated_by_a_score_that_the_evaluation_computes(reference, monkeypatch):
+def test_shipped_configurations_keep_their_limits(reference, monkeypatch):
+    """Types and ranges, data against model, names of scores; files are not looked for."""
     monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(Path, "exists", lambda path: True)
     config = load_config(reference)
-    assert config.training.best_metric in config.task.score_names(config.data, config.evaluation)
+    if reference != "configs/camera/native_ring.py":  # data to export, which fit no small model
+        check_run(config)
 
 
 def test_every_golden_text_has_its_configuration():

@@ -64,12 +64,12 @@ def test_the_current_form_of_a_configuration_is_itself(config):
     [
         (
             {"training": {"best_metric": "all/DET_1"}},
-            r"training\.best_metric is all/DET_1, .*choose one of .*all/DET_l,",
+            r"training\.best_metric is 'all/DET_1': .*choose one of .*all/DET_l,",
         ),
-        ({"training": {"best_metric": "all/OLS"}}, r"training\.best_metric is all/OLS"),
+        ({"training": {"best_metric": "all/OLS"}}, r"training\.best_metric is 'all/OLS'"),
         (
             {"optim": {"restarts": RestartsConfig(adaptive=AdaptiveConfig(metric="loss"))}},
-            r"optim\.restarts\.adaptive\.metric is loss",
+            r"optim\.restarts\.adaptive\.metric is 'loss'",
         ),
     ],
 )

@@ -48,6 +48,7 @@ def build_parser() -> argparse.ArgumentParser:
     models.convert(commands)
     models.export(commands)
     data.data(commands)
+    data.cache(commands)
     models.summary(commands)
     comparisons.compare(commands)
     comparisons.tables(commands)

@@ -5,6 +5,7 @@ A config file is Python with `get_config() -> RunConfig` and optionally `ablatio
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import difflib
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from tflane_jax.config_files import find_config, split_reference
-from tflane_jax.config_io import choices, settings, with_setting
+from tflane_jax.config_io import choices, part_classes, settings, with_setting
 from tflane_jax.datasets.argoverse2 import LogData
 from tflane_jax.datasets.front_views import FrontViewData
 from tflane_jax.datasets.nuscenes import NuScenesData
@@ -31,10 +32,11 @@ from tflane_jax.datasets.sources import data_classes
 from tflane_jax.datasets.tusimple import TuSimpleData
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.limits import Rules, SettingError, check_settings
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
-from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.training.schedule import OptimConfig, warmup_fits
 
 if TYPE_CHECKING:
     from tflane_jax.datasets.data_source import SplitData as Data
@@ -82,26 +84,35 @@ class RunConfig:
     evaluation: EvaluationConfig = EvaluationConfig()
     weights: Path | None = None
 
+    def limits(self) -> Rules:
+        """The warm-up ends before the run does."""
+        yield warmup_fits(self.optim, self.training.steps)
+
 
 def load_config(reference: str) -> RunConfig:
     """Return a configuration: `path.py`, a shipped one (`tf_lane/toponet_tfm`), or an ablation of either (`...:name`).
 
     Raises:
-        UserError: no such file, name, function or ablation, or an exception inside the file (named with its line).
+        UserError: no such file, name, function or ablation, an exception inside the file, or a setting that breaks a
+            limit (both named with the line).
     """
     name, ablation = split_reference(reference)
     if not ablation:
-        return _called(find_config(name), "get_config", RunConfig)
+        return _checked(find_config(name), _called(find_config(name), "get_config", RunConfig))
     ablations = load_ablations(name)
     if ablation not in ablations:
         close = difflib.get_close_matches(ablation, ablations, 3)
-        hint = f"; did you mean {' or '.join(close)}?" if close else ""
-        raise UserError(f"config file {name} has no ablation {ablation}, only {', '.join(ablations)}{hint}")
-    return ablations[ablation]
+        raise UserError(
+            f"config file {name} has no ablation {ablation}, only {', '.join(ablations)}{_did_you_mean(close)}"
+        )
+    return _checked(find_config(name), ablations[ablation])
 
 
 def load_ablations(name: str) -> dict[str, RunConfig]:
-    """Return the ablations of a config file or shipped configuration; raises UserError like `load_config`."""
+    """Return the ablations of a config file or shipped configuration; raises UserError where it has none.
+
+    Their settings are not checked; `load_config` does that for one of them.
+    """
     return _called(find_config(name), "ablations", dict)
 
 
@@ -137,7 +148,31 @@ def _named_errors(path: Path):
     except Exception as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else "?"
-        raise UserError(f"config file {path}, line {line}: {type(error).__name__}: {error}") from error
+        if (
+            unknown := re.search(r"(\w+)\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(error))
+        ) is None:
+            raise UserError(f"config file {path}, line {line}: {type(error).__name__}: {error}") from error
+        kind, name = unknown.groups()
+        known = [field.name for field in dataclasses.fields(part_classes(RunConfig).get(kind, RunConfig))]
+        hint = _did_you_mean(difflib.get_close_matches(name, known, 3, 0.5))
+        raise UserError(f"config file {path}, line {line}: {kind} has no setting {name}{hint}") from error
+
+
+def _checked(path: Path, config: RunConfig) -> RunConfig:
+    """Return the configuration that a file gave; raise UserError, with file and line, if it breaks a limit."""
+    try:
+        check_settings(config)
+    except SettingError as error:
+        raise UserError(f"config file {path}{_lines_of(path, error)}: {error}") from error
+    return config
+
+
+def _lines_of(path: Path, error: SettingError) -> str:
+    """Return where a file gives a setting its value, in words; "" where it does so in no way that can be read."""
+    name = re.sub(r"\[\d+\]$", "", error.setting).rpartition(".")[2]
+    given = [k for k in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(k, ast.keyword) and k.arg == name]
+    written = [k for k in given if ast.unparse(k.value) == repr(error.value)] or given
+    return f", line {' or '.join(str(k.lineno) for k in written)}" if written else ""
 
 
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
@@ -147,7 +182,8 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
 
     Raises:
-        UserError: an unknown setting (with the names closest to it), or a value of the wrong type.
+        UserError: an unknown setting (with the names closest to it), a value of the wrong type, or one that breaks a
+            limit.
     """
     if not arguments:
         return config
@@ -158,9 +194,11 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     output = io.StringIO()
     try:
         with contextlib.redirect_stderr(output), contextlib.redirect_stdout(output):
-            return tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
+            changed = tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
         raise UserError(_without_boxes(output.getvalue())) from error
+    check_settings(changed, "--")
+    return changed
 
 
 def override_names(config: RunConfig) -> list[str]:
@@ -202,6 +240,10 @@ def _check_names(config: RunConfig, arguments: Sequence[str]) -> None:
             close = _closest(name, known)
             hint = f"did you mean {' or '.join(f'--{c}' for c in close)}?" if close else "see --help for all settings"
             raise UserError(f"unknown setting --{name}: {hint}")
+
+
+def _did_you_mean(close: Sequence[str]) -> str:
+    return f"; did you mean {' or '.join(close)}?" if close else ""
 
 
 def _closest(name: str, known: list[str]) -> list[str]:

@@ -7,6 +7,7 @@ Configurations of older versions go through `migrations.migrate` first.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import enum
 import importlib
 import json
@@ -84,6 +85,20 @@ def subclasses(kind: type) -> dict[str, type]:
     return found
 
 
+def part_classes(kind: type) -> dict[str, type]:
+    """Return the classes of all configurations that one of class `kind` can hold, at any depth, by name."""
+    found: dict[str, type] = {}
+    waiting: list[Any] = [kind]
+    while waiting:
+        hint = waiting.pop()
+        waiting += typing.get_args(hint)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint) and hint.__name__ not in found:
+            found[hint.__name__] = hint
+            waiting += typing.get_type_hints(hint).values()
+            waiting += subclasses(hint).values() if getattr(hint, "open_base", False) else ()
+    return found
+
+
 def added_settings(before: dict[str, Any], after: dict[str, Any], prefix: str = "") -> list[str]:
     """Return a line for each setting that only the second of two configurations (JSON) has, with its value there.
 
@@ -117,16 +132,25 @@ def _shown(value: Any) -> str:
 
 def _dataclass(kind: Any, content: Any, path: str) -> Any:
     if isinstance(content, dict) and getattr(kind, "open_base", False):
-        kind = subclasses(kind).get(content.get("class", ""), kind)
+        kind = subclasses(kind).get(str(content.get("class", "")), kind)
     if not isinstance(content, dict) or content.get("class") != kind.__name__:
         raise UserError(f"setting {path or 'at the top'} should be a {kind.__name__}, not {content!r:.80}")
     hints = typing.get_type_hints(kind)
     names = {field.name for field in dataclasses.fields(kind)}
     unknown = sorted(content.keys() - names - {"class"})
     if unknown:
-        raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax")
+        close = difflib.get_close_matches(unknown[0], names, 3)
+        hint = f"; did you mean {' or '.join(path + name for name in close)}?" if close else ""
+        raise UserError(f"setting {path}{unknown[0]} is unknown to this version of tflane_jax{hint}")
     values = {name: _value(hints[name], content[name], path + name) for name in names & content.keys()}
+    missing = [f.name for f in dataclasses.fields(kind) if f.name not in values and _is_required(f)]
+    if missing:
+        raise UserError(f"setting {path}{missing[0]} is missing")
     return kind(**values)
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
 def _value(hint: Any, content: Any, path: str) -> Any:

@@ -35,7 +35,10 @@ def migrate(content: Json, migrations: Sequence[Migration] | None = None) -> tup
     """
     notices: list[str] = []
     for migration in MIGRATIONS if migrations is None else migrations:
-        content, more = migration(content)
+        try:
+            content, more = migration(content)
+        except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
+            raise UserError(f"the saved configuration is damaged ({type(error).__name__}: {error})") from error
         notices += more
     return content, notices
 

@@ -23,10 +23,13 @@ from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import from_first
+from tflane_jax.run_checks import check_run
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
+from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
@@ -59,7 +62,9 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     """
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
     task = config.task
-    _check_metrics(config)
+    check_run(config)
+    if config.training.init_from is not None and start != "resume":
+        check_origins(config.training.init_from, config.training.seeds)
     data: Any = task.load(config.data.source("train"), progress=progress)
     task.check(config.data, data)
     arrays = task.examples(data)
@@ -83,19 +88,6 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         draw=_drawing(config),
         progress=progress,
     )
-
-
-def _check_metrics(config: RunConfig) -> None:
-    """Raise UserError if a setting names a score that the evaluation does not compute."""
-    known = config.task.score_names(config.data, config.evaluation)
-    adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
-    named = {"training.best_metric": config.training.best_metric}
-    if adaptive is not None:
-        named["optim.restarts.adaptive.metric"] = adaptive.metric
-    for setting, name in named.items():
-        if name not in known:
-            listed = ", ".join(sorted(score for score in known if "@" not in score))
-            raise UserError(f"{setting} is {name}, which the evaluation does not compute: choose one of {listed}")
 
 
 def build_data(source: Any) -> None:
@@ -127,7 +119,18 @@ def _loaded(data: _TestData) -> Any:
 
 def resumable_config(folder: Path) -> RunConfig:
     """Return the configuration that a run was started with; raises UserError if the folder holds no run."""
-    return from_json(RunConfig, migrate(read_config(folder))[0])
+    return _read_config(folder / "config.json", read_config(folder))[0]
+
+
+def _read_config(path: Path, saved: dict[str, Any]) -> tuple[RunConfig, list[str]]:
+    """Return a saved configuration (JSON) and notices of its migration; raises UserError that names the file."""
+    try:
+        migrated, notices = migrate(saved)
+        config = from_json(RunConfig, migrated)
+        check_settings(config)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    return config, notices
 
 
 def current_form(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -151,15 +154,18 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: the checkpoint is missing, damaged, or of an unreadable version.
     """
     plain = Checkpoints(folder / "checkpoints")
-    migrated, notices = migrate(plain.manifest(plain.find("last")).config)
+    step = plain.find("last")
+    config, notices = _read_config(plain.path(step) / "manifest.json", plain.manifest(step).config)
     for notice in notices:
         print(notice, file=sys.stderr)
-    config = from_json(RunConfig, migrated)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
     if which is None:
         which = "last" if checkpoints.best_step() is None else "best"
     step = checkpoints.find(which)
-    params = per_seed(checkpoints.params(step), config.training.seeds)
+    averaged, seeds = checkpoints.params(step), config.training.seeds
+    if len(seeds) > 1 and any(leaf.shape[:1] != (len(seeds),) for leaf in jax.tree.leaves(averaged)):
+        raise UserError(f"{checkpoints.path(step)} has not the parameters of {len(seeds)} seeds (training.seeds)")
+    params = per_seed(averaged, seeds)
     return Run(str(folder), config, step, tuple(params))
 
 

@@ -72,7 +72,7 @@ def test_rows_summarise_the_sightings():
     ],
 )
 def test_invalid_configs_are_refused(config):
-    with pytest.raises(UserError, match="markers are measured"):
+    with pytest.raises(UserError, match=r"CurveConfig\.\w+ is"):
         measure([config])
 
 

@@ -12,13 +12,15 @@ from jax import lax
 
 from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
 from tests.parameters import random_params
-from tflane_jax.config import RunConfig
+from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.models.parameters import split_statistics
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import TrafficFlow, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 TASKS = {
     "toponet": LaneGraphTask(CAMERA_TOPONET),
@@ -213,11 +215,11 @@ def test_mismatched_parts_are_errors():
     task, key = TASKS["toponet"], jax.random.key(0)
     with pytest.raises(UserError, match="choose data with cameras"):
         jax.eval_shape(task.init, key, make_example())
-    with pytest.raises(UserError, match="give the model an encoder of cameras"):
+    with pytest.raises(UserError, match="None without an encoder of cameras"):
         TopoNetConfig(elements=CAMERA_TOPONET.elements).build()
-    with pytest.raises(UserError, match=r"have 3 and 2: set elements\.layers"):
+    with pytest.raises(UserError, match=r"elements\.layers is 3: it must be decoder\.layers \(2\)"):
         dataclasses.replace(CAMERA_TOPONET, elements=dataclasses.replace(CAMERA_TOPONET.elements, layers=3)).build()
-    with pytest.raises(UserError, match='refine to "fixed"'):
+    with pytest.raises(UserError, match=r"decoder\.refine is 'iterative': it must be fixed"):
         dataclasses.replace(CAMERA_DETR, decoder=dataclasses.replace(CAMERA_DETR.decoder, refine="iterative")).build()
     unlabelled = batch_of(make_camera_example().replace(traffic_elements=None))
     with pytest.raises(UserError, match=r"set task\.model\.elements to None"):
@@ -226,7 +228,7 @@ def test_mismatched_parts_are_errors():
 
 def test_a_camera_that_sees_too_many_cells_is_named_before_training():
     examples = stack_examples([make_camera_example()])
-    config = RunConfig(task=TASKS["toponet"])
+    config = RunConfig(task=TASKS["toponet"], data=WorldData(example=ExampleConfig(cameras=CameraRigConfig())))
     encoder = CAMERA_TOPONET.encoder
     tight = dataclasses.replace(encoder, bev=dataclasses.replace(encoder.bev, capacity=1))
     task = dataclasses.replace(config.task, model=dataclasses.replace(CAMERA_TOPONET, encoder=tight))

@@ -105,12 +105,15 @@ def test_boundaries_of_the_small_form_start_beside_the_lane_and_end_at_the_borde
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"decoder": replace(SEGMENTS.decoder, heads=3)}, "heads even"),
+        ({"decoder": replace(SEGMENTS.decoder, heads=1)}, r"decoder\.heads is 1: it must be even"),
         ({"decoder": replace(SEGMENTS.decoder, sampling_points=12)}, "multiple of 8"),
         ({"elements": ELEMENTS}, "encoder of cameras"),
-        ({"encoder": CAMERA, "elements": replace(ELEMENTS, layers=3)}, "elements.layers and decoder.layers"),
-        ({"areas": AreaDecoderConfig()}, "decoder.classes to 1"),
-        ({"decoder": replace(SEGMENTS.decoder, classes=1)}, "to 2 without"),
+        (
+            {"encoder": CAMERA, "elements": replace(ELEMENTS, layers=3)},
+            r"elements\.layers is 3: .*decoder\.layers",
+        ),
+        ({"areas": AreaDecoderConfig()}, r"decoder\.classes is 2: it must be 1 with areas"),
+        ({"decoder": replace(SEGMENTS.decoder, classes=1)}, "2 without"),
     ],
 )
 def test_sizes_that_do_not_fit_are_named(change, message):

@@ -115,7 +115,7 @@ def test_traffic_respects_the_hosts_own_groups_of_queries():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"denoising": DenoisingConfig()}, "anchors to spread"),
+        ({"denoising": DenoisingConfig()}, "decoder.anchors spread"),
         ({"encoder": replace(LINES.encoder, cells=True)}, "cells learn directed lanes"),
         ({"encoder": replace(CAMERA, cells=False), "elements": ELEMENTS}, "no traffic elements"),
     ],

@@ -86,7 +86,7 @@ def test_it_trains_and_all_its_parameters_learn(params):
 
 
 def test_parts_that_do_not_fit_are_named():
-    with pytest.raises(UserError, match="choose one of"):
+    with pytest.raises(UserError, match=r"many is \d+: it must be 0 with denoising"):
         replace(MODEL, denoising=DenoisingConfig()).build()
 
 

@@ -13,8 +13,9 @@ import pytest
 from tests.training.stub_run import CONFIG, OPTIM, run, score
 from tests.training.test_loop import arrays, timeless
 from tflane_jax.errors import UserError
+from tflane_jax.limits import check_settings
 from tflane_jax.plots.curves import curves
-from tflane_jax.training.adaptive import AdaptiveConfig, Memory, check_adaptive, judge
+from tflane_jax.training.adaptive import AdaptiveConfig, Memory, judge
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.restarts import RestartsConfig
 
@@ -100,9 +101,9 @@ def test_no_restart_near_the_end_of_the_run(left, verdict):
     ],
 )
 def test_invalid_settings_are_named(change):
-    check_adaptive(RULE)
+    check_settings(RULE, "adaptive.")
     with pytest.raises(UserError, match=rf"adaptive\.{next(iter(change))} is"):
-        check_adaptive(dataclasses.replace(RULE, **change))
+        check_settings(dataclasses.replace(RULE, **change), "adaptive.")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

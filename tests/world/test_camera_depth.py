@@ -11,6 +11,7 @@ from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
 from tflane_jax.datasets.procedural import ProceduralDataset, WorldData
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.cameras import ground_points
+from tflane_jax.limits import check_settings
 from tflane_jax.world.cameras.depth import render_depth
 from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.cameras.solids import pack
@@ -101,5 +102,5 @@ def test_a_finer_grid_has_the_same_nearest_surfaces():
 
 
 def test_cells_without_pixels_are_refused():
-    with pytest.raises(UserError, match="depth_cell must be at least 1"):
-        CameraRigConfig(depth_cell=0).validate()
+    with pytest.raises(UserError, match="depth_cell is 0: it must be a whole number of at least 1 or None"):
+        check_settings(CameraRigConfig(depth_cell=0))

@@ -6,8 +6,7 @@ existed already says so in its report.
 
 from __future__ import annotations
 
-import contextlib
-import json
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
+from tflane_jax.files.fields import load_json
 from tflane_jax.training.provenance import provenance
 
 FILE = "declaration.json"
@@ -128,8 +128,8 @@ def declare(declaration: Declaration, plan: Mapping[str, Sequence[Job]], seeds: 
     claims = [asdict(claim) for claim in declaration.claims]
     path, wanted = out / FILE, asdict(declaration) | {"claims": claims, "models": list(plan)}
     found: dict[str, Any] = {}
-    with contextlib.suppress(FileNotFoundError):
-        found = _current_form(json.loads(path.read_text(encoding="utf-8")))
+    if path.exists():
+        found = _read(path)
     if not found:
         source = provenance()
         begun = sum(job.start() == "resume" for planned in plan.values() for job in planned)
@@ -143,6 +143,20 @@ def declare(declaration: Declaration, plan: Mapping[str, Sequence[Job]], seeds: 
     if difference:
         raise UserError(f"{path} holds another declaration ({difference}): choose another folder with --out")
     return declared
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the content of a declaration file; raises UserError that names it where something is missing."""
+    remedy = "restore it, or choose another folder with --out"
+    try:
+        found = _current_form(dict(load_json(path)))
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path} is damaged: it holds no declaration; {remedy}") from error
+    names = [field.name for field in dataclasses.fields(Declaration)]
+    kinds = {"seeds": list, "time": str, "begun": int, "models": list} | dict.fromkeys(names, object)
+    if wrong := [name for name, kind in kinds.items() if name not in found or not isinstance(found[name], kind)]:
+        raise UserError(f"{path} is damaged ({wrong[0]}); {remedy}")
+    return found
 
 
 def _current_form(found: dict[str, Any]) -> dict[str, Any]:

@@ -108,7 +108,7 @@ class Job:
 
     def step(self) -> int:
         """Return the last step in the run's records, 0 without records; for progress bars."""
-        with contextlib.suppress(FileNotFoundError, IndexError, ValueError):
+        with contextlib.suppress(OSError, IndexError, ValueError, KeyError, TypeError, RecursionError):
             lines = (self.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
             return min(int(json.loads(lines[-1])["step"]), self.config.training.steps)
         return 0

@@ -11,6 +11,7 @@ from typing import Any
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
+from tflane_jax.files.fields import load_json, member
 from tflane_jax.plots.tables import format_table
 
 _WIDTH = 120
@@ -25,16 +26,16 @@ def record(summaries: Sequence[Path], folder: Path) -> Path:
         UserError: a summary is of a quick run.
     """
     for path in summaries:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["quick"]:
+        content = load_json(path)
+        if member(content, "quick", str(path)):
             raise UserError(f"{path} is of a quick run, which is a smoke test and no result")
-        write_text(folder / f"{content['table']}.json", json.dumps(content, indent=1) + "\n")
+        write_text(folder / f"{member(content, 'table', str(path))}.json", json.dumps(content, indent=1) + "\n")
     return write_text(folder.with_name(f"{folder.name}.md"), page(folder))
 
 
 def page(folder: Path) -> str:
     """Return the page of a folder of summaries, in the order of the tables."""
-    found = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")}
+    found = {path.stem: load_json(path) for path in folder.glob("*.json")}
     lines = [
         "# Results",
         "",

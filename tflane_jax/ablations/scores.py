@@ -158,11 +158,26 @@ def _mark(**parts: Any) -> str:
 
 def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a file of scores that are complete."""
-    with contextlib.suppress(FileNotFoundError, ValueError):
+    with contextlib.suppress(OSError, ValueError, RecursionError):
         content = json.loads(path.read_text(encoding="utf-8"))
         for mark, entry in content.items() if isinstance(content, dict) else ():
-            if isinstance(entry, dict) and entry.keys() >= {"code", "step", "protocol", "ways", "ratios"}:
+            if _is_entry(entry):
                 yield mark, entry
+
+
+def _is_entry(entry: Any) -> bool:
+    """Return whether an entry of a file of scores is one that `measure` wrote; others are measured again."""
+    kinds = {"code": str, "step": int, "protocol": str, "ways": dict, "ratios": dict}
+    if not isinstance(entry, dict) or not all(isinstance(entry.get(name), kind) for name, kind in kinds.items()):
+        return False
+    numbers = [value for scores in entry["ways"].values() for value in _values(scores)]
+    counts = [pair for of_way in entry["ratios"].values() for pair in _values(of_way)]
+    paired = [isinstance(pair, list) and [type(half) for half in pair] == [list, list] for pair in counts]
+    return "" in entry["ways"] and all(type(value) in (int, float) for value in numbers) and all(paired)
+
+
+def _values(mapping: Any) -> list[Any]:
+    return list(mapping.values()) if isinstance(mapping, dict) else [None]
 
 
 @functools.cache

@@ -22,6 +22,7 @@ from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.errors import UserError
+from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
 from tflane_jax.training.provenance import thread_setting
 from tflane_jax.training.runtime import configure_jax
@@ -134,7 +135,12 @@ def _running(workers: Sequence[Worker], queue: Queue) -> str:
 
 
 def _build(job: Job, built: set[Any]) -> None:
-    """Make the data that a job needs, with all cores, unless an earlier job needed them too."""
+    """Make the data that a job needs, with all cores, unless an earlier job needed them too.
+
+    Raises UserError before that for a run that must fail.
+    """
+    if not job.is_complete():
+        check_run(job.config)
     for split in ("train", "val", "test"):
         if (source := job.config.data.source(split)) not in built:
             build_data(source)

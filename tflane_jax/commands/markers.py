@@ -24,6 +24,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.images import list_photos, opencv, read_image, undistorted
 from tflane_jax.geometry.cameras import project
+from tflane_jax.limits import check_settings
 from tflane_jax.markers.curves import CurveConfig, measure, summarise
 from tflane_jax.markers.detection import DetectedMarkers, detect
 from tflane_jax.markers.image_search import DetectorConfig
@@ -48,7 +49,7 @@ def find(options: argparse.Namespace) -> int:
         enlarge=options.enlarge,
         search=options.search,
     )
-    config.validate()
+    check_settings(config, "DetectorConfig.")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)
     rows, records = [], []

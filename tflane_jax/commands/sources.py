@@ -12,13 +12,12 @@ from tflane_jax.datasets.base import Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.sources import SOURCES, named_source, source_names, source_of
 from tflane_jax.errors import UserError
+from tflane_jax.run_checks import KINDS, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.traffic import limit_instances
-
-_KINDS = {Example: "lane graphs", RoadImage: "images"}
 
 
 def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
@@ -85,10 +84,7 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     assert split is not None
     configured = config.data.source(split)
     kind = RoadImage if isinstance(config.task, LaneShapeTask) else Example
-    if source_of(configured).example is not kind:
-        raise UserError(
-            f"this configuration's data are {_KINDS[source_of(configured).example]}, but its task takes {_KINDS[kind]}"
-        )
+    check_kind(config)
     if options.data is None and options.root is None:
         return configured
     source = source_of(configured) if options.data is None else named_source(options.data)
@@ -102,7 +98,7 @@ def _check_choice(source: DataSource[Any], kind: type[Any], options: argparse.Na
     if source.example is not kind:
         names = source_names(kind)
         raise UserError(
-            f"--data {source.name} are no {_KINDS[kind]}: this model takes {', '.join(names[:-1])} or {names[-1]}"
+            f"--data {source.name} are no {KINDS[kind]}: this model takes {', '.join(names[:-1])} or {names[-1]}"
         )
     if options.data is None and source.root is None:
         rooted = [f"--data {one.name}" for one in SOURCES if one.root is not None and one.example is kind]

@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.files.images import opencv
+from tflane_jax.limits import Factor, Fraction, PositiveOrZero, within
 from tflane_jax.scene import LaneLines, RoadImage
 
 Seed = int | Sequence[int]
@@ -47,14 +49,14 @@ class AugmentationConfig:
         lighting: standard deviation of the change along the principal components of colour.
     """
 
-    geometry: float = 10 / 11
-    rotation: float = math.radians(10.0)
-    flip: float = 0.5
-    crop: float = 0.9
-    brightness: float = 0.4
-    contrast: float = 0.4
-    saturation: float = 0.4
-    lighting: float = 0.1
+    geometry: Fraction = 10 / 11
+    rotation: Annotated[float, within(0, math.pi)] = math.radians(10.0)
+    flip: Fraction = 0.5
+    crop: Factor = 0.9
+    brightness: Fraction = 0.4
+    contrast: Fraction = 0.4
+    saturation: Fraction = 0.4
+    lighting: PositiveOrZero = 0.1
 
 
 def augment(example: RoadImage, config: AugmentationConfig, seed: Seed) -> RoadImage:

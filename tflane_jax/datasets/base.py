@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.limits import Count, Positive, at_least
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.scene import Example, RoadImage
@@ -61,17 +62,17 @@ class ExampleConfig:
     sensor: BevSensorConfig | None = BevSensorConfig()
     cameras: CameraRigConfig | None = None
     markers: MarkerConfig | None = None
-    lanes: int = 48
-    lane_points: int = 11
-    segments: int = 96
-    segment_points: int = 10
-    areas: int = 32
-    area_points: int = 20
+    lanes: Count = 48
+    lane_points: Annotated[int, at_least(2)] = 11
+    segments: Count = 96
+    segment_points: Annotated[int, at_least(2)] = 10
+    areas: Count = 32
+    area_points: Annotated[int, at_least(2)] = 20
     crossings: Literal["ring", "sides"] = "ring"
-    history: int = 20
-    history_hz: float | None = None
-    tracks: int = 96
-    elements: int = 24
+    history: Count = 20
+    history_hz: Positive | None = None
+    tracks: Count = 96
+    elements: Count = 24
     elements_of: Literal["centerlines", "segments"] = "centerlines"
     bike_lanes: Literal["include", "exclude"] = "include"
     sd_map: SdMapConfig | None = None

@@ -13,6 +13,7 @@ import errno
 import functools
 import hashlib
 import json
+import multiprocessing
 import os
 import shutil
 import sys
@@ -20,7 +21,7 @@ import tempfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -29,10 +30,23 @@ from tflane_jax.datasets.base import FrameInfo, IndexedExamples
 from tflane_jax.datasets.leaves import example_from_leaves
 from tflane_jax.datasets.parallel import fill, frame_leaves, leaf_path
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import rename_flushed
 from tflane_jax.scene import Example
+
+# Errors of a folder that cannot be a cache.
+_UNUSABLE = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG),
+    *(errno.ELOOP, errno.EIO, errno.ESTALE),
+)
 
 # Packages whose code determines the examples.
 _SOURCES = ("scene", "geometry", "world", "markers", "datasets")
+
+
+_UNGUARDED = (
+    'a script builds a dataset outside `if __name__ == "__main__":`, and worker processes import the script: put what '
+    "it does below that line"
+)
 
 
 class Cacheable(IndexedExamples, Protocol):
@@ -46,7 +60,14 @@ class Cacheable(IndexedExamples, Protocol):
 
 def cache_root() -> Path:
     """Return the folder of all entries: $TFLANE_CACHE, or ~/.cache/tflane_jax."""
-    return Path(os.environ.get("TFLANE_CACHE") or Path.home() / ".cache" / "tflane_jax").expanduser()
+    named = os.environ.get("TFLANE_CACHE")
+    try:
+        root = Path(named).expanduser() if named else Path.home() / ".cache" / "tflane_jax"
+    except RuntimeError as error:  # ~user without such a user, or no home folder
+        raise UserError(f"TFLANE_CACHE is {named or 'not set'}: {error}; set it to a folder") from error
+    if named and root.exists() and not root.is_dir():
+        raise UserError(f"TFLANE_CACHE is {named}, which is no folder: set it to one")
+    return root
 
 
 def cached(
@@ -66,6 +87,9 @@ def cached(
     """
     if len(dataset) == 0:
         raise UserError(f"dataset {dataset.name} has no examples: ask for at least one scene")
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        # A worker that imports the script again: it would wait for the lock of the builder that waits for it.
+        raise SystemExit(_UNGUARDED)
     root = cache_root() if root is None else root
     mark = fingerprint(dataset)
     folder = root / f"{dataset.name.replace('/', '-')}-{mark[:16]}"
@@ -137,7 +161,9 @@ class CachedDataset:
             self.config_text: str = self._index["config"]
             self._scenes: list[str] = self._index["scenes"]
             self._arrays = {name: self._map(name) for name in self._index["leaves"]}
-        except (OSError, ValueError, KeyError, EOFError) as error:
+            if not _is_whole(self._index, self._arrays):
+                raise ValueError("index.json is not what was written")
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, RecursionError) as error:
             raise DamagedEntry(f"{folder}: {error}") from error
 
     def _map(self, name: str) -> np.ndarray:
@@ -187,6 +213,15 @@ class CachedDataset:
         return {name: array for name, array in self._arrays.items() if not name.startswith("info.")}
 
 
+def _is_whole(index: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bool:
+    """Return whether an index has entries of the right types, and arrays as many examples as it names."""
+    scenes, sums = index["scenes"], [leaf["crc32"] for leaf in index["leaves"].values()]
+    texts = [index["name"], index["config"], index["source"], *scenes]
+    lengths = {len(array) for array in (*arrays.values(), arrays["info.timestamp_ns"], arrays["info.global_from_ego"])}
+    typed = isinstance(scenes, list) and all(isinstance(text, str) for text in texts)
+    return typed and lengths == {len(scenes)} and all(type(one) is int for one in sums)
+
+
 def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: bool) -> None:
     """Build the entry beside its final path and rename it."""
     # The lock makes this the only builder, so any such folder was left behind by a killed build.
@@ -209,9 +244,11 @@ def _build(dataset: Cacheable, folder: Path, mark: str, workers: int, progress: 
             "scenes": scenes,
         }
         (temporary / "index.json").write_text(json.dumps(index, indent=1), encoding="utf-8")
-        if folder.exists():  # damaged
+        if folder.is_dir():  # damaged
             shutil.rmtree(folder)
-        temporary.rename(folder)
+        else:
+            folder.unlink(missing_ok=True)
+        rename_flushed(temporary, folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -244,7 +281,7 @@ def _explain(error: OSError, root: Path) -> Exception:
     """Return a UserError with a remedy for a failure to write below `root`; return any other error unchanged."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         remedy = "free space there, ask for fewer scenes, or set TFLANE_CACHE to a folder on another disk"
-    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR):
+    elif error.errno in _UNUSABLE:
         remedy = "set TFLANE_CACHE to a folder that can be written"
     else:
         return error

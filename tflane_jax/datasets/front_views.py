@@ -21,6 +21,7 @@ from tflane_jax.datasets.leaves import image_from_leaves
 from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
 from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.limits import Count
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 from tflane_jax.world.front_view.views import FrontWorldConfig, front_view
@@ -124,9 +125,9 @@ class FrontViewData:
         augmentation: of training images, or None.
     """
 
-    train: int = 4000
-    val: int = 100
-    test: int = 400
+    train: Count = 4000
+    val: Count = 100
+    test: Count = 400
     augmentation: AugmentationConfig | None = AugmentationConfig()
 
     def source(self, split: Split) -> FrontViewConfig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.limits import Count, at_least
 from tflane_jax.scene import LineClass, MapLines
 from tflane_jax.world.bev.line_of_sight import hidden_points
 
@@ -28,8 +29,8 @@ class MapLinesConfig:
             the lane graph inside the range.
     """
 
-    lines: int = 64
-    points: int = 20
+    lines: Count = 64
+    points: Annotated[int, at_least(2)] = 20
     centerlines: Literal["exclude", "include"] = "exclude"
 
 

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
 from tflane_jax.files.images import opencv
+from tflane_jax.limits import Fraction, Range, within
 from tflane_jax.scene import CameraViews, Example
 
 # Colour of a hidden square: the mean of ImageNet, which normalisation turns into zero as in the original.
@@ -37,14 +39,14 @@ class PhotometricConfig:
         grid_ratio: fraction of the period that stays visible in either direction.
     """
 
-    probability: float = 0.5
-    brightness: float = 32.0
-    contrast: tuple[float, float] = (0.5, 1.5)
-    saturation: tuple[float, float] = (0.5, 1.5)
-    hue: float = 18.0
-    swap: float = 0.5
-    grid_mask: float = 0.0
-    grid_ratio: float = 0.5
+    probability: Fraction = 0.5
+    brightness: Annotated[float, within(0, 255)] = 32.0
+    contrast: Range = (0.5, 1.5)
+    saturation: Range = (0.5, 1.5)
+    hue: Annotated[float, within(0, 360)] = 18.0
+    swap: Fraction = 0.5
+    grid_mask: Fraction = 0.0
+    grid_ratio: Fraction = 0.5
 
 
 LANESEGNET_PHOTOMETRIC = PhotometricConfig(grid_mask=0.7)

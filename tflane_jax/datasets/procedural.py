@@ -18,6 +18,7 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.limits import Count, Rules
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.bev.sensor import BevSensorConfig
@@ -125,6 +126,25 @@ def _simulated(scene_id: int, config: WorldConfig, history: int) -> Log:
     return simulate(scene_id, config, history)
 
 
+def scene_limits(world: WorldConfig, example: ExampleConfig, name: str) -> Rules:
+    """Yield the limits of key frames and histories in scenes of the built-in world.
+
+    Args:
+        world: of the scenes.
+        example: what examples hold of them.
+        name: of `world` in the data, with a dot behind.
+    """
+    ratio = 1.0 if example.history_hz is None else world.rate_hz / example.history_hz
+    stride = max(round(ratio), 1)
+    divides = abs(ratio - stride) <= 0.05 * stride
+    yield "example.history_hz", divides, f"{world.rate_hz:g} Hz ({name}rate_hz) divided by a whole number, or None"
+    history = HISTORY if example.history_hz is None else example.history * stride
+    most = max(world.frames - history, 0)
+    allowed = f"at most {most}: scenes of {world.duration_s:g} s ({name}duration_s) have {world.frames} frames, "
+    allowed += f"{history} of them before the first key frame (example.history, example.history_hz)"
+    yield f"{name}keyframes", world.keyframes <= most, allowed
+
+
 @dataclass(frozen=True)
 class WorldData:
     """The built-in world for training, validation and test.
@@ -135,11 +155,15 @@ class WorldData:
         example: what is in an example, and its capacities.
     """
 
-    train: int = 2000
-    val: int = 100
-    test: int = 200
+    train: Count = 2000
+    val: Count = 100
+    test: Count = 200
     world: WorldConfig = WorldConfig()
     example: ExampleConfig = ExampleConfig()
+
+    def limits(self) -> Rules:
+        """Scenes are long enough for their key frames."""
+        yield from scene_limits(self.world, self.example, "world.")
 
     def source(self, split: Split) -> ProceduralConfig:
         """Return the dataset of a split."""

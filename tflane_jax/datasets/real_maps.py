@@ -18,10 +18,11 @@ from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.overlap import Drive
-from tflane_jax.datasets.procedural import SimulatedDataset
+from tflane_jax.datasets.procedural import SimulatedDataset, scene_limits
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Count, Fraction, Rules
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.presets import CITY, REAL_MAPS
@@ -135,18 +136,24 @@ class RealMapData:
     """
 
     maps: Path = Path("data/maps")
-    train: int = 2000
-    val: int = 25
-    test: int = 100
+    train: Count = 2000
+    val: Count = 25
+    test: Count = 100
     val_logs: tuple[str, ...] = ()
     test_logs: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     test_on: Literal["maps", "recordings"] = "maps"
     test_traffic: str = ""
-    generated: float = 0.0
+    generated: Fraction = 0.0
     world: WorldConfig = REAL_MAPS
     generated_world: WorldConfig = CITY
     example: ExampleConfig = RECORDED_EXAMPLE
+
+    def limits(self) -> Rules:
+        """Scenes are long enough for their key frames."""
+        yield from scene_limits(self.world, self.example, "world.")
+        if self.generated > 0.0:
+            yield from scene_limits(self.generated_world, self.example, "generated_world.")
 
     def source(self, split: Split) -> RealMapConfig | RecordedConfig:
         """Return the dataset of a split."""

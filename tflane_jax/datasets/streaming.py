@@ -15,6 +15,7 @@ import numpy as np
 
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Count, CountOrZero
 
 # Draws in place of an example that is not wanted.
 _MOST_DRAWS = 1000
@@ -31,9 +32,9 @@ class StreamingConfig:
             does not). The caller's script must then be guarded by `if __name__ == "__main__":`.
     """
 
-    threads: int = 4
-    ahead: int = 16
-    processes: int = 0
+    threads: CountOrZero = 4
+    ahead: Count = 16
+    processes: CountOrZero = 0
 
 
 class Request(NamedTuple):

@@ -7,6 +7,7 @@ The presets are those of the published code: TopoNet (https://github.com/OpenDri
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -14,6 +15,7 @@ from jaxtyping import Float, UInt8
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry.cameras import crop_intrinsics, resize_intrinsics
+from tflane_jax.limits import INCREASING, Count, CountOrZero, Factor
 
 
 @dataclass(frozen=True)
@@ -27,10 +29,10 @@ class ImageConfig:
         divisor: width and height of the array that holds all images are multiples of it.
     """
 
-    front_rows: tuple[int, int] | None = None
-    front_size: tuple[int, int] | None = None
-    scale: float = 1.0
-    divisor: int = 32
+    front_rows: Annotated[tuple[CountOrZero, Count], INCREASING] | None = None
+    front_size: tuple[Count, Count] | None = None
+    scale: Factor = 1.0
+    divisor: Count = 32
 
 
 TOPONET_SUBSET_A = ImageConfig(front_rows=(356, 1906), scale=0.5)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.vector_map import Measure
 
@@ -32,12 +33,12 @@ class EvaluationConfig:
             optional AP by overlap as the group "lines IoU" (slow, needs shapely).
     """
 
-    batch_size: int = 16
-    pictures: int = 4
-    versions: tuple[Version, ...] = ("v2.1",)
+    batch_size: Count = 16
+    pictures: CountOrZero = 4
+    versions: Annotated[tuple[Version, ...], NOT_EMPTY, DIFFERENT] = ("v2.1",)
     traffic: Traffic = "own"
     topology: Topology = "learned"
-    map_measures: tuple[Measure, ...] = ("chamfer",)
+    map_measures: Annotated[tuple[Measure, ...], DIFFERENT] = ("chamfer",)
 
 
 @dataclass(frozen=True)

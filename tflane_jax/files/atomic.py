@@ -2,7 +2,8 @@
 
 The content is written under a hidden temporary name beside its destination and then renamed. A reader sees the old
 content or the new one, never a part. A killed process leaves the destination as it was, and at most a file or folder
-named `.<name>.<process>-<number>.tmp`. A power failure is not covered: nothing is flushed to the device.
+named `.<name>.<process>-<number>.tmp`. What was renamed survives a power failure: the content is flushed to the device
+before, the folder after.
 """
 
 from __future__ import annotations
@@ -49,10 +50,12 @@ def replacing(path: Path | str) -> Iterator[Path]:
         yield temporary
         if not os.path.lexists(temporary):
             raise ValueError(f"nothing was written to {temporary}, so {path} cannot be replaced")
+        flush(temporary)
         if temporary.is_dir() and path.is_dir():
             _replace_folder(temporary, path)
         else:
             os.replace(temporary, path)
+        _flush_one(path.parent)
     except OSError as error:
         raise UserError(_message(path, temporary, error)) from error
     finally:
@@ -87,6 +90,32 @@ def write_json(path: Path | str, content: Any, *, indent: int | None = 1, allow_
         TypeError, ValueError: `content` is not JSON. The file is then as it was.
     """
     return write_text(path, json.dumps(content, indent=indent, allow_nan=allow_nan) + "\n")
+
+
+def flush(path: Path) -> None:
+    """Return when a file, or a folder with all its content, is on the device; raises OSError like writing."""
+    for folder, _, names in os.walk(path):
+        for name in (*names, "."):
+            _flush_one(Path(folder) / name)
+    if not path.is_dir():
+        _flush_one(path)
+
+
+def rename_flushed(written: Path, path: Path) -> None:
+    """Rename a file or folder to a name that is free, so that a power failure leaves all of it or nothing there."""
+    flush(written)
+    written.rename(path)
+    _flush_one(path.parent)
+
+
+def _flush_one(path: Path) -> None:
+    if path.is_dir() and os.name != "posix":  # elsewhere, folders cannot be opened
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def check_writable(path: Path | str) -> None:

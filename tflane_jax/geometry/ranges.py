@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 
 from tflane_jax.geometry.namespace import ArrayT, namespace
+from tflane_jax.limits import Count, Interval
 
 
 @dataclass(frozen=True)
@@ -17,9 +18,9 @@ class PerceptionRange:
         x, y, z: (low, high) per axis.
     """
 
-    x: tuple[float, float] = (-50.0, 50.0)
-    y: tuple[float, float] = (-25.0, 25.0)
-    z: tuple[float, float] = (-2.3, 1.7)
+    x: Interval = (-50.0, 50.0)
+    y: Interval = (-25.0, 25.0)
+    z: Interval = (-2.3, 1.7)
 
     def low(self, dims: int = 3) -> tuple[float, ...]:
         """Return the lower corner of the first `dims` axes, metres."""
@@ -55,8 +56,8 @@ class BevGrid:
     """
 
     range: PerceptionRange = PerceptionRange((-51.2, 51.2), (-25.6, 25.6), (-2.3, 1.7))
-    rows: int = 100
-    columns: int = 200
+    rows: Count = 100
+    columns: Count = 200
 
     @property
     def cell(self) -> tuple[float, float]:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.pointwise import convolve
+from tflane_jax.limits import Count
 
 _INIT = nn.initializers.xavier_uniform()
 
@@ -25,8 +26,8 @@ class FeaturePyramidConfig:
         levels: levels out; those beyond the input's are convolutions of stride 2 on the coarsest output.
     """
 
-    dim: int = 256
-    levels: int = 4
+    dim: Count = 256
+    levels: Count = 4
 
 
 class FeaturePyramid(nn.Module):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
+from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Positive, Rules, splits
 
 Layout = Literal["blocks", "interleaved"]
 
@@ -55,15 +56,20 @@ class PolylineEncoderConfig:
         attend: what attends to each other: "lines" (SMERF), or the "points" of one line (marker fusion).
     """
 
-    dim: int = 256
-    layers: int = 6
-    heads: int = 4
-    hidden: int = 256
-    dropout: float = 0.1
-    bands: int = 16
-    temperature: float = 1000.0
+    dim: Count = 256
+    layers: CountOrZero = 6
+    heads: Count = 4
+    hidden: Count = 256
+    dropout: FractionBelowOne = 0.1
+    bands: CountOrZero = 16
+    temperature: Positive = 1000.0
     layout: Layout = "blocks"
     attend: Literal["lines", "points"] = "lines"
+
+    def limits(self) -> Rules:
+        """Channels split over heads, and every frequency has a sine and a cosine."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        yield "bands", self.bands % 2 == 0, "even: every frequency has a sine and a cosine"
 
 
 # Marker fusion, section IV-C.

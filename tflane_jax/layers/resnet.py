@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import flax.linen as nn
 import jax
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.pointwise import convolve
+from tflane_jax.limits import NOT_EMPTY, Count, Rules
 
 # PyTorch's default: uniform within 1 / sqrt(fan in).
 _INIT = nn.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
@@ -37,13 +38,19 @@ class ResNetConfig:
         frozen_norms: all norms are constant (fine-tuning from ImageNet with few images per step).
     """
 
-    blocks: tuple[int, ...] = (1, 2, 2, 2)
-    channels: tuple[int, ...] = (16, 32, 64, 128)
-    strides: tuple[int, ...] = (1, 2, 2, 2)
-    stem_channels: int = 16
+    blocks: Annotated[tuple[Count, ...], NOT_EMPTY] = (1, 2, 2, 2)
+    channels: Annotated[tuple[Count, ...], NOT_EMPTY] = (16, 32, 64, 128)
+    strides: Annotated[tuple[Count, ...], NOT_EMPTY] = (1, 2, 2, 2)
+    stem_channels: Count = 16
     block: Literal["basic", "bottleneck"] = "basic"
     frozen_stem_norm: bool = False
     frozen_norms: bool = False
+
+    def limits(self) -> Rules:
+        """Every stage has blocks, channels and a stride."""
+        for name in ("channels", "strides"):
+            fits = len(getattr(self, name)) == len(self.blocks)
+            yield name, fits, f"as many numbers as there are stages (blocks has {len(self.blocks)})"
 
 
 RESNET_50 = ResNetConfig((3, 4, 6, 3), (64, 128, 256, 512), (1, 2, 2, 2), 64, "bottleneck")

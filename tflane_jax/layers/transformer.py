@@ -14,6 +14,7 @@ import flax.linen as nn
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.attention import Mask, MultiHeadAttention
+from tflane_jax.limits import Count, FractionBelowOne
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,9 @@ class TransformerConfig:
         activation: of the hidden channels; "gelu" is the exact one, with the error function, as in PyTorch.
     """
 
-    heads: int = 2
-    hidden: int = 128
-    dropout: float = 0.1
+    heads: Count = 2
+    hidden: Count = 128
+    dropout: FractionBelowOne = 0.1
     norm_first: bool = False
     activation: Literal["relu", "gelu"] = "relu"
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.line_orders import Ways, point_orders
+from tflane_jax.limits import Positive, PositiveOrZero
 from tflane_jax.losses.common import Report
 from tflane_jax.losses.maptr import LineTargets, MapTrLossConfig, line_loss
 from tflane_jax.scene import AreaPrediction, Areas, AreaType, LinePrediction
@@ -36,10 +37,10 @@ class AreaLossConfig:
         class_target: see `MapTrLossConfig`.
     """
 
-    class_weight: float = 1.5
-    points_weight: float = 0.025
-    direction_weight: float = 0.005
-    least_step: float = 1e-6
+    class_weight: PositiveOrZero = 1.5
+    points_weight: PositiveOrZero = 0.025
+    direction_weight: PositiveOrZero = 0.005
+    least_step: Positive = 1e-6
     rings: Ways = "one"
     class_target: Literal["one", "quality"] = "one"
 

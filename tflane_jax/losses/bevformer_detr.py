@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from jaxtyping import Array, Float
 
+from tflane_jax.limits import PositiveOrZero
 from tflane_jax.losses.common import Report
 from tflane_jax.losses.toponet import TopoNetLossConfig, lane_graph_host_loss
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
@@ -17,7 +18,7 @@ from tflane_jax.scene import Example, Prediction
 class BevFormerDetrLossConfig(TopoNetLossConfig):
     """Weights, see `TopoNetLossConfig`; the defaults are the baseline's."""
 
-    points_weight: float = 0.0075
+    points_weight: PositiveOrZero = 0.0075
 
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: BevFormerDetrConfig

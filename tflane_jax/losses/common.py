@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.limits import PositiveOrZero
 from tflane_jax.matching import Assignment
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.scene import Example, Prediction
@@ -28,7 +29,7 @@ class HostLossConfig:
         cell_weight: weight of the auxiliary loss on BEV cells, if the host has it (`losses.lane_cells`).
     """
 
-    cell_weight: float = 1.0
+    cell_weight: PositiveOrZero = 1.0
 
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""

@@ -12,6 +12,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry.lane_shapes import curve_columns
+from tflane_jax.limits import Positive, PositiveOrZero
 from tflane_jax.losses.common import Report
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
@@ -35,12 +36,12 @@ class LaneShapeLossConfig:
         matcher: backend of `matching.match`.
     """
 
-    class_weight: float = 3.0
-    curve_weight: float = 5.0
-    extent_weight: float = 2.0
-    cell_weight: float = 10.0
+    class_weight: PositiveOrZero = 3.0
+    curve_weight: PositiveOrZero = 5.0
+    extent_weight: PositiveOrZero = 2.0
+    cell_weight: PositiveOrZero = 10.0
     shared_horizon: bool = True
-    least_depth: float = 1e-6
+    least_depth: Positive = 1e-6
     matcher: Literal["scipy", "jax"] = "jax"
 
     def loss(

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.datasets.segment_targets import SegmentTargets
+from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.areas import AreaLossConfig, area_loss
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
@@ -74,21 +75,21 @@ class LaneSegNetLossConfig(HostLossConfig):
         cell_weight: see `HostLossConfig`.
     """
 
-    class_weight: float = 1.5
-    points_weight: float = 0.025
-    mask_weight: float = 3.0
-    dice_weight: float = 3.0
-    type_weight: float = 0.1
-    successor_weight: float = 5.0
-    element_lane_weight: float = 5.0
-    alpha: float = 0.25
-    gamma: float = 2.0
+    class_weight: PositiveOrZero = 1.5
+    points_weight: PositiveOrZero = 0.025
+    mask_weight: PositiveOrZero = 3.0
+    dice_weight: PositiveOrZero = 3.0
+    type_weight: PositiveOrZero = 0.1
+    successor_weight: PositiveOrZero = 5.0
+    element_lane_weight: PositiveOrZero = 5.0
+    alpha: Fraction = 0.25
+    gamma: PositiveOrZero = 2.0
     matcher: Literal["scipy", "jax"] = "jax"
     dice_cost: Literal["logits", "probabilities"] = "logits"
     successor_mean: Literal["negatives", "pairs"] = "negatives"
     raster: Raster = "cells"
     class_target: Literal["one", "quality"] = "one"
-    proposal_weight: float = 1.5
+    proposal_weight: PositiveOrZero = 1.5
     elements: ElementLossConfig = ElementLossConfig()
     areas: AreaLossConfig = AreaLossConfig()
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.line_orders import Ways, point_orders
+from tflane_jax.limits import Fraction, Positive, PositiveOrZero
 from tflane_jax.losses.auxiliary import denoising_pairs
 from tflane_jax.losses.common import (
     HostLossConfig,
@@ -56,12 +57,12 @@ class MapTrLossConfig(HostLossConfig):
         cell_weight: not used.
     """
 
-    class_weight: float = 2.0
-    points_weight: float = 5.0
-    direction_weight: float = 0.005
-    least_step: float = 1e-6
-    alpha: float = 0.25
-    gamma: float = 2.0
+    class_weight: PositiveOrZero = 2.0
+    points_weight: PositiveOrZero = 5.0
+    direction_weight: PositiveOrZero = 0.005
+    least_step: Positive = 1e-6
+    alpha: Fraction = 0.25
+    gamma: PositiveOrZero = 2.0
     rings: Ways = "one"
     matcher: Literal["scipy", "jax"] = "jax"
     class_target: Literal["one", "quality"] = "one"

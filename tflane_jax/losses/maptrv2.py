@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import Count, PositiveOrZero
 from tflane_jax.losses.common import Terms
 from tflane_jax.losses.map_masks import bev_line_mask, depth_targets, view_line_masks
 from tflane_jax.losses.maptr import LineTargets, MapTrLossConfig, assign_lines, line_losses
@@ -32,13 +33,13 @@ class MapTrV2LossConfig(MapTrLossConfig):
         others: see `MapTrLossConfig`.
     """
 
-    many_repeats: int = 6
-    many_weight: float = 1.0
-    mask_weight: float = 1.0
-    mask_positive: float = 4.0
-    view_mask_weight: float = 2.0
-    view_mask_positive: float = 1.0
-    depth_weight: float = 3.0
+    many_repeats: Count = 6
+    many_weight: PositiveOrZero = 1.0
+    mask_weight: PositiveOrZero = 1.0
+    mask_positive: PositiveOrZero = 4.0
+    view_mask_weight: PositiveOrZero = 2.0
+    view_mask_positive: PositiveOrZero = 1.0
+    depth_weight: PositiveOrZero = 3.0
 
     def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output, see `MapTrLossConfig.auxiliary_terms`."""

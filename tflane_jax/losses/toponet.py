@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry.bezier import bezier_fit
+from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.auxiliary import auxiliary_losses, denoising_pairs
 from tflane_jax.losses.common import (
     HostLossConfig,
@@ -67,16 +68,16 @@ class TopoNetLossConfig(HostLossConfig):
         cell_weight: see `HostLossConfig`.
     """
 
-    class_weight: float = 1.5
-    points_weight: float = 0.025
-    successor_weight: float = 5.0
-    alpha: float = 0.25
-    gamma: float = 2.0
+    class_weight: PositiveOrZero = 1.5
+    points_weight: PositiveOrZero = 0.025
+    successor_weight: PositiveOrZero = 5.0
+    alpha: Fraction = 0.25
+    gamma: PositiveOrZero = 2.0
     matcher: Literal["scipy", "jax"] = "jax"
-    element_lane_weight: float = 5.0
+    element_lane_weight: PositiveOrZero = 5.0
     elements: ElementLossConfig = ElementLossConfig()
     class_target: Literal["one", "quality"] = "one"
-    proposal_weight: float = 1.5
+    proposal_weight: PositiveOrZero = 1.5
 
     def loss(
         self, outputs: Prediction, auxiliary: AuxiliaryOutputs, batch: Example, host: Any

@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Fraction, PositiveOrZero
 from tflane_jax.losses.common import Terms, positives
 from tflane_jax.losses.costs import focal_cost, generalised_iou, pairwise_l1
 from tflane_jax.matching import Assignment, match
@@ -30,11 +31,11 @@ class ElementLossConfig:
         alpha, gamma: parameters of the focal terms.
     """
 
-    class_weight: float = 1.0
-    box_weight: float = 2.5
-    iou_weight: float = 1.0
-    alpha: float = 0.25
-    gamma: float = 2.0
+    class_weight: PositiveOrZero = 1.0
+    box_weight: PositiveOrZero = 2.5
+    iou_weight: PositiveOrZero = 1.0
+    alpha: Fraction = 0.25
+    gamma: PositiveOrZero = 2.0
 
 
 def clear_padding(elements: TrafficElements) -> TrafficElements:

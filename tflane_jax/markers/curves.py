@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, yaw_pose
+from tflane_jax.limits import NOT_EMPTY, Count, Fraction, Positive, above, check_settings
 from tflane_jax.markers.image_search import DetectorConfig, find_markers
 from tflane_jax.markers.square_pose import marker_outline, solve_square
 from tflane_jax.scene import LineType
@@ -43,21 +44,13 @@ class CurveConfig:
         detector: settings.
     """
 
-    distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
-    turns: tuple[float, ...] = (0.0, 20.0, 40.0)
-    seeds: int = 8
-    mounts: tuple[CameraMount, ...] = (ARGOVERSE2_RING[0], ARGOVERSE2_RING[2])
-    scale: float = 1.0
-    severity: float = 0.5
+    distances: Annotated[tuple[Annotated[float, above(1)], ...], NOT_EMPTY] = tuple(map(float, range(5, 65, 5)))
+    turns: Annotated[tuple[float, ...], NOT_EMPTY] = (0.0, 20.0, 40.0)
+    seeds: Count = 8
+    mounts: Annotated[tuple[CameraMount, ...], NOT_EMPTY] = (ARGOVERSE2_RING[0], ARGOVERSE2_RING[2])
+    scale: Positive = 1.0
+    severity: Fraction = 0.5
     detector: DetectorConfig = DetectorConfig()
-
-    def validate(self) -> None:
-        """Raise UserError for numbers out of range."""
-        self.detector.validate()
-        if not self.distances or min(self.distances) <= 1.0:
-            raise UserError("markers are measured at distances above 1 m: give at least one")
-        if self.seeds < 1 or not self.turns or not self.mounts:
-            raise UserError("markers are measured in at least one scene, at one angle, with one camera: give them")
 
 
 @dataclass(frozen=True)
@@ -96,7 +89,7 @@ def measure(configs: Sequence[CurveConfig]) -> list[list[Sighting]]:
     """
     found: list[list[Sighting]] = [[] for _ in configs]
     for config in configs:
-        config.validate()
+        check_settings(config, "CurveConfig.")
         if replace(config, detector=configs[0].detector) != configs[0]:
             raise UserError("detectors are compared on the same scenes: give configs that differ in the detector alone")
     for image in _images(configs[0]) if configs else ():

@@ -12,8 +12,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
+from tflane_jax.limits import Count, CountOrZero, Fraction, Positive, check_settings
 from tflane_jax.markers.corner_refinement import refine_corners
 from tflane_jax.markers.occluded_search import find_occluded
 from tflane_jax.scene.marker_patterns import MarkerFamily, dictionary_of, marker_cells
@@ -45,25 +45,16 @@ class DetectorConfig:
     """
 
     family: MarkerFamily = MarkerFamily.ARUCO_5X5_100
-    size: float = 1.0
-    capacity: int = 16
+    size: Positive = 1.0
+    capacity: Count = 16
     corners: Literal["pattern", "subpixel", "none"] = "pattern"
-    enlarge: int = 1
+    enlarge: Count = 1
     search: Literal["outlines", "all"] = "outlines"
-    ids: tuple[int, ...] | None = None
-    least_pixels: float = 8.0
-    ambiguous: float = 0.6
-    tilt: float = 0.05
-    turn: float = 0.8
-
-    def validate(self) -> None:
-        """Raise UserError for numbers out of range."""
-        for name, least in (("capacity", 1), ("enlarge", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"DetectorConfig.{name} must be at least {least}, not {getattr(self, name)}")
-        for name in ("size", "least_pixels", "tilt", "turn"):
-            if not getattr(self, name) > 0.0:
-                raise UserError(f"DetectorConfig.{name} must be positive, not {getattr(self, name)}")
+    ids: tuple[CountOrZero, ...] | None = None
+    least_pixels: Positive = 8.0
+    ambiguous: Fraction = 0.6
+    tilt: Positive = 0.05
+    turn: Positive = 0.8
 
 
 class ImageMarkers(NamedTuple):
@@ -89,7 +80,7 @@ def find_markers(
     An id found several times at one place is reported once, where its cells are read best; an id at several places is
     reported at each. Raises UserError without OpenCV or for an invalid config.
     """
-    config.validate()
+    check_settings(config, "DetectorConfig.")
     cv2 = opencv()
     if min(image.shape[:2]) < config.least_pixels:
         return ImageMarkers(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros(0, int))

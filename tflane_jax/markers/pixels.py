@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
+from tflane_jax.limits import Positive
 from tflane_jax.markers.detection import DetectedMarkers, locate
 from tflane_jax.markers.image_search import DetectorConfig, ImageMarkers, find_markers, joined
 from tflane_jax.markers.square_pose import marker_outline
@@ -39,7 +40,7 @@ class PixelConfig:
 
     rig: CameraRigConfig = CameraRigConfig(cameras=ARGOVERSE2_RING[:3], scale=1.0, markers=True)
     detector: DetectorConfig = DetectorConfig(search="all")
-    range: float = 70.0
+    range: Positive = 70.0
 
     def native(self, cameras: CameraRigConfig | None) -> CameraRigConfig:
         """Return the cameras in which boards are searched, for an example with these cameras."""

@@ -7,12 +7,13 @@ separate random stream for each log, moment and marker, so they do not depend on
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, PositiveOrZero, at_least, within
 from tflane_jax.markers.observe import frame_before
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.visibility import seen_fraction
@@ -58,25 +59,25 @@ class MarkerSimulationConfig:
         first_residual: r of a marker that was not detected in that earlier frame, metres.
     """
 
-    forward_sigma: float = 3.0
-    yaw_sigma: float = 2.0
-    pitch_sigma: float = 2.0
-    reference: float = 60.0
+    forward_sigma: PositiveOrZero = 3.0
+    yaw_sigma: PositiveOrZero = 2.0
+    pitch_sigma: PositiveOrZero = 2.0
+    reference: Positive = 60.0
     growth: Literal["linear", "quadratic"] = "linear"
-    jump: float = 0.05
-    jump_distance: float = 25.0
-    jump_yaw: float = 90.0
-    jump_spread: float = 0.1
-    detection_sigma: float = 40.0
-    range: float = 60.0
-    field_of_view: float = 120.0
-    frontal: float = 60.0
+    jump: Fraction = 0.05
+    jump_distance: PositiveOrZero = 25.0
+    jump_yaw: PositiveOrZero = 90.0
+    jump_spread: PositiveOrZero = 0.1
+    detection_sigma: Positive = 40.0
+    range: Positive = 60.0
+    field_of_view: Annotated[float, within(0, 360)] = 120.0
+    frontal: Annotated[float, within(0, 360)] = 60.0
     cameras: tuple[CameraMount, ...] | None = None
     occlusion: Literal["bodies", "line_of_sight", "none"] = "line_of_sight"
-    least_seen: float = 0.75
-    score: tuple[float, float] = (1.0, 1.0)
-    residual_interval: float | None = 0.5
-    first_residual: float = 0.0
+    least_seen: Fraction = 0.75
+    score: Annotated[tuple[Fraction, Fraction], ASCENDING] = (1.0, 1.0)
+    residual_interval: Positive | None = 0.5
+    first_residual: PositiveOrZero = 0.0
 
     def growth_at(self, distance: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
         """Return the factor on the standard deviations at a distance (metres); 1 at `reference`."""
@@ -105,10 +106,10 @@ class MarkerConfig:
         pixels: detect the boards in native images of the built-in world's cameras instead; None simulates.
     """
 
-    markers: int = 2
-    lanes: int = 48
-    points: int = 11
-    radius: float = 50.0
+    markers: Count = 2
+    lanes: Count = 48
+    points: Annotated[int, at_least(2)] = 11
+    radius: Positive = 50.0
     simulation: MarkerSimulationConfig = MarkerSimulationConfig()
     pixels: PixelConfig | None = None
 

@@ -6,7 +6,7 @@ The decoder is MapTR's: instance and point queries, whose points every layer mov
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import Count, at_least
 from tflane_jax.models.map_lines import LineDecoderConfig, LineOutput, LineQueries, decode_line_layers
 from tflane_jax.scene import AreaPrediction
 
@@ -32,8 +33,8 @@ class AreaDecoderConfig(LineDecoderConfig):
         others: see `LineDecoderConfig`.
     """
 
-    queries: int = 12
-    points: int = 20
+    queries: Count = 12
+    points: Annotated[int, at_least(2)] = 20
     coordinates: Literal[2, 3] = 3
     classes: Literal[2, 3, 4] = AREA_CLASSES
 

@@ -28,6 +28,7 @@ from tflane_jax.geometry import BevGrid
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.bev_attention import SpatialCrossAttention, TemporalSelfAttention
 from tflane_jax.layers.geometry_kernel import GeometryKernelAttention
+from tflane_jax.limits import Count, FractionBelowOne, Rules, splits
 from tflane_jax.models.prior import BevHook
 
 
@@ -64,26 +65,37 @@ class BevFormerConfig:
     """
 
     grid: BevGrid = BevGrid()
-    dim: int = 256
-    heads: int = 8
-    layers: int = 3
-    hidden: int = 512
-    dropout: float = 0.1
-    temporal_points: int = 4
-    spatial_points: int = 8
-    anchors: int = 4
-    levels: int = 4
-    cameras: int = 7
-    capacity: int | None = None
+    dim: Count = 256
+    heads: Count = 8
+    layers: Count = 3
+    hidden: Count = 512
+    dropout: FractionBelowOne = 0.1
+    temporal_points: Count = 4
+    spatial_points: Count = 8
+    anchors: Count = 4
+    levels: Count = 4
+    cameras: Count = 7
+    capacity: Count | None = None
     align: Literal["warp", "reference", "bevformer"] = "warp"
     rotation_center: tuple[float, float] | None = None
     temporal_value: Literal["running", "initial"] = "running"
-    value_projections: int = 1
+    value_projections: Count = 1
     remat: bool = False
     precision: Literal["float32", "bfloat16"] = "float32"
     attention: Literal["deformable", "kernel"] = "deformable"
-    kernel: tuple[int, int] = (3, 5)
+    kernel: tuple[Count, Count] = (3, 5)
     memory: Literal["previous", "off"] = "previous"
+
+    def limits(self) -> Rules:
+        """Channels split over heads, sampling points over anchors."""
+        yield "dim", self.dim % 2 == 0, "even: half of the position encoding is for rows, half for columns"
+        yield splits("heads", self.heads, "dim", self.dim)
+        if self.attention == "kernel":
+            yield splits("anchors", self.anchors, "dim", self.dim)
+            yield "levels", self.levels == 1, "1 with the geometry-guided kernel (attention)"
+        else:
+            multiple = self.spatial_points % self.anchors == 0
+            yield "spatial_points", multiple, f"a multiple of anchors ({self.anchors})"
 
     @property
     def dtype(self) -> Any:

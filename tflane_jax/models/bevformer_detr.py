@@ -7,17 +7,18 @@ relationship heads. A lane is 11 points or a Bezier curve.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.geometry.bezier import bezier_basis
+from tflane_jax.limits import Rules, at_least, check_settings
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
-from tflane_jax.models.encoders import EncoderConfig, check_elements
+from tflane_jax.models.encoders import EncoderConfig, element_limits
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, LaneHeads, attention_reference, make_prediction
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
@@ -42,7 +43,7 @@ class BevFormerDetrConfig(HostConfig):
     encoder: EncoderConfig = CameraEncoderConfig()
     decoder: LaneDecoderConfig = LaneDecoderConfig(refine="fixed")
     elements: ElementDecoderConfig | None = ElementDecoderConfig()
-    control_points: int | None = None
+    control_points: Annotated[int, at_least(2)] | None = None
     denoising: DenoisingConfig | None = None
 
     @property
@@ -57,10 +58,14 @@ class BevFormerDetrConfig(HostConfig):
 
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        check_elements(self.encoder, self.decoder.layers, self.elements)
-        if self.decoder.refine != "fixed":
-            raise UserError('the references of BEVFormer-DETR never move: set task.model.decoder.refine to "fixed"')
+        check_settings(self, "task.model.")
         return BevFormerDetr(self)
+
+    def limits(self) -> Rules:
+        """Those of a host with traffic elements, and references that stay."""
+        yield from super().limits()
+        yield from element_limits(self.elements, self.encoder, self.decoder.layers)
+        yield "decoder.refine", self.decoder.refine == "fixed", "fixed: the references of BEVFormer-DETR never move"
 
 
 def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import Rules
 from tflane_jax.models.auxiliary import AUXILIARY, LaneCellHead, LineMaskHead
 from tflane_jax.models.bev_encoder import SMALL_BEVFORMER, BevFormerConfig, BevMemory
 from tflane_jax.models.bevformer import BevFormer
@@ -44,6 +45,13 @@ class CameraEncoderConfig:
     bev: BevFormerConfig | LiftConfig = SMALL_BEVFORMER
     cells: bool = False
     line_masks: bool = False
+
+    def limits(self) -> Rules:
+        """BEV features are made of the pyramid's levels and channels."""
+        pyramid = self.images.pyramid
+        levels = self.bev.levels if isinstance(self.bev, BevFormerConfig) else 1
+        yield "bev.dim", self.bev.dim == pyramid.dim, f"that of the image features (images.pyramid.dim, {pyramid.dim})"
+        yield "images.pyramid.levels", pyramid.levels == levels, f"{levels}, the levels that bev takes"
 
     @property
     def bev_range(self) -> PerceptionRange:

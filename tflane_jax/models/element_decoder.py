@@ -22,6 +22,7 @@ from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import image_sine_encoding, inverse_sigmoid
 from tflane_jax.layers.transformer import FeedForward, Residual, TransformerConfig
+from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Rules, splits
 
 
 @dataclass(frozen=True)
@@ -39,15 +40,20 @@ class ElementDecoderConfig:
         dropout: probability, for attention weights, hidden channels and every residual branch.
     """
 
-    dim: int = 64
-    heads: int = 8
-    levels: int = 2
-    encoder_layers: int = 1
-    layers: int = 3
-    queries: int = 16
-    sampling_points: int = 4
-    hidden: int = 128
-    dropout: float = 0.0
+    dim: Count = 64
+    heads: Count = 8
+    levels: Count = 2
+    encoder_layers: CountOrZero = 1
+    layers: Count = 3
+    queries: Count = 16
+    sampling_points: Count = 4
+    hidden: Count = 128
+    dropout: FractionBelowOne = 0.0
+
+    def limits(self) -> Rules:
+        """Channels split over heads, and over rows and columns."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        yield "dim", self.dim % 2 == 0, "even: half of the position encoding is for rows, half for columns"
 
 
 PAPER_ELEMENT_DECODER = ElementDecoderConfig(

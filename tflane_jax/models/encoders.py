@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Rules
 from tflane_jax.models.bev_encoder import BevFormerConfig, BevMemory
 from tflane_jax.models.camera_encoder import CameraEncoder, CameraEncoderConfig, EncoderOutput
 from tflane_jax.models.element_decoder import ElementDecoderConfig
@@ -55,16 +56,14 @@ def start_bev_memory(config: EncoderConfig) -> BevMemory | None:
     return None
 
 
-def check_elements(encoder: EncoderConfig, layers: int, elements: ElementDecoderConfig | None) -> None:
-    """Raise UserError if traffic elements have no front view, or not as many layers as the lane decoder."""
+def element_limits(elements: ElementDecoderConfig | None, encoder: EncoderConfig, layers: int) -> Rules:
+    """Yield the limits of a host's traffic elements: a front view, and as many layers as the lane decoder."""
     if elements is None:
         return
-    if not isinstance(encoder, CameraEncoderConfig):
-        raise UserError(
-            "traffic elements are detected in the front camera's image: give the model an encoder of cameras"
-        )
-    if elements.layers != layers:
-        raise UserError(
-            "each lane layer reads the element layer of its index, but the decoders of elements and lanes have "
-            f"{elements.layers} and {layers}: set elements.layers and decoder.layers to one number"
-        )
+    seen = isinstance(encoder, CameraEncoderConfig)
+    yield "elements", seen, "None without an encoder of cameras: traffic elements are detected in the front image"
+    fits = elements.layers == layers
+    yield "elements.layers", fits, f"decoder.layers ({layers}): a lane layer reads the element layer of its index"
+    if isinstance(encoder, CameraEncoderConfig):
+        pyramid = encoder.images.pyramid
+        yield "elements.levels", elements.levels == pyramid.levels, f"encoder.images.pyramid.levels ({pyramid.levels})"

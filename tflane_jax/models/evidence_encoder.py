@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, UInt8
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.limits import Count, Rules
 from tflane_jax.models.auxiliary import LaneCellHead
 from tflane_jax.models.prior import BevHook
 
@@ -32,13 +33,17 @@ class EvidenceEncoderConfig:
         coordinates: whether x, y, abs x and abs y of the cells are input channels.
     """
 
-    dim: int = 32
-    cell: int = 4
-    dilations: tuple[int, ...] = (1, 2, 4, 1)
+    dim: Count = 32
+    cell: Count = 4
+    dilations: tuple[Count, ...] = (1, 2, 4, 1)
     cells: bool = False
     range: PerceptionRange = BevGrid().range
-    levels: tuple[int, ...] = ()
+    levels: tuple[Count, ...] = ()
     coordinates: bool = False
+
+    def limits(self) -> Rules:
+        """Four groups of channels encode the positions of cells."""
+        yield "dim", self.dim % 4 == 0, "a multiple of 4, for sine and cosine of x and y"
 
     @property
     def bev_range(self) -> PerceptionRange:

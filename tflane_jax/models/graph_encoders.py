@@ -18,7 +18,7 @@ types are shifts and means, and similarity, with one head for all channels, is o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -37,6 +37,7 @@ from tflane_jax.layers.image_graph import (
     smooth,
 )
 from tflane_jax.layers.masks import key_mask
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, FractionBelowOne, Rules
 
 
 @dataclass(frozen=True)
@@ -56,15 +57,19 @@ class GtnEncoderConfig:
         dropout: probability for hidden channels and each residual branch.
     """
 
-    layers: int = 2
-    hops: int = 2
-    channels: int = 2
-    relations: tuple[Relation, ...] = ("self", "up", "down", "left", "right", "row", "column")
+    layers: Count = 2
+    hops: Count = 2
+    channels: Count = 2
+    relations: Annotated[tuple[Relation, ...], DIFFERENT] = ("self", "up", "down", "left", "right", "row", "column")
     similarity: Literal["last_hop", "every_hop"] | None = "last_hop"
-    heads: int = 1
-    head_dim: int = 16
-    hidden: int = 128
-    dropout: float = 0.1
+    heads: Count = 1
+    head_dim: Count = 16
+    hidden: Count = 128
+    dropout: FractionBelowOne = 0.1
+
+    def limits(self) -> Rules:
+        """Every hop has edge types."""
+        yield "relations", bool(self.relations) or self.offers_similarity(0), "at least one, or similarity every_hop"
 
     def build(self, dim: int, name: str) -> GraphEncoder:
         """Return the Linen module for `dim` channels; raises UserError where they do not split."""
@@ -93,9 +98,9 @@ class GcnEncoderConfig:
         dropout: probability for hidden channels and each residual branch.
     """
 
-    layers: int = 2
-    hidden: int = 128
-    dropout: float = 0.1
+    layers: Count = 2
+    hidden: Count = 128
+    dropout: FractionBelowOne = 0.1
 
     def build(self, dim: int, name: str) -> GraphEncoder:
         """Return the Linen module; it infers the number of channels from its input."""
@@ -120,12 +125,12 @@ class HanEncoderConfig:
         dropout: probability for hidden channels and each residual branch.
     """
 
-    layers: int = 2
-    heads: int = 2
-    relations: tuple[Literal["near", "row", "column"], ...] = ("near", "row", "column")
-    semantic: int = 32
-    hidden: int = 128
-    dropout: float = 0.1
+    layers: Count = 2
+    heads: Count = 2
+    relations: Annotated[tuple[Literal["near", "row", "column"], ...], NOT_EMPTY, DIFFERENT] = ("near", "row", "column")
+    semantic: Count = 32
+    hidden: Count = 128
+    dropout: FractionBelowOne = 0.1
 
     def build(self, dim: int, name: str) -> GraphEncoder:
         """Return the Linen module for `dim` channels; raises UserError where they do not split."""

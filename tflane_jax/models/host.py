@@ -13,6 +13,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import Rules, splits
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
@@ -62,6 +63,18 @@ class HostConfig:
     """Field of `Example` with the lanes that traffic elements govern, see `ExampleConfig.elements_of`."""
     query_type: ClassVar[Literal["instance", "point"]] = "instance"
     """What a query represents, see `HostSpec.query_type`."""
+
+    def limits(self) -> Rules:
+        """Channels of queries and BEV features split over the heads of the priors."""
+        flow, encoder = self.priors.traffic_flow, self.encoder
+        if flow is not None and flow.insert != "nowhere":
+            heads = flow.module.heads
+            yield splits("priors.traffic_flow.module.heads", heads, "the channels of a query", self.query_dim)
+        width = encoder.dim if isinstance(encoder, EvidenceEncoderConfig) else encoder.bev.dim
+        for name in ("sd_map", "markers"):
+            prior = getattr(self.priors, name)
+            if prior is not None and prior.width is None:
+                yield splits(f"priors.{name}.heads", prior.heads, "the channels of BEV features", width)
 
     @property
     def query_dim(self) -> int:

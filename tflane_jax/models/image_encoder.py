@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from tflane_jax.layers.fpn import FeaturePyramid, FeaturePyramidConfig
 from tflane_jax.layers.resnet import RESNET_50, ResNet, ResNetConfig
+from tflane_jax.limits import INCREASING, NOT_EMPTY, CountOrZero, Rules
 from tflane_jax.scene import CameraViews
 
 # ImageNet statistics, RGB, of values in [0, 255].
@@ -33,11 +34,19 @@ class ImageEncoderConfig:
     """
 
     backbone: ResNetConfig = ResNetConfig((1, 1, 1, 1), (16, 32, 64, 128))
-    stages: tuple[int, ...] = (2, 3)
+    stages: Annotated[tuple[CountOrZero, ...], INCREASING, NOT_EMPTY] = (2, 3)
     pyramid: FeaturePyramidConfig = FeaturePyramidConfig(64, 2)
-    frozen_stages: int = 0
+    frozen_stages: CountOrZero = 0
     remat: bool = False
     precision: Literal["float32", "bfloat16"] = "float32"
+
+    def limits(self) -> Rules:
+        """Stages exist, and the pyramid has a level for each that it takes."""
+        stages = len(self.backbone.blocks)
+        yield "stages", max(self.stages) < stages, f"stages of the backbone, from 0 to {stages - 1}"
+        taken = len(self.stages)
+        yield "pyramid.levels", self.pyramid.levels >= taken, f"at least {taken}, one for each of stages"
+        yield "frozen_stages", self.frozen_stages <= stages + 1, f"at most {stages + 1}: the stem and {stages} stages"
 
 
 # TopoNet, LaneSegNet and OpenLane-V2's baseline: ResNet-50 from ImageNet with frozen norms, C3 to C5, four levels.

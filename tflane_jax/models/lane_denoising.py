@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import PerceptionRange, transform_points, yaw_pose
+from tflane_jax.limits import Count, Fraction, PositiveOrZero
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.element_decoder import ElementOutput
 from tflane_jax.models.lane_proposals import LaneProposals
@@ -36,11 +37,11 @@ class DenoisingConfig:
         straighten: upper limit of the uniform weight with which a lane is blended with the chord between its ends.
     """
 
-    copies: int = 2
-    shift: float = 1.5
-    turn: float = 0.1
-    stretch: float = 0.15
-    straighten: float = 1.0
+    copies: Count = 2
+    shift: PositiveOrZero = 1.5
+    turn: PositiveOrZero = 0.1
+    stretch: PositiveOrZero = 0.15
+    straighten: Fraction = 1.0
 
 
 class NoisedQueries(nn.Module):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.limits import Count, FractionBelowOne, Positive, PositiveOrZero, Rules, at_least, splits
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,11 @@ class LaneProposalConfig:
         turn: the same of the heading, radians.
     """
 
-    count: int = 40
-    headings: int = 8
-    hidden: int = 64
-    jitter: tuple[float, float] = (2.0, 0.8)
-    turn: float = 0.25
+    count: Count = 40
+    headings: Count = 8
+    hidden: Count = 64
+    jitter: tuple[PositiveOrZero, PositiveOrZero] = (2.0, 0.8)
+    turn: PositiveOrZero = 0.25
 
 
 @dataclass(frozen=True)
@@ -57,21 +58,30 @@ class LaneDecoderConfig:
         dropout: probability, for attention weights, hidden channels, messages and every residual branch.
     """
 
-    dim: int = 64
-    heads: int = 8
-    layers: int = 3
-    queries: int = 48
-    points: int = 11
-    sampling_points: int = 4
-    hidden: int = 128
-    relation: int = 16
-    edge_weight: float = 0.6
-    bands: int = 6
+    dim: Count = 64
+    heads: Count = 8
+    layers: Count = 3
+    queries: Count = 48
+    points: Annotated[int, at_least(2)] = 11
+    sampling_points: Count = 4
+    hidden: Count = 128
+    relation: Count = 16
+    edge_weight: PositiveOrZero = 0.6
+    bands: Count = 6
     refine: Literal["fixed", "iterative"] = "iterative"
     output: Literal["sigmoid", "metric"] = "sigmoid"
-    metres: tuple[float, float, float] = (5.0, 5.0, 0.3)
+    metres: tuple[Positive, Positive, Positive] = (5.0, 5.0, 0.3)
     proposals: LaneProposalConfig | None = None
-    dropout: float = 0.0
+    dropout: FractionBelowOne = 0.0
+
+    def limits(self) -> Rules:
+        """Channels split over heads, sampling points over directions, and proposals are among the queries."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        star = self.sampling_points % min(self.sampling_points, 8) == 0
+        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
+        if self.proposals is not None:
+            fits = self.proposals.count <= self.queries
+            yield "proposals.count", fits, f"at most the decoder's queries ({self.queries})"
 
     @property
     def learned_queries(self) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
+from tflane_jax.limits import Count, Limit, Rules, at_least
 from tflane_jax.models.lane_decoder import clipped, directions, refined_points, smooth_basis
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 
@@ -42,24 +42,17 @@ class SegmentDecoderConfig(LaneDecoderConfig):
         others: see `LaneDecoderConfig`; `sampling_points` is a multiple of 8 or less than 8, `heads` is even.
     """
 
-    points: int = 10
-    sampling_points: int = 32
+    points: Annotated[int, at_least(2)] = 10
+    sampling_points: Count = 32
     refine: Literal["point", "iterative"] = "point"  # pyright: ignore[reportIncompatibleVariableOverride]
     offsets: Literal["ego", "lane"] = "ego"
     classes: Literal[1, 2] = 2
-    initial_score: float | None = None
+    initial_score: Annotated[float, Limit("above 0 and below 1", lambda value: 0 < value < 1)] | None = None
 
-    def check(self) -> None:
-        """Raise UserError where sizes do not fit together."""
-        if self.heads % 2:
-            raise UserError(
-                f"half of the attention heads look at each boundary: make decoder.heads even, not {self.heads}"
-            )
-        if self.sampling_points % min(self.sampling_points, 8):
-            raise UserError(
-                "sampling points start as a star of eight directions: set decoder.sampling_points to a multiple of 8 "
-                f"or less than 8, not {self.sampling_points}"
-            )
+    def limits(self) -> Rules:
+        """Those of every lane decoder, and an even number of heads."""
+        yield from super().limits()
+        yield "heads", self.heads % 2 == 0, "even: half of the attention heads look at each boundary"
 
 
 PAPER_SEGMENT_DECODER = SegmentDecoderConfig(dim=256, layers=6, queries=200, hidden=512, relation=128, dropout=0.1)

@@ -18,13 +18,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets.segment_targets import Center
-from tflane_jax.errors import UserError
 from tflane_jax.layers.graph import RelationshipHead
+from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER, AreaDecoder, AreaDecoderConfig
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
-from tflane_jax.models.encoders import check_elements
+from tflane_jax.models.encoders import element_limits
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, lane_position
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
@@ -85,14 +85,15 @@ class LaneSegNetConfig(HostConfig):
 
     def build(self) -> LaneSegNet:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        check_elements(self.encoder, self.decoder.layers, self.elements)
-        self.decoder.check()
-        if (self.areas is None) != (self.decoder.classes == 2):
-            raise UserError(
-                "crossings are either the second class of the segments or areas with a decoder of their own: set "
-                "task.model.decoder.classes to 1 with task.model.areas, and to 2 without"
-            )
+        check_settings(self, "task.model.")
         return LaneSegNet(self)
+
+    def limits(self) -> Rules:
+        """Those of a host with traffic elements; crossings are a class of segments or areas with their own decoder."""
+        yield from super().limits()
+        yield from element_limits(self.elements, self.encoder, self.decoder.layers)
+        fits = (self.areas is None) == (self.decoder.classes == 2)
+        yield "decoder.classes", fits, "1 with areas, which then hold the crossings, and 2 without (areas is None)"
 
 
 def paper_config() -> LaneSegNetConfig:

@@ -23,6 +23,7 @@ from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.depth_net import DepthNet
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.prior import BevHook
 from tflane_jax.scene import CameraViews
@@ -49,14 +50,23 @@ class LiftConfig:
 
     grid: BevGrid = BevGrid(PerceptionRange((-30.0, 30.0), (-15.0, 15.0), (-10.0, 10.0)), 100, 200)
     fine: Literal[1, 2] = 2
-    dim: int = 256
-    cameras: int = 6
-    depth: tuple[float, float, float] = (1.0, 35.0, 0.5)
-    pyramid: int = 96
-    dropout: float = 0.5
-    image_scale: float = 0.5
+    dim: Count = 256
+    cameras: Count = 6
+    depth: tuple[Positive, Positive, Positive] = (1.0, 35.0, 0.5)
+    pyramid: Count = 96
+    dropout: FractionBelowOne = 0.5
+    image_scale: Positive = 0.5
     supervised: bool = False
     border: Literal["exact", "published"] = "exact"
+
+    def limits(self) -> Rules:
+        """The depth bins follow each other."""
+        first, last, size = self.depth
+        yield (
+            "depth",
+            first + size <= last,
+            "(first, last, size of a bin), with a bin between first and last",
+        )
 
     @property
     def bins(self) -> int:

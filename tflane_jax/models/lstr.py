@@ -7,7 +7,7 @@ query per lane -> class, extent and curve of each lane. Source: docs/reference/l
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.positions import image_sine_encoding
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
+from tflane_jax.limits import INCREASING, Count, Fraction, Rules, splits
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
 from tflane_jax.scene import CurvePrediction
@@ -37,7 +38,7 @@ class TransformerEncoderConfig:
         layer: sizes of a layer.
     """
 
-    layers: int = 2
+    layers: Count = 2
     layer: TransformerConfig = TransformerConfig()
 
     def build(self, dim: int, name: str) -> TransformerEncoder:
@@ -79,16 +80,26 @@ class LstrConfig:
     """
 
     backbone: ResNetConfig = ResNetConfig()
-    dim: int = 32
+    dim: Count = 32
     encoder: EncoderConfig = TransformerEncoderConfig()
-    decoder_layers: int = 2
+    decoder_layers: Count = 2
     decoder: TransformerConfig = TransformerConfig()
-    queries: int = 7
-    shrink: int = 1
+    queries: Count = 7
+    shrink: Count = 1
     located: bool = False
-    anchors: tuple[float, float] | None = None
+    anchors: Annotated[tuple[Fraction, Fraction], INCREASING] | None = None
     cells: bool = False
     init: Literal["flax", "lstr"] = "flax"
+
+    def limits(self) -> Rules:
+        """Channels split over rows and columns, sine and cosine, and over heads and meta-paths."""
+        yield "dim", self.dim % 4 == 0, "a multiple of 4, for sine and cosine of rows and columns"
+        yield splits("decoder.heads", self.decoder.heads, "dim", self.dim)
+        if isinstance(self.encoder, TransformerEncoderConfig):
+            yield splits("encoder.layer.heads", self.encoder.layer.heads, "dim", self.dim)
+        for name in ("heads", "channels"):
+            if hasattr(self.encoder, name):
+                yield splits(f"encoder.{name}", getattr(self.encoder, name), "dim", self.dim)
 
     @property
     def auxiliary(self) -> tuple[AuxiliaryName, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
+from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules, at_least, splits
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, clipped
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
 from tflane_jax.models.lane_queries import spread_lanes
@@ -53,20 +54,26 @@ class LineDecoderConfig:
         dropout: probability, for attention weights, hidden channels and every residual branch.
     """
 
-    dim: int = 64
-    heads: int = 8
-    layers: int = 3
-    queries: int = 30
-    points: int = 12
+    dim: Count = 64
+    heads: Count = 8
+    layers: Count = 3
+    queries: Count = 30
+    points: Annotated[int, at_least(2)] = 12
     coordinates: Literal[2, 3] = 2
     classes: Literal[2, 3, 4] = 3
-    sampling_points: int = 4
-    hidden: int = 128
+    sampling_points: Count = 4
+    hidden: Count = 128
     anchors: Literal["linear", "spread"] = "linear"
-    bands: int = 6
+    bands: Count = 6
     output: Literal["sigmoid", "metric", "raw"] = "sigmoid"
-    metres: tuple[float, float, float] = (5.0, 5.0, 0.3)
-    dropout: float = 0.0
+    metres: tuple[Positive, Positive, Positive] = (5.0, 5.0, 0.3)
+    dropout: FractionBelowOne = 0.0
+
+    def limits(self) -> Rules:
+        """Channels split over heads, sampling points over directions."""
+        yield splits("heads", self.heads, "dim", self.dim)
+        star = self.sampling_points % min(self.sampling_points, 8) == 0
+        yield "sampling_points", star, "a multiple of 8 or less than 8: they start as a star of eight directions"
 
 
 PAPER_LINE_DECODER = LineDecoderConfig(dim=256, layers=6, queries=50, points=20, hidden=512, dropout=0.1)

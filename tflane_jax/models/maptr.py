@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.fpn import FeaturePyramidConfig
+from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -73,20 +73,17 @@ class MapTrConfig(HostConfig):
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        self.check()
+        check_settings(self, "task.model.")
         return MapTr(self)
 
-    def check(self) -> None:
-        """Raise UserError where parts do not fit together."""
-        if self.elements is not None:
-            raise UserError("MapTR predicts no traffic elements: set task.model.elements to None")
-        if self.encoder.cells:
-            raise UserError("BEV cells learn directed lanes, which MapTR's truth lacks: unset task.model.encoder.cells")
-        if self.denoising is not None and self.decoder.anchors != "spread":
-            raise UserError(
-                "queries on noised lines must know where their points are: set task.model.decoder.anchors to spread, "
-                "or task.model.denoising to None"
-            )
+    def limits(self) -> Rules:
+        """Those of every host, and what MapTR cannot do."""
+        yield "elements", self.elements is None, "None: MapTR predicts no traffic elements"
+        cells = self.encoder.cells
+        yield "encoder.cells", not cells, "False: BEV cells learn directed lanes, which MapTR's truth lacks"
+        known = self.denoising is None or self.decoder.anchors == "spread"
+        yield "denoising", known, "None, or decoder.anchors spread: queries on noised lines know where their points are"
+        yield from super().limits()
 
 
 PAPER_RANGE = PerceptionRange((-30.0, 30.0), (-15.0, 15.0), (-2.0, 2.0))

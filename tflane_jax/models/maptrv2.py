@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
+from tflane_jax.limits import CountOrZero, Rules, check_settings
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host
@@ -48,7 +48,7 @@ class MapTrV2Config(MapTrConfig):
         decoder, denoising, encoder, range, priors: see `MapTrConfig`.
     """
 
-    many: int = 0
+    many: CountOrZero = 0
     line_mask: bool = False
 
     @property
@@ -65,10 +65,13 @@ class MapTrV2Config(MapTrConfig):
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
-        self.check()
-        if self.many and self.denoising is not None:
-            raise UserError("choose one of task.model.many and task.model.denoising: both add queries in training")
+        check_settings(self, "task.model.")
         return MapTrV2(self)
+
+    def limits(self) -> Rules:
+        """Those of MapTR, and one group of further queries in training."""
+        yield from super().limits()
+        yield "many", not self.many or self.denoising is None, "0 with denoising: both add queries in training"
 
 
 PAPER_LIFT_ENCODER = CameraEncoderConfig(PAPER_MAP_ENCODER.images, LiftConfig(supervised=True), line_masks=True)

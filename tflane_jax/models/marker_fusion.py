@@ -22,6 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.limits import Count, Fraction, Positive, Rules, splits
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
@@ -68,13 +69,18 @@ class MarkerFusionConfig:
     encoding: Literal["sine", "transformer", "mlp"] = "sine"
     lines: PolylineEncoderConfig = MARKER_POLYLINES
     fusion: Literal["gated", "uniform", "hard"] = "gated"
-    hard_threshold: float = 0.5
-    heads: int = 4
-    width: int | None = None
+    hard_threshold: Fraction = 0.5
+    heads: Count = 4
+    width: Count | None = None
     norm: Literal["written", "sum", "query"] = "sum"
-    radius: float | None = None
+    radius: Positive | None = None
     query_position: bool = True
     connectivity: bool = False
+
+    def limits(self) -> Rules:
+        """Channels of the attention split over heads."""
+        if self.width is not None:
+            yield splits("heads", self.heads, "width", self.width)
 
     def build(self, host: HostSpec) -> MarkerPrior:
         """Return the prior for a host."""

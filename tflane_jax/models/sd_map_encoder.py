@@ -17,6 +17,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.limits import Count, Positive, Rules, splits
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
 from tflane_jax.scene import Example, SdMap
@@ -37,11 +38,16 @@ class SdMapModuleConfig:
 
     prior: SdMapPriorConfig = SdMapPriorConfig()
     lines: PolylineEncoderConfig = PolylineEncoderConfig()
-    heads: int = 4
-    width: int | None = None
+    heads: Count = 4
+    width: Count | None = None
     norm: Literal["sum", "query"] = "sum"
-    radius: float | None = None
+    radius: Positive | None = None
     absent: Literal["nothing", "reference"] = "nothing"
+
+    def limits(self) -> Rules:
+        """Channels of the attention split over heads."""
+        if self.width is not None:
+            yield splits("heads", self.heads, "width", self.width)
 
     def build(self, host: HostSpec) -> SdMapPrior:
         """Return the prior for a host."""

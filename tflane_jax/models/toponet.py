@@ -15,10 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.graph import ElementNodes, edge_probabilities
+from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
-from tflane_jax.models.encoders import check_elements
+from tflane_jax.models.encoders import element_limits
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.lane_decoder import (
     ElementEmbedding,
@@ -66,8 +67,13 @@ class TopoNetConfig(HostConfig):
 
     def build(self) -> TopoNet:
         """Return the Linen module; raises UserError where encoder, decoder and elements do not fit together."""
-        check_elements(self.encoder, self.decoder.layers, self.elements)
+        check_settings(self, "task.model.")
         return TopoNet(self)
+
+    def limits(self) -> Rules:
+        """Those of a host with traffic elements."""
+        yield from super().limits()
+        yield from element_limits(self.elements, self.encoder, self.decoder.layers)
 
 
 def paper_config() -> TopoNetConfig:

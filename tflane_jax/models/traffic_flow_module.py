@@ -10,18 +10,18 @@ The paper leaves much open; docs/tf_lane.md lists what we chose, and the setting
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
 from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
@@ -58,16 +58,22 @@ class TrafficFlowModuleConfig:
         masking: restrictions of the masks.
     """
 
-    fusions: tuple[Fusion, ...] = LANE_FUSIONS
-    depth: int = 1
-    spatial_depth: int = 1
+    fusions: Annotated[tuple[Fusion, ...], NOT_EMPTY, DIFFERENT] = LANE_FUSIONS
+    depth: CountOrZero = 1
+    spatial_depth: Count = 1
     residual: Literal["fusion", "none"] = "fusion"
     token: Literal["mean_and_ends", "mean"] = "mean_and_ends"
     position_encoding: Literal["sine", "linear"] = "sine"
-    bands: int = 7
-    width: int = 32
-    heads: int = 4
+    bands: Count = 7
+    width: Count = 32
+    heads: Count = 4
     masking: TrafficMaskConfig = TrafficMaskConfig()
+
+    def limits(self) -> Rules:
+        """Channels split over heads, and each head has its window."""
+        yield splits("heads", self.heads, "width", self.width)
+        fits = len(self.masking.head_windows) in (0, self.heads)
+        yield "masking.head_windows", fits, f"one window for each of the {self.heads} heads, or ()"
 
 
 @dataclass(frozen=True)
@@ -87,13 +93,14 @@ class TrafficFlowConfig:
     insert: Literal["before_decoder", "every_layer", "nowhere"] = "before_decoder"
     bev: TrafficRasterConfig | None = None
 
+    def limits(self) -> Rules:
+        """Traffic flow enters the model somewhere."""
+        somewhere = self.insert != "nowhere" or self.bev is not None
+        yield "insert", somewhere, "before_decoder or every_layer where bev is None: else traffic flow enters nowhere"
+
     def build(self, host: HostSpec) -> TrafficFlowPrior:
-        """Return the prior for a host; raises UserError where the traffic flow would enter nowhere."""
-        if self.insert == "nowhere" and self.bev is None:
-            raise UserError(
-                "traffic flow enters nowhere: choose traffic_flow.insert or traffic_flow.bev, or leave traffic_flow out"
-            )
-        self.module.masking.check(self.module.heads)
+        """Return the prior for a host; raises UserError for settings that break a limit."""
+        check_settings(self, "task.model.priors.traffic_flow.")
         return TrafficFlowPrior(self, host)
 
 

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.masks import SpatialMask, causal_mask, key_mask, nearest_mask, track_distance
+from tflane_jax.limits import Count, PositiveOrInfinite
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.priors.traffic_flow import TrafficFlowTokens
 
@@ -37,22 +37,10 @@ class TrafficMaskConfig:
     """
 
     softmax: Literal["quadrants", "joint"] = "quadrants"
-    window: float | None = None
-    nearest: int | None = None
-    head_windows: tuple[float, ...] = ()
+    window: PositiveOrInfinite | None = None
+    nearest: Count | None = None
+    head_windows: tuple[PositiveOrInfinite, ...] = ()
     temporal: Literal["all", "causal"] = "all"
-
-    def check(self, heads: int) -> None:
-        """Raise UserError for windows that do not fit the number of heads, or that nothing can be in."""
-        if self.head_windows and len(self.head_windows) != heads:
-            raise UserError(
-                f"masking.head_windows has {len(self.head_windows)} windows for {heads} heads: give one for each"
-            )
-        windows = (*self.head_windows, *(() if self.window is None else (self.window,)))
-        if any(window <= 0 for window in windows):
-            raise UserError(f"masking: a window of {min(windows):g} m holds nothing")
-        if self.nearest is not None and self.nearest < 1:
-            raise UserError(f"masking.nearest is {self.nearest}: a lane sees at least one instance")
 
     @property
     def local(self) -> bool:

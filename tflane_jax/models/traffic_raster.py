@@ -14,6 +14,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from tflane_jax.limits import Count, CountOrZero
 from tflane_jax.priors.traffic_raster import TrafficRaster
 
 
@@ -28,8 +29,8 @@ class TrafficRasterConfig:
     """
 
     layers: Literal["first", "all"] = "first"
-    between: int = 3
-    hidden: int = 32
+    between: CountOrZero = 3
+    hidden: Count = 32
 
 
 class TrafficRasterFusion(nn.Module):

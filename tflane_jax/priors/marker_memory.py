@@ -26,6 +26,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from tflane_jax.limits import Count, Factor, Fraction
 from tflane_jax.priors.markers import MarkerLanes
 
 
@@ -44,11 +45,11 @@ class MarkerMemoryConfig:
         gate: c of Eq. (3) for tokens from the bank, and what their weights are relative to; see above.
     """
 
-    frames: int = 6
-    decay: float = 0.9
-    exponent: float = 1.0
-    threshold: float = 0.1
-    lanes: int | None = None
+    frames: Count = 6
+    decay: Factor = 0.9
+    exponent: Factor = 1.0
+    threshold: Fraction = 0.1
+    lanes: Count | None = None
     compensation: Literal["ego_motion", "none"] = "ego_motion"
     gate: Literal["once", "strongest", "one"] = "once"
 

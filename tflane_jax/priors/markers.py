@@ -7,13 +7,14 @@ in numpy or under jit, depending on the arrays.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry.namespace import namespace
+from tflane_jax.limits import Count, Positive, at_least
 from tflane_jax.scene import MarkerObservations
 
 
@@ -32,10 +33,10 @@ class MarkerPriorConfig:
             (then only when nothing is detected).
     """
 
-    points: int = 11
-    lanes: int = 32
-    distance_scale: float = 40.0
-    residual_scale: float = 10.0
+    points: Annotated[int, at_least(2)] = 11
+    lanes: Count = 32
+    distance_scale: Positive = 40.0
+    residual_scale: Positive = 10.0
     use_score: bool = False
     trust: Literal["confidence", "all"] = "confidence"
 

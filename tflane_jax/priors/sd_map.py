@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
+from tflane_jax.limits import Count
 from tflane_jax.scene import SdCategory, SdMap
 
 
@@ -23,7 +24,7 @@ class SdMapPriorConfig:
         categories: number of labels, `scene.SdCategory`; larger categories count as the last one.
     """
 
-    categories: int = len(SdCategory)
+    categories: Count = len(SdCategory)
 
 
 @struct.dataclass

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.namespace import namespace
+from tflane_jax.limits import Count, CountOrZero, Positive, Rules, within
 from tflane_jax.scene import TrafficFlow
 
 
@@ -34,14 +35,20 @@ class TrafficFlowPriorConfig:
         coordinates: "normalised" aligns positions with the BEV in [0, 1] (Table 5, "Norm." = T); "metres" does not.
     """
 
-    frames: int = 20
-    min_valid_frames: int = 5
-    max_instances: int = 30
-    top_instances: int | None = None
+    frames: Count = 20
+    min_valid_frames: Count = 5
+    max_instances: Count = 30
+    top_instances: CountOrZero | None = None
     occluded_frames: Literal["mask", "keep"] = "mask"
-    front_sector_deg: float = 60.0
-    distance_scale: float = 25.0
+    front_sector_deg: Annotated[float, within(0, 360)] = 60.0
+    distance_scale: Positive = 25.0
     coordinates: Literal["normalised", "metres"] = "normalised"
+
+    def limits(self) -> Rules:
+        """An instance can have enough frames, and a slot."""
+        yield "min_valid_frames", self.min_valid_frames <= self.frames, f"at most frames ({self.frames})"
+        fits = self.top_instances is None or self.top_instances <= self.max_instances
+        yield "top_instances", fits, f"at most max_instances ({self.max_instances})"
 
 
 @struct.dataclass

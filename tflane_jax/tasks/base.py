@@ -117,6 +117,9 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         """Return shapes and types of one example without loading the data."""
         raise NotImplementedError
 
+    def check_settings(self, data: SplitData) -> None:
+        """Raise UserError if the model cannot be trained on such data, whatever the examples are."""
+
     def check(self, data: SplitData, train: DataT) -> None:
         """Raise UserError if the model cannot be trained on this training split."""
 

@@ -16,21 +16,33 @@ from tflane_jax.models.host import HostConfig
 from tflane_jax.scene import Example
 
 
-def check_fit(model: HostConfig, config: ExampleConfig, example: Example) -> None:
-    """Raise UserError where data and model do not fit together.
+def check_settings_fit(model: HostConfig, config: ExampleConfig, *, images: bool) -> None:
+    """Raise UserError where data and model cannot fit together whatever the examples are.
 
-    Ranges or points differ, the data lack the lines of a map that the model learns, or the traffic flow or the past
-    frames that it reads, or a camera sees more cells than `capacity`.
+    Ranges or points differ, or the data lack the camera images, the evidence, the past frames or the prior that the
+    model reads, or the lines of a map that it learns.
 
     Args:
         model: the host.
         config: of the examples.
-        example: one of them.
+        images: whether examples have camera images.
     """
+    _check_inputs(model, config, images=images)
     _check_ranges(model, config)
-    _check_lines(model, config, example)
+    _check_lines(model, config)
     _check_points(model, config)
-    _check_traffic(model, config, example)
+    _check_history(model, config)
+
+
+def check_fit(model: HostConfig, example: Example) -> None:
+    """Raise UserError where an example lacks what the model reads, or a camera sees more cells than `capacity`."""
+    if _learns_lines(model) and example.map_lines is None:
+        raise UserError(_NO_LINES)
+    if reads_traffic(model) and example.traffic_flow is None:
+        raise UserError(
+            "this model reads traffic flow (task.model.priors.traffic_flow), and the data have none: name the folder "
+            "of the tracks (data.tracks) or leave the prior out"
+        )
     _check_elements(model, example)
     encoder, cameras = model.encoder, example.cameras
     if isinstance(encoder, CameraEncoderConfig) and isinstance(encoder.bev, BevFormerConfig) and cameras is not None:
@@ -70,13 +82,38 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
         )
 
 
-def _check_lines(model: HostConfig, config: ExampleConfig, example: Example) -> None:
-    learned = "lines" in model.predicts and "map_lines" in model.truth
-    if learned and (config.map_lines is None or example.map_lines is None):
+def _check_inputs(model: HostConfig, config: ExampleConfig, *, images: bool) -> None:
+    evidence = isinstance(model.encoder, EvidenceEncoderConfig)
+    if evidence and config.sensor is None:
         raise UserError(
-            "this model learns the lines of a vector map, and the data label none: set data.example.map_lines, which "
-            "the built-in world, Argoverse 2 and nuScenes read"
+            "this model reads BEV evidence (task.model.encoder), and the data have none: set data.example.sensor"
         )
+    if not evidence and not images:
+        raise UserError(
+            "this model reads camera images (task.model.encoder), and the data have none: set data.example.cameras "
+            "(built-in world) or data.image (nuScenes)"
+        )
+    for name in ("sd_map", "markers"):
+        if getattr(model.priors, name) is not None and getattr(config, name) is None:
+            raise UserError(
+                f"this model reads a prior (task.model.priors.{name}), and data.example.{name} is None: set that one "
+                "as well, or leave the prior out"
+            )
+
+
+_NO_LINES = (
+    "this model learns the lines of a vector map, and the data label none: set data.example.map_lines, which the "
+    "built-in world, Argoverse 2 and nuScenes read"
+)
+
+
+def _learns_lines(model: HostConfig) -> bool:
+    return "lines" in model.predicts and "map_lines" in model.truth
+
+
+def _check_lines(model: HostConfig, config: ExampleConfig) -> None:
+    if _learns_lines(model) and config.map_lines is None:
+        raise UserError(_NO_LINES)
 
 
 def _check_points(model: HostConfig, config: ExampleConfig) -> None:
@@ -88,16 +125,9 @@ def _check_points(model: HostConfig, config: ExampleConfig) -> None:
             )
 
 
-def _check_traffic(model: HostConfig, config: ExampleConfig, example: Example) -> None:
+def _check_history(model: HostConfig, config: ExampleConfig) -> None:
     traffic = model.priors.traffic_flow
-    if traffic is None:
-        return
-    if reads_traffic(model) and example.traffic_flow is None:
-        raise UserError(
-            "this model reads traffic flow (task.model.priors.traffic_flow), and the data have none: name the folder "
-            "of the tracks (data.tracks) or leave the prior out"
-        )
-    if config.history < traffic.prior.frames:
+    if traffic is not None and config.history < traffic.prior.frames:
         raise UserError(
             f"the model reads {traffic.prior.frames} past frames (task.model.priors.traffic_flow.prior.frames), and "
             f"examples hold {config.history} (data.example.history): change either"

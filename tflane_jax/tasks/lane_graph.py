@@ -25,6 +25,7 @@ from tflane_jax.evaluation.lane_graph import evaluate_lanes
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
+from tflane_jax.limits import Count, SettingError
 from tflane_jax.losses.common import HostLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
@@ -36,7 +37,7 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import Example, Prediction, shapes_of
 from tflane_jax.tasks import score_names
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
-from tflane_jax.tasks.fit import check_fit, reads_traffic
+from tflane_jax.tasks.fit import check_fit, check_settings_fit, reads_traffic
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
 T = TypeVar("T")
@@ -57,7 +58,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     model: HostConfig = TopoNetConfig()
     losses: HostLossConfig = TopoNetLossConfig()
-    clip: int = 1
+    clip: Count = 1
     empty_frames: Literal["keep", "skip"] = "keep"
 
     columns: ClassVar[tuple[str, ...]] = score_names.COLUMNS
@@ -179,7 +180,16 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
     def check(self, data: SplitData, train: Example | Streamed) -> None:
         """Raise UserError where data and model do not fit together, see `tasks.fit`."""
-        check_fit(self.model, data.source("train").example, first_example(train))
+        self.check_settings(data)
+        check_fit(self.model, first_example(train))
+
+    def check_settings(self, data: SplitData) -> None:
+        """Raise UserError where settings of data and model do not fit together, see `tasks.fit`."""
+        source, world = data.source("train"), getattr(data, "world", None)
+        images = source.example.cameras is not None or getattr(source, "image", None) is not None
+        check_settings_fit(self.model, source.example, images=images)
+        if world is not None and world.keyframes % self.clip:
+            raise SettingError("data.world.keyframes", world.keyframes, f"a multiple of task.clip ({self.clip})")
 
     def prepare(self, data: SplitData) -> Prepare | None:
         """Return the photometric augmentation of the data, or None."""

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from tflane_jax.errors import UserError
+from tflane_jax.limits import Count, CountOrZero, Factor, Fraction, FractionBelowOne, PositiveOrZero
 
 Verdict = Literal["go on", "extend", "restart"]
 
@@ -46,13 +46,13 @@ class AdaptiveConfig:
 
     metric: str = "loss"
     mode: Literal["min", "max"] = "min"
-    threshold: float = 0.01
-    fraction: float = 0.5
-    extend: float = 0.5
-    max_extensions: int = 1
-    grace: float = 0.25
-    patience: int = 3
-    shrink: float = 0.7
+    threshold: FractionBelowOne = 0.01
+    fraction: Fraction = 0.5
+    extend: PositiveOrZero = 0.5
+    max_extensions: CountOrZero = 1
+    grace: Fraction = 0.25
+    patience: Count = 3
+    shrink: Factor = 0.7
 
 
 @dataclass(frozen=True)
@@ -72,22 +72,6 @@ class Memory:
     cycle_best: float | None = None
     stale: int = 0
     extensions: int = 0
-
-
-def check_adaptive(config: AdaptiveConfig) -> None:
-    """Raise UserError for a setting out of its range."""
-    for name, fits, wanted in (
-        ("threshold", 0.0 <= config.threshold < 1.0, "at least 0 and below 1"),
-        ("fraction", 0.0 <= config.fraction <= 1.0, "from 0 to 1"),
-        ("extend", 0.0 <= config.extend < math.inf, "at least 0"),
-        ("max_extensions", config.max_extensions >= 0, "at least 0"),
-        ("grace", 0.0 <= config.grace <= 1.0, "from 0 to 1"),
-        ("patience", config.patience >= 1, "at least 1"),
-        ("shrink", 0.0 < config.shrink <= 1.0, "above 0 and at most 1"),
-    ):
-        if not fits:
-            value = getattr(config, name)
-            raise UserError(f"optim.restarts.adaptive.{name} is {value}: it must be {wanted}")
 
 
 def judge(

@@ -23,6 +23,7 @@ from flax import serialization
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import rename_flushed
 from tflane_jax.training.state import TrainState, state_from, tree_of
 
 _VERSION = 1
@@ -64,7 +65,10 @@ class Checkpoints:
 
     def steps(self) -> list[int]:
         """Return the steps of all checkpoints, ascending."""
-        names = [p.name for p in self.folder.iterdir()] if self.folder.is_dir() else []
+        try:
+            names = [p.name for p in self.folder.iterdir()] if self.folder.is_dir() else []
+        except OSError as error:
+            raise UserError(f"cannot read {self.folder}: {error.strerror or error}") from error
         return sorted(int(found[1]) for name in names if (found := re.fullmatch(r"step_(\d{8,})", name)))
 
     def path(self, step: int) -> Path:
@@ -86,21 +90,26 @@ class Checkpoints:
         place = self.path(manifest.step)
         if place.exists() and self._is_evaluated(manifest.step):
             return place
-        self.folder.mkdir(parents=True, exist_ok=True)
-        for stale in self.folder.glob(".writing-*"):  # left behind by a process that was killed
-            shutil.rmtree(stale, ignore_errors=True)
         writing = self.folder / f".writing-{os.getpid()}"
         try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for stale in self.folder.glob(".writing-*"):  # left behind by a process that was killed
+                shutil.rmtree(stale, ignore_errors=True)
             _save_tree(writing / "state", _plain(state))
             content = asdict(manifest) | {"files": _checksums(writing)}
             (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
-            if place.exists():
+            if place.is_dir():
                 shutil.rmtree(place)
-            writing.rename(place)
+            else:
+                place.unlink(missing_ok=True)
+            rename_flushed(writing, place)
+            self._drop_old()
         except OSError as error:
             shutil.rmtree(writing, ignore_errors=True)
-            raise UserError(f"cannot write checkpoint {place}: {error.strerror or error}; free space there") from error
-        self._drop_old()
+            raise UserError(
+                f"cannot write checkpoint {place}: {error.strerror or error}; make room or give the right to write "
+                "there, and go on from the checkpoint before with --resume"
+            ) from error
         return place
 
     def manifest(self, step: int) -> Manifest:
@@ -108,8 +117,10 @@ class Checkpoints:
         try:
             content = json.loads((self.path(step) / "manifest.json").read_text(encoding="utf-8"))
             manifest = Manifest(**content)
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, ValueError, TypeError, RecursionError) as error:
             raise self._damaged(step, f"manifest.json: {error}") from error
+        if (wrong := _wrong_entry(manifest)) is not None:
+            raise self._damaged(step, f"manifest.json: {wrong} is not what was written")
         if manifest.version != _VERSION:
             raise UserError(
                 f"checkpoint {self.path(step)} has layout version {manifest.version}, this program reads {_VERSION}"
@@ -160,14 +171,18 @@ class Checkpoints:
                 wrong = sorted(k for k in found.keys() | manifest.files.keys() if found.get(k) != manifest.files.get(k))
                 raise self._damaged(step, f"{wrong[0]} is not what was written")
             return _load_tree(folder / "state")
-        except (OSError, ValueError, KeyError) as error:
-            raise self._damaged(step, str(error)) from error
+        except UserError:
+            raise
+        except Exception as error:  # orbax and tensorstore have many
+            raise self._damaged(step, _first_line(error)) from error
 
     def params(self, step: int) -> dict[str, Any]:
         """Return the averaged parameters of a checkpoint (leading seed axis where it has several), numpy."""
         prefix = "ema_params/"
         arrays = self.arrays(step)
         averaged = {name.removeprefix(prefix): a for name, a in arrays.items() if name.startswith(prefix)}
+        if not averaged:
+            raise self._damaged(step, "it has no averaged parameters")
         return unflatten_dict(averaged, sep="/")
 
     def content(self, step: int) -> str:
@@ -189,6 +204,10 @@ class Checkpoints:
             if step not in kept:
                 shutil.rmtree(self.path(step))
 
+    def damaged_progress(self, step: int, error: Exception) -> UserError:
+        """Return the error for a checkpoint whose entry "progress" the loop cannot read."""
+        return self._damaged(step, f"manifest.json: progress: {type(error).__name__}: {error}")
+
     def _damaged(self, step: int, why: str) -> UserError:
         others = [other for other in self.steps() if other != step]
         remedy = f"the run can go on from step {others[-1]}" if others else "there is no other: start the run again"
@@ -202,8 +221,11 @@ class Checkpoints:
 def _save_tree(folder: Path, tree: dict[str, np.ndarray]) -> None:
     import orbax.checkpoint as ocp
 
-    with _checkpointer() as writer:
-        writer.save(folder.absolute(), args=ocp.args.PyTreeSave(unflatten_dict(tree, sep="/")))
+    try:
+        with _checkpointer() as writer:
+            writer.save(folder.absolute(), args=ocp.args.PyTreeSave(unflatten_dict(tree, sep="/")))
+    except Exception as error:  # those of orbax and tensorstore for a full disk are no OSError
+        raise error if isinstance(error, OSError) else OSError(_first_line(error)) from error
 
 
 def _checkpointer() -> Any:
@@ -226,6 +248,26 @@ def _load_tree(folder: Path) -> dict[str, np.ndarray]:
         names = reader.metadata(folder.absolute()).item_metadata.tree
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), names)
         return _flat(reader.restore(folder.absolute(), args=ocp.args.PyTreeRestore(restore_args=as_numpy)))
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
+def _wrong_entry(manifest: Manifest) -> str | None:
+    """Return the name of the first entry with a value of the wrong type, None where all are right."""
+    numbers = {"metrics": manifest.metrics, "files": manifest.files}
+    right = {
+        "step": type(manifest.step) is int,
+        "version": type(manifest.version) is int,
+        "config": isinstance(manifest.config, dict),
+        "progress": isinstance(manifest.progress, dict),
+        **{
+            name: isinstance(entry, dict) and all(type(value) in (int, float) for value in entry.values())
+            for name, entry in numbers.items()
+        },
+    }
+    return next((name for name, fits in right.items() if not fits), None)
 
 
 def _checksums(folder: Path) -> dict[str, int]:

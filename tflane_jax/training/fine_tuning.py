@@ -42,6 +42,15 @@ def starting_params(
     ]
 
 
+def check_origins(reference: str, seeds: Sequence[int]) -> None:
+    """Raise UserError if a run to start from is missing or has no checkpoint; nothing is restored."""
+    for folder in _folders(reference, seeds):
+        try:
+            _starting_checkpoint(folder)
+        except UserError as error:
+            raise UserError(f"training.init_from is {reference}: {error}") from error
+
+
 def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """Return folder, step and content of the checkpoint that each seed starts from, see `starting_params`."""
     found = []

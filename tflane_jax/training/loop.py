@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -23,6 +23,7 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, replicated, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, check_settings
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import apart, arrays_from_first, from_first, is_first, stop_signal
 from tflane_jax.training.adaptive import Memory
@@ -65,13 +66,13 @@ class TrainingConfig:
         init_partly: whether that run's model may have other modules; those that it lacks start from random parameters.
     """
 
-    steps: int = 10_000
-    batch_size: int = 8
-    seeds: tuple[int, ...] = (0,)
-    log_every: int = 50
-    eval_every: int = 1000
-    checkpoint_every: int = 500
-    keep_checkpoints: int = 2
+    steps: Count = 10_000
+    batch_size: Count = 8
+    seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)
+    log_every: Count = 50
+    eval_every: Count = 1000
+    checkpoint_every: Count = 500
+    keep_checkpoints: Count = 2
     best_metric: str = "all/DET_l"
     init_from: str | None = None
     init_partly: bool = False
@@ -149,7 +150,7 @@ def train(
         UserError: see `run_folder.claimed` and `Checkpoints`; settings out of range; a loss that is not finite, after
             the last good state was written.
     """
-    _check(config)
+    check_settings(config, "training.")
     progress = progress and is_first()
     mesh = training_mesh(config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
@@ -185,10 +186,10 @@ def train(
             states = per_seed(
                 arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole), config.seeds
             )
-            progress_so_far = latest["progress"]
-            window, seconds = _Window(**progress_so_far["window"]), progress_so_far["seconds"]
-            metrics = progress_so_far["metrics"]
-            memories = [Memory(**memory) for memory in progress_so_far.get("cycles", [])] or memories
+            try:
+                window, metrics, seconds, memories = _carried(latest["progress"], memories)
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
             fresh = states
             given = arrays_from_first(
@@ -294,12 +295,12 @@ def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
     return {"step": steps[-1], "progress": checkpoints.manifest(steps[-1]).progress}
 
 
-def _check(config: TrainingConfig) -> None:
-    for name in ("steps", "batch_size", "log_every", "eval_every", "checkpoint_every", "keep_checkpoints"):
-        if getattr(config, name) < 1:
-            raise UserError(f"training.{name} is {getattr(config, name)}: it must be at least 1")
-    if not config.seeds or len(set(config.seeds)) < len(config.seeds):
-        raise UserError(f"training.seeds is {config.seeds}: give one or more different numbers")
+def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[_Window, dict[str, float], float, list[Memory]]:
+    """Return window, metrics, seconds and the memories of seeds from a checkpoint's progress."""
+    sums = {name: list(map(float, values)) for name, values in saved["window"]["sums"].items()}
+    window = _Window(int(saved["window"]["steps"]), sums)
+    metrics = {name: float(value) for name, value in saved["metrics"].items()}
+    return window, metrics, float(saved["seconds"]), [Memory(**one) for one in saved.get("cycles", [])] or fresh
 
 
 def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:

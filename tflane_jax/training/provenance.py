@@ -72,11 +72,13 @@ def add_provenance(folder: Path, **more: Any) -> list[str]:
 
 
 def read_provenance(folder: Path) -> list[dict[str, Any]]:
-    """Return the record of every start of a run, the first one first; empty where there is none."""
+    """Return the record of every start of a run, the first one first; those that are damaged are left out."""
     try:
-        return json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        content = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return []
+    starts = content if isinstance(content, list) else []
+    return [start for start in starts if isinstance(start, dict) and isinstance(start.get("threads", {}), dict)]
 
 
 def _listed(setting: dict[str, Any]) -> str:

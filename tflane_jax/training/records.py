@@ -2,27 +2,50 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
+from tflane_jax.files.fields import read_text
 
 Record = dict[str, Any]
 
 
 def read_records(path: Path) -> list[Record]:
-    """Return the records of a metrics.jsonl in order, without a last line that was cut short."""
+    """Return the records of a metrics.jsonl in order, up to the first line that is none (a last one may be cut short).
+
+    Raises UserError if the file cannot be read as text.
+    """
     if not path.exists():
         return []
+    try:
+        lines = read_text(path, "file of records").splitlines()
+    except UserError as error:
+        raise UserError(f"{error}: move it away, the run goes on without its earlier records") from error
     records = []
-    for line in path.read_text(encoding="utf-8").splitlines():
+    for line in lines:
         try:
-            records.append(json.loads(line))
-        except ValueError:
+            record = json.loads(line)
+        except (ValueError, RecursionError):
             break
+        if not _is_record(record):
+            break
+        records.append(record)
     return records
+
+
+def _is_record(record: Any) -> bool:
+    if not isinstance(record, dict) or type(record.get("step")) is not int or not isinstance(record.get("split"), str):
+        return False
+    values = [value for name, value in record.items() if name not in ("step", "split")]
+    numbers = [number for value in values for number in (value if isinstance(value, list) else [value])]
+    return all(type(number) in (int, float) for number in numbers)
 
 
 class RecordWriter:
@@ -37,27 +60,20 @@ class RecordWriter:
     """
 
     def __init__(self, folder: Path, step: int):
-        from tensorboardX import SummaryWriter
-
-        path = folder / "metrics.jsonl"
+        self._path = path = folder / "metrics.jsonl"
         self.records = [record for record in read_records(path) if record["step"] <= step]
         write_text(path, "".join(_line(record) for record in self.records))
-        self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
-        purge = step + 1 if self.records else None
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=purge, write_to_disk=True)
+        with self._told():
+            self._board = _Board(folder / "tensorboard", step + 1 if self.records else None)
+            self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
 
     def write(self, record: Record) -> None:
-        """Append one record and flush the file."""
+        """Append one record and flush the files; raises UserError where that fails."""
         self.records.append(record)
-        self._file.write(_line(record))
-        self._file.flush()
-        for name, value in record.items():
-            if name in ("step", "split"):
-                continue
-            tag = f"{record['split']}/{name}"
-            tags = {f"{tag}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {tag: value}
-            for one, number in tags.items():
-                self._board.add_scalar(one, number, record["step"])
+        with self._told():
+            self._file.write(_line(record))
+            self._file.flush()
+            self._board.write(record)
 
     def __enter__(self) -> RecordWriter:
         return self
@@ -65,8 +81,59 @@ class RecordWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
-        self._board.close()
+        for file in (self._file, self._board):
+            with contextlib.suppress(OSError):  # what could not be written has been told by `write`
+                file.close()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise UserError(
+                f"cannot write the records in {self._path.parent}: {error.strerror or error}; make room or give the "
+                "right to write there, and go on with --resume"
+            ) from error
+
+
+class _Board:
+    """Scalars for TensorBoard.
+
+    tensorboardX's own `SummaryWriter` writes in a thread, which dies on a full disk and leaves the program waiting.
+
+    Args:
+        folder: of the event files.
+        purge: TensorBoard hides events of earlier files from this step on; None hides none.
+    """
+
+    def __init__(self, folder: Path, purge: int | None):
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self._events = EventsWriter(str(folder / "events"))
+        if purge is not None:
+            self._events.write_event(Event(step=purge, file_version="brain.Event:2"))
+            self._events.write_event(Event(step=purge, session_log=SessionLog(status=SessionLog.START)))
+
+    def write(self, record: Record) -> None:
+        """Append the values of a record and flush the file."""
+        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+        from tensorboardX.summary import scalar
+
+        for name, value in record.items():
+            if name in ("step", "split"):
+                continue
+            tag = f"{record['split']}/{name}"
+            tags = {f"{tag}/{i}": v for i, v in enumerate(value)} if isinstance(value, list) else {tag: value}
+            for one, number in tags.items():
+                event = Event(step=record["step"], wall_time=time.time(), summary=scalar(one, number))
+                self._events.write_event(event)
+        self._events.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._events.close()
 
 
 class Unwritten:

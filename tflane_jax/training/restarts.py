@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.training.adaptive import AdaptiveConfig, Memory, check_adaptive, judge
+from tflane_jax.limits import Fraction, at_least, below
+from tflane_jax.training.adaptive import AdaptiveConfig, Memory, judge
 
 _LONGEST = 2**29  # steps; twice that still is an int32
 
@@ -42,9 +43,9 @@ class RestartsConfig:
         adaptive: rule that changes cycles by the evaluations; None for fixed cycles.
     """
 
-    cycle_steps: int = 1000
-    factor: float = 2.0
-    floor: float = 0.0
+    cycle_steps: Annotated[int, at_least(1), below(_LONGEST)] = 1000
+    factor: Annotated[float, at_least(1)] = 2.0
+    floor: Fraction = 0.0
     last_cycle: Literal["cut", "fit"] = "cut"
     adaptive: AdaptiveConfig | None = None
 
@@ -67,18 +68,6 @@ class Cycle(NamedTuple):
     period: Int[Array, "*seeds"]
     magnitude: Float[Array, "*seeds"]
     number: Int[Array, "*seeds"]
-
-
-def check_restarts(config: RestartsConfig) -> None:
-    """Raise UserError for a setting out of its range."""
-    if not 1 <= config.cycle_steps < _LONGEST:
-        raise UserError(f"optim.restarts.cycle_steps is {config.cycle_steps}: it must be at least 1 (and below 2^29)")
-    if not config.factor >= 1.0:
-        raise UserError(f"optim.restarts.factor is {config.factor}: it must be at least 1")
-    if not 0.0 <= config.floor <= 1.0:
-        raise UserError(f"optim.restarts.floor is {config.floor}: it is relative to optim.lr, from 0 to 1")
-    if config.adaptive is not None:
-        check_adaptive(config.adaptive)
 
 
 def first_cycle(config: RestartsConfig, start: int, steps: int) -> Cycle:

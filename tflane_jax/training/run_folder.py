@@ -11,16 +11,17 @@ evaluations/              tables of `tflane eval`
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import is_temporary
+from tflane_jax.files.atomic import check_writable, is_temporary
+from tflane_jax.files.fields import load_json
 
 Start = Literal["new", "resume", "overwrite"]
+_COPY = 'A copy is the entry "config" of checkpoints/step_.../manifest.json: write it there, or start with --overwrite'
 _CONTENT = (
     "config.json",
     "config.txt",
@@ -38,12 +39,16 @@ _CONTENT = (
 
 def read_config(folder: Path) -> dict[str, Any]:
     """Return the resolved configuration of a run as saved (JSON); raises UserError if the folder holds no run."""
+    path = folder / "config.json"
+    if not path.exists():
+        raise UserError(f"{folder} holds no run (it has no config.json)")
     try:
-        return json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise UserError(f"{folder} holds no run (it has no config.json)") from error
-    except ValueError as error:
-        raise UserError(f"{folder / 'config.json'} is damaged ({error}): checkpoints hold a copy") from error
+        content = load_json(path)
+    except UserError as error:
+        raise UserError(f"{error}. {_COPY}") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path} is damaged: it holds no configuration. {_COPY}")
+    return content
 
 
 @contextlib.contextmanager
@@ -73,8 +78,9 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
 
 
 def check_start(folder: Path, start: Start) -> None:
-    """Raise UserError if the folder does not fit `start`, see `claimed`. Nothing is written."""
+    """Raise UserError if the folder does not fit `start`, see `claimed`, or cannot be written. Nothing is written."""
     holds_run = (folder / "config.json").exists()
+    check_writable(folder / "run.lock")
     if start == "new" and holds_run:
         raise UserError(
             f"{folder} already holds a run: continue it with --resume, replace it with --overwrite, "
@@ -82,7 +88,10 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
-    found = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+    try:
+        found = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+    except OSError as error:
+        raise UserError(f"cannot read {folder}: {error.strerror or error}") from error
     # A process killed while it wrote the first file leaves a temporary one: still no foreign file.
     if not holds_run and (other := {name for name in found if not is_temporary(name)} - set(_CONTENT)):
         raise UserError(f"{folder} is not empty ({min(other)}) and holds no run: choose another folder with --out")

@@ -8,19 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from tflane_jax.errors import UserError
+from tflane_jax.limits import (
+    INCREASING,
+    NOT_EMPTY,
+    Count,
+    CountOrZero,
+    Factor,
+    Fraction,
+    FractionBelowOne,
+    Positive,
+    PositiveOrInfinite,
+    PositiveOrZero,
+    Rules,
+    SettingError,
+    check_settings,
+)
 from tflane_jax.training.muon import scale_by_muon
 from tflane_jax.training.restarts import (
     Cycle,
     RestartsConfig,
-    check_restarts,
     current_cycle,
     cycle_of,
     first_cycle,
@@ -39,8 +52,8 @@ class DropsConfig:
         factor: on the rate at each drop.
     """
 
-    steps: tuple[int, ...] = (450_000,)
-    factor: float = 0.1
+    steps: Annotated[tuple[Count, ...], NOT_EMPTY, INCREASING] = (450_000,)
+    factor: Factor = 0.1
 
 
 @dataclass(frozen=True)
@@ -48,7 +61,7 @@ class OptimConfig:
     """Optimiser and averaging.
 
     Attributes:
-        lr: peak learning rate.
+        lr: peak learning rate; 0 changes nothing but running statistics and averages.
         warmup_steps: steps of linear rise from `warmup_ratio * lr` to `lr`.
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
         weight_decay: on kernels and embeddings only.
@@ -67,22 +80,30 @@ class OptimConfig:
         drops: steps at which a constant rate drops, in place of the cosine; None for none.
     """
 
-    lr: float = 2e-4
-    warmup_steps: int = 500
-    warmup_ratio: float = 1 / 3
-    final_ratio: float = 1e-3
-    weight_decay: float = 0.01
+    lr: PositiveOrZero = 2e-4
+    warmup_steps: CountOrZero = 500
+    warmup_ratio: Fraction = 1 / 3
+    final_ratio: Fraction = 1e-3
+    weight_decay: PositiveOrZero = 0.01
     decay: Literal["decoupled", "coupled"] = "decoupled"
     optimizer: Literal["adam", "muon"] = "adam"
     muon_kernels: Literal["dense", "dense_and_convolution"] = "dense"
-    clip_norm: float = 35.0
-    b1: float = 0.9
-    b2: float = 0.999
-    eps: float = 1e-8
-    ema_decay: float = 0.999
-    epoch_steps: int = 0
+    clip_norm: PositiveOrInfinite = 35.0
+    b1: FractionBelowOne = 0.9
+    b2: FractionBelowOne = 0.999
+    eps: Positive = 1e-8
+    ema_decay: FractionBelowOne = 0.999
+    epoch_steps: CountOrZero = 0
     restarts: RestartsConfig | None = None
     drops: DropsConfig | None = None
+
+    def limits(self) -> Rules:
+        """One rule lowers the learning rate."""
+        alone = not self.epoch_steps or self.restarts is None
+        yield "epoch_steps", alone, "0 with restarts: optim.epoch_steps and optim.restarts exclude each other"
+        for name, value in (("restarts", self.restarts), ("epoch_steps", self.epoch_steps)):
+            alone = self.drops is None or not value
+            yield "drops", alone, f"None with {name}: optim.drops and optim.{name} exclude each other"
 
 
 Rate = Callable[[Any, Int[ArrayLike, ""]], Float[Array, ""]]
@@ -214,30 +235,17 @@ def _cycle_rate(config: OptimConfig, restarts: RestartsConfig, cycle: Cycle) -> 
     return config.lr * warmup_factor(config, cycle.count) * relative_rate(restarts, cycle)
 
 
+def warmup_fits(config: OptimConfig, steps: int) -> tuple[str, bool, str]:
+    """Return the rule that the warm-up ends before the run does."""
+    allowed = f"less than the steps of the run (training.steps, {steps})"
+    return "optim.warmup_steps", config.warmup_steps < steps, allowed
+
+
 def _check(config: OptimConfig, steps: int) -> None:
-    if not 0 <= config.warmup_steps < steps:
-        raise UserError(
-            f"optim.warmup_steps is {config.warmup_steps} but there are only {steps} steps: "
-            "lower optim.warmup_steps or raise training.steps"
-        )
-    if config.epoch_steps < 0:
-        raise UserError(f"optim.epoch_steps is {config.epoch_steps}: it must be at least 0")
-    if config.restarts is not None:
-        if config.epoch_steps:
-            raise UserError("optim.epoch_steps and optim.restarts exclude each other: set epoch_steps to 0")
-        check_restarts(config.restarts)
-    if config.drops is not None:
-        _check_drops(config, config.drops)
-
-
-def _check_drops(config: OptimConfig, drops: DropsConfig) -> None:
-    if config.restarts is not None or config.epoch_steps:
-        other = "restarts" if config.restarts is not None else "epoch_steps"
-        raise UserError(f"optim.drops and optim.{other} exclude each other: set one of them to its default")
-    if not drops.steps or list(drops.steps) != sorted(set(drops.steps)) or drops.steps[0] < 1:
-        raise UserError(f"optim.drops.steps is {drops.steps}: it must be ascending numbers of updates, at least 1")
-    if not 0.0 < drops.factor <= 1.0:
-        raise UserError(f"optim.drops.factor is {drops.factor}: it must be above 0 and at most 1")
+    check_settings(config, "optim.")
+    setting, fits, allowed = warmup_fits(config, steps)
+    if not fits:
+        raise SettingError(setting, config.warmup_steps, allowed)
 
 
 def is_decayed(params: Vectors) -> Vectors:

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
+from tflane_jax.limits import Count, Fraction, Positive
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.roads.map_networks import build_map_network
@@ -58,10 +59,10 @@ class WorldConfig:
     traffic: TrafficConfig = TrafficConfig()
     tracker: TrackerConfig = TrackerConfig()
     markers: PlacementConfig = PlacementConfig()
-    severity: float = 0.5
-    duration_s: float = 8.0
-    rate_hz: float = 10.0
-    keyframes: int = 4
+    severity: Fraction = 0.5
+    duration_s: Positive = 8.0
+    rate_hz: Positive = 10.0
+    keyframes: Count = 4
 
     @property
     def frames(self) -> int:

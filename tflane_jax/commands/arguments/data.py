@@ -1,4 +1,4 @@
-"""Arguments of `tflane data`."""
+"""Arguments of `tflane data` and `tflane cache`."""
 
 from __future__ import annotations
 
@@ -120,6 +120,20 @@ def data(commands) -> None:
     )
     build.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the built-in world)")
     build.set_defaults(takes_overrides=True)
+
+
+def cache(commands) -> None:
+    """Add `tflane cache`."""
+    text = "list or delete what is kept between runs: examples of the built-in world, programs, weights"
+    parser = commands.add_parser("cache", help=text, description=f"{text[0].upper()}{text[1:]}.")
+    inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
+    where = "Entries lie in the folder named by TFLANE_CACHE (default ~/.cache/tflane_jax)."
+    command(inner, "list", "list the entries, with size and age", module="cache", function="show", epilog=where)
+    clear = command(inner, "clear", "delete entries", module="cache", function="clear", epilog=where)
+    chosen = clear.add_mutually_exclusive_group(required=True)
+    chosen.add_argument("names", metavar="NAME", nargs="*", default=[], help="as `tflane cache list` gives them")
+    chosen.add_argument("--older", metavar="DAYS", type=float, help="all but weights that were not used for so long")
+    chosen.add_argument("--all", action="store_true", help="all entries but weights")
 
 
 def _moment(text: str) -> float:

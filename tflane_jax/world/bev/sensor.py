@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.special import ndtri
 
 from tflane_jax.geometry import BevGrid, PerceptionRange, transform_points
+from tflane_jax.limits import Fraction, Positive, PositiveOrZero
 from tflane_jax.scene import BevChannel
 from tflane_jax.world.bev.line_of_sight import Directions, hidden_points
 from tflane_jax.world.bev.map_samples import MapSamples
@@ -51,14 +52,14 @@ class BevSensorConfig:
     """
 
     grid: BevGrid = BevGrid()
-    severity: float = 1.0
-    sight_range: float = 65.0
-    weather_range_loss: float = 0.5
-    far_blur: float = 0.8
-    far_error: float = 0.8
-    lost: float = 0.08
-    invented: float = 0.008
-    noise: float = 0.03
+    severity: Fraction = 1.0
+    sight_range: Positive = 65.0
+    weather_range_loss: Fraction = 0.5
+    far_blur: Fraction = 0.8
+    far_error: PositiveOrZero = 0.8
+    lost: Fraction = 0.08
+    invented: Fraction = 0.008
+    noise: PositiveOrZero = 0.03
 
 
 def hidden_cells(

@@ -8,11 +8,12 @@ from __future__ import annotations
 import functools
 import zlib
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.errors import UserError
+from tflane_jax.limits import NOT_EMPTY, Count, Fraction, Positive, PositiveOrZero, Rules, check_settings
 from tflane_jax.world.render.camera import FrontCamera, camera_pose
 from tflane_jax.world.render.weather import FrontWeatherConfig
 
@@ -43,9 +44,9 @@ class CameraMount:
     z: float
     yaw: float
     pitch: float
-    focal: float
-    width: int
-    height: int
+    focal: Positive
+    width: Count
+    height: Count
 
 
 ARGOVERSE2_RING = (
@@ -85,15 +86,15 @@ class CameraRigConfig:
             learns it in cells of 32); None leaves it out.
     """
 
-    cameras: tuple[CameraMount, ...] = NUSCENES_RING
-    scale: float = 0.1
-    multiple: int = 1
-    jitter: float = 1.0
-    severity: float = 1.0
+    cameras: Annotated[tuple[CameraMount, ...], NOT_EMPTY] = NUSCENES_RING
+    scale: Positive = 0.1
+    multiple: Count = 1
+    jitter: PositiveOrZero = 1.0
+    severity: Fraction = 1.0
     weather: FrontWeatherConfig = FrontWeatherConfig()
-    element_pixels: float = 8.0
+    element_pixels: PositiveOrZero = 8.0
     markers: bool = False
-    depth_cell: int | None = None
+    depth_cell: Count | None = None
 
     @property
     def supersample(self) -> int:
@@ -107,19 +108,10 @@ class CameraRigConfig:
         )
         return width, height
 
-    def validate(self) -> None:
-        """Raise UserError for a rig without cameras, too small images or a severity outside 0 to 1."""
-        if not self.cameras:
-            raise UserError("a camera rig needs at least one camera: give CameraRigConfig.cameras")
-        if not 0.0 <= self.severity <= 1.0:
-            raise UserError(f"CameraRigConfig.severity must be between 0 and 1, not {self.severity}")
-        if self.multiple < 1 or min(min(self.size(mount)) for mount in self.cameras) < 8:
-            raise UserError(
-                f"CameraRigConfig.scale = {self.scale} with multiple = {self.multiple} leaves less than 8 pixels of an "
-                "image: raise scale, and multiple to at least 1"
-            )
-        if self.depth_cell is not None and self.depth_cell < 1:
-            raise UserError(f"CameraRigConfig.depth_cell must be at least 1 pixel, or None, not {self.depth_cell}")
+    def limits(self) -> Rules:
+        """Images are not too small to show anything."""
+        sizes = [size for mount in self.cameras for size in self.size(mount)]
+        yield "scale", min(sizes) >= 8, "so large that images have at least 8 pixels in each direction"
 
 
 @functools.lru_cache(maxsize=16)
@@ -128,7 +120,7 @@ def draw_rig(seed: int, config: CameraRigConfig) -> tuple[FrontCamera, ...]:
 
     A camera depends on the seed, its own mount, scale, multiple and jitter alone, not on the other cameras.
     """
-    config.validate()
+    check_settings(config, "CameraRigConfig.")
     return tuple(_draw_camera(seed, mount, config) for mount in config.cameras)
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.world.roads.config import Range
+from tflane_jax.limits import SOME_WEIGHT, PositiveOrZero, Range
 
 Rgb = Float[np.ndarray, "3"]
 
@@ -39,7 +40,7 @@ class FrontWeatherConfig:
         contrast, exposure, tint: largest relative deviation of the camera's tone.
     """
 
-    kinds: tuple[tuple[Sky, float], ...] = (
+    kinds: Annotated[tuple[tuple[Sky, PositiveOrZero], ...], SOME_WEIGHT] = (
         (Sky.CLEAR, 0.26),
         (Sky.LOW_SUN, 0.14),
         (Sky.OVERCAST, 0.22),
@@ -50,12 +51,12 @@ class FrontWeatherConfig:
     )
     fog: Range = (45.0, 160.0)
     rain: Range = (120.0, 500.0)
-    noise: float = 0.03
-    blur: float = 0.9
-    wear: float = 1.0
-    contrast: float = 0.35
-    exposure: float = 0.35
-    tint: float = 0.1
+    noise: PositiveOrZero = 0.03
+    blur: PositiveOrZero = 0.9
+    wear: PositiveOrZero = 1.0
+    contrast: PositiveOrZero = 0.35
+    exposure: PositiveOrZero = 0.35
+    tint: PositiveOrZero = 0.1
 
 
 @dataclass(frozen=True)

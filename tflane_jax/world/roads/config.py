@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import Annotated
 
-Range = tuple[float, float]
+from tflane_jax.limits import SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range
 
 
 class SceneKind(enum.Enum):
@@ -61,7 +62,7 @@ class RoadConfig:
         building_setback: distance of buildings behind the kerb.
     """
 
-    kinds: tuple[tuple[SceneKind, float], ...] = (
+    kinds: Annotated[tuple[tuple[SceneKind, PositiveOrZero], ...], SOME_WEIGHT] = (
         (SceneKind.ROAD, 0.16),
         (SceneKind.LANE_DROP, 0.06),
         (SceneKind.LANE_GAIN, 0.06),
@@ -72,9 +73,9 @@ class RoadConfig:
         (SceneKind.TWO_JUNCTIONS, 0.14),
         (SceneKind.ROUNDABOUT, 0.06),
     )
-    reach: float = 130.0
-    ego_reach: float = 70.0
-    vertex_spacing: float = 1.6
+    reach: Positive = 130.0
+    ego_reach: Positive = 70.0
+    vertex_spacing: Positive = 1.6
     lane_width: Range = (2.9, 3.8)
     ring_lane_width: Range = (4.2, 5.2)
     bike_width: Range = (1.5, 1.9)
@@ -85,25 +86,25 @@ class RoadConfig:
     urban_speed: Range = (8.3, 14.0)
     fast_speed: Range = (16.0, 25.0)
     ramp_speed: Range = (11.0, 16.0)
-    comfortable_lateral_acceleration: float = 2.2
+    comfortable_lateral_acceleration: Positive = 2.2
     bend_radius: Range = (45.0, 200.0)
     fast_bend_radius: Range = (180.0, 600.0)
     corner_radius: Range = (4.5, 9.0)
     crossing_width: Range = (2.6, 4.2)
-    solid_before_stop: float = 25.0
+    solid_before_stop: PositiveOrZero = 25.0
     taper: Range = (18.0, 26.0)
     fast_taper: Range = (30.0, 45.0)
     pocket: Range = (38.0, 46.0)
-    skew: float = 25.0
-    arm_offset: float = 2.0
-    junction_lanes: int = 3
-    one_way: float = 0.2
-    median: float = 0.35
-    bike: float = 0.25
-    parking: float = 0.35
-    mid_block_crossing: float = 0.3
-    signals: float = 0.6
-    crossings: float = 0.8
-    turn_restriction: float = 0.12
-    sidewalk: float = 1.8
+    skew: PositiveOrZero = 25.0
+    arm_offset: PositiveOrZero = 2.0
+    junction_lanes: Count = 3
+    one_way: Fraction = 0.2
+    median: Fraction = 0.35
+    bike: Fraction = 0.25
+    parking: Fraction = 0.35
+    mid_block_crossing: Fraction = 0.3
+    signals: Fraction = 0.6
+    crossings: Fraction = 0.8
+    turn_restriction: Fraction = 0.12
+    sidewalk: PositiveOrZero = 1.8
     building_setback: Range = (4.0, 10.0)

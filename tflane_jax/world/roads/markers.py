@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import pose_matrix
+from tflane_jax.limits import Count, Positive, PositiveOrZero
 from tflane_jax.scene.logs import LaneSegment, PlacedMarkers, VectorMap
 
 ROOT = 20_251_122
@@ -52,12 +53,12 @@ class PlacementConfig:
 
     per: Literal["approach", "scene"] = "approach"
     side: Literal["near", "both"] = "near"
-    size: float = 1.0
-    height: float = 3.0
-    setback: float = 0.8
-    toe_in: float = 5.0
-    jitter: float = 3.0
-    dictionary: int = 100
+    size: Positive = 1.0
+    height: PositiveOrZero = 3.0
+    setback: PositiveOrZero = 0.8
+    toe_in: PositiveOrZero = 5.0
+    jitter: PositiveOrZero = 3.0
+    dictionary: Count = 100
     site: Literal["junction", "clear"] = "junction"
 
 

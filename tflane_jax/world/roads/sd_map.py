@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange, clip_to_range, invert_pose, resample_lines, transform_points
 from tflane_jax.geometry.poses import yaw_pose
+from tflane_jax.limits import Count, Positive, PositiveOrZero, at_least
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.scene.logs import Log
 
@@ -44,14 +45,14 @@ class SdMapConfig:
         crossings: whether pedestrian crossings are lines of the map.
     """
 
-    lines: int = 24
-    points: int = 11
+    lines: Count = 24
+    points: Annotated[int, at_least(2)] = 11
     range: PerceptionRange = BevGrid().range
-    tolerance: float = 1.0
-    survey: float = 1.5
-    translation: float = 0.0
-    yaw_deg: float = 0.0
-    drift_s: float = 30.0
+    tolerance: PositiveOrZero = 1.0
+    survey: PositiveOrZero = 1.5
+    translation: PositiveOrZero = 0.0
+    yaw_deg: PositiveOrZero = 0.0
+    drift_s: Positive = 30.0
     crossings: Literal["include", "exclude"] = "include"
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.limits import SOME_WEIGHT, Fraction, Positive, PositiveOrZero
 from tflane_jax.scene import RoadUser
 from tflane_jax.world.roads.networks import RoadNetwork
 from tflane_jax.world.traffic.demand import Trips, draw_trips
@@ -48,25 +50,25 @@ class TrafficConfig:
         step_s: largest time step, seconds; frames within a step assume constant acceleration.
     """
 
-    vehicles_per_metre: float = 0.032
-    category_share: tuple[tuple[RoadUser, float], ...] = (
+    vehicles_per_metre: PositiveOrZero = 0.032
+    category_share: Annotated[tuple[tuple[RoadUser, PositiveOrZero], ...], SOME_WEIGHT] = (
         (RoadUser.CAR, 0.79),
         (RoadUser.TRUCK, 0.1),
         (RoadUser.BUS, 0.05),
         (RoadUser.MOTORCYCLE, 0.06),
     )
-    bicycles_per_metre: float = 0.012
-    parked_share: float = 0.55
-    pedestrians_per_metre: float = 0.015
-    crossers_per_minute: float = 3.0
-    variety: float = 0.0
-    ego_top_speed: float = 14.0
-    ego_passes_s: float | None = None
-    green_wave: float = 0.6
-    range: float = 90.0
-    warm_up_s: float = 20.0
-    early_s: float = 40.0
-    step_s: float = 0.2
+    bicycles_per_metre: PositiveOrZero = 0.012
+    parked_share: Fraction = 0.55
+    pedestrians_per_metre: PositiveOrZero = 0.015
+    crossers_per_minute: PositiveOrZero = 3.0
+    variety: Fraction = 0.0
+    ego_top_speed: Positive = 14.0
+    ego_passes_s: Positive | None = None
+    green_wave: Fraction = 0.6
+    range: Positive = 90.0
+    warm_up_s: PositiveOrZero = 20.0
+    early_s: PositiveOrZero = 40.0
+    step_s: Positive = 0.2
 
 
 @dataclass(frozen=True)

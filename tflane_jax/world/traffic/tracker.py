@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
+from tflane_jax.limits import CountOrZero, Fraction, Positive, PositiveOrZero
 from tflane_jax.scene.logs import Tracks
 from tflane_jax.world.bev.line_of_sight import hidden_points
 
@@ -41,20 +42,20 @@ class TrackerConfig:
         look_every_s: interval at which line of sight is computed, seconds; it is interpolated in between.
     """
 
-    range: float = 60.0
-    falloff: float = 25.0
-    view_needed: float = 0.35
-    drop: float = 0.03
-    position_noise: float = 0.08
-    position_noise_growth: float = 0.003
-    yaw_noise: float = 0.03
-    size_noise: float = 0.03
-    velocity_noise: float = 0.3
-    correlation: float = 0.7
-    coast: int = 5
-    switch_rate: float = 0.02
-    switch_distance: float = 3.5
-    look_every_s: float = 0.3
+    range: Positive = 60.0
+    falloff: Positive = 25.0
+    view_needed: Fraction = 0.35
+    drop: Fraction = 0.03
+    position_noise: PositiveOrZero = 0.08
+    position_noise_growth: PositiveOrZero = 0.003
+    yaw_noise: PositiveOrZero = 0.03
+    size_noise: PositiveOrZero = 0.03
+    velocity_noise: PositiveOrZero = 0.3
+    correlation: Fraction = 0.7
+    coast: CountOrZero = 5
+    switch_rate: Fraction = 0.02
+    switch_distance: PositiveOrZero = 3.5
+    look_every_s: Positive = 0.3
 
     def with_noise(self, scale: float) -> TrackerConfig:
         """Return the tracker with noise and misses scaled."""

@@ -1,0 +1,62 @@
+"""What is checked of a run before its data are built and its programs compiled: settings, names of scores, files."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+from tflane_jax.config import RunConfig
+from tflane_jax.config_io import settings
+from tflane_jax.datasets.sources import source_of
+from tflane_jax.errors import UserError
+from tflane_jax.limits import SettingError, check_settings
+from tflane_jax.scene import Example, RoadImage
+from tflane_jax.tasks.lane_shape import LaneShapeTask
+
+KINDS = {Example: "lane graphs", RoadImage: "images"}
+"""Kinds of examples, in words."""
+
+
+def check_run(config: RunConfig) -> None:
+    """Raise UserError, naming the setting, where a run with this configuration must fail.
+
+    A limit is broken, data and model do not fit together, a score is named that the evaluation does not compute, or a
+    file or folder of the training or validation data is missing.
+    """
+    check_settings(config)
+    check_kind(config)
+    config.task.check_settings(config.data)
+    _check_scores(config)
+    _check_files(config)
+
+
+def check_kind(config: RunConfig) -> None:
+    """Raise UserError if the task takes examples of another kind than the data give."""
+    given = source_of(config.data.source("train")).example
+    taken = RoadImage if isinstance(config.task, LaneShapeTask) else Example
+    if given is not taken:
+        raise UserError(
+            f"this configuration's data are {KINDS[given]} (data is {type(config.data).__name__}), but its task takes "
+            f"{KINDS[taken]} (task is {type(config.task).__name__}): change either"
+        )
+
+
+def _check_scores(config: RunConfig) -> None:
+    known = config.task.score_names(config.data, config.evaluation)
+    adaptive = None if config.optim.restarts is None else config.optim.restarts.adaptive
+    named = {"training.best_metric": config.training.best_metric}
+    if adaptive is not None:
+        named["optim.restarts.adaptive.metric"] = adaptive.metric
+    for setting, name in named.items():
+        if name not in known:
+            listed = ", ".join(sorted(score for score in known if "@" not in score))
+            close = difflib.get_close_matches(name, sorted(known), 3)
+            hint = f"; did you mean {' or '.join(close)}?" if close else ""
+            raise SettingError(setting, name, f"a score that the evaluation computes: choose one of {listed}{hint}")
+
+
+def _check_files(config: RunConfig) -> None:
+    for name, value in settings(config.data, "data."):
+        # Training does not read the test split.
+        if isinstance(value, Path) and name != "data.test" and not value.exists():
+            raise SettingError(name, str(value), "a file or folder that exists")

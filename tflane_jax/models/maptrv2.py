@@ -123,15 +123,16 @@ class MapTrV2(MapTr):
         """Return the predictions of one set of queries; those of the one-to-many group exchange nothing with others."""
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         (lines, points, dim), outputs = queries.shape, []
-        groups = None
+        groups, sizes = None, ()
         if lines > config.queries:
+            sizes = config.queries * points, (lines - config.queries) * points
             many = jnp.arange(lines) >= config.queries
             groups = many[:, None] == many[None]
         every = None if groups is None else jnp.repeat(jnp.repeat(groups, points, 0), points, 1)
         for i in range(config.layers):
             placed = point_position(config, i, position, reference)
             points_alone = reference.reshape(-1, 1, reference.shape[-1])
-            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every)
+            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every, sizes)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
             layer = DecoupledLayer(config, name=f"layer_{i}")
             queries = layer(queries, placed, reference, bev, groups, deterministic=deterministic)

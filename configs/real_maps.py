@@ -4,9 +4,9 @@
     tflane train --config real_maps:mixed --data.maps FOLDER --data.test-logs LOG
     tflane eval RUN --data recorded --root FOLDER
 
-FOLDER holds logs of Argoverse 2, scene files of nuScenes, or lanes as GeoJSON, in any depth. A log in `test_logs` or
-`val_logs` is no training map. The third command tests on recorded traffic; `tflane carry-over` does all of it, with
-each log left out once. No result yet; docs/real_roads.md tells what a run costs.
+FOLDER holds logs of Argoverse 2, scene files of nuScenes, segments of OpenLane-V2, or lanes as GeoJSON, in any depth.
+A log in `test_logs` or `val_logs` is no training map. The third command tests on recorded traffic; `tflane carry-over`
+does all of it, with each log left out once. No result yet; docs/real_roads.md tells what a run costs.
 """
 
 import dataclasses

@@ -23,6 +23,7 @@ FLOORS = (
     "world.bev",
     "world.traffic",
     "world.cameras world.front_view",
+    "world.terrain",
     "world.simulate",
     "world.presets",
     "markers",

@@ -6,12 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.datasets.openlane_scenes import DriveConfig, DriveDataset
 from tests.datasets.test_nuscenes_scenes import content
 from tests.test_cli import CONFIG as TINY
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tests.test_migrations import renamed_back
 from tflane_jax.config import RealMapData, RecordedData, RunConfig, WorldData, load_config
 from tflane_jax.config_io import to_json
+from tflane_jax.datasets.openlane_export import export_openlane_v2
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.models.toponet import paper_config
@@ -108,3 +111,19 @@ def test_test_frames_are_compared_with_the_places_of_the_training_split(tmp_path
     assert training_nearness(RunConfig(data=WorldData()), test) is None
     assert training_nearness(RunConfig(data=replace(maps, generated=1.0)), test) is None
     assert training_nearness(RunConfig(data=recorded), WorldData().source("test")) is None
+
+
+def test_the_training_split_may_lie_in_another_folder(tmp_path):
+    """Of a model that learned elsewhere, or whose configuration names another place: `--training-root`."""
+    pytest.importorskip("cv2")
+    scenes = DriveDataset(DriveConfig(scenes=1))
+    root = export_openlane_v2({"train": scenes, "val": scenes}, tmp_path / "data", progress=False)
+    source = OpenLaneV2Config(root, "val", "B", image=None)
+    found = training_nearness(RunConfig(data=WorldData()), source, root)
+    assert found is not None
+    assert found.groups == ["near training"] * 3
+    assert found.sentence() == "3 of 3 frames are within 5 m of a training frame; the nearest is 0.0 m away"
+    with pytest.raises(UserError, match=r"there is no folder .*elsewhere"):
+        training_nearness(RunConfig(data=WorldData()), source, tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="has no training split in a folder: leave out --training-root"):
+        training_nearness(RunConfig(), WorldData().source("test"), root)

@@ -7,15 +7,25 @@
 The cameras are nuScenes' ring with images of 800 x 480 pixels, as the paper has them. The reference trains 24 epochs of
 28,130 frames on eight GPUs, four frames each. `:bevformer` has BEVFormer's attention to the cameras instead of the
 kernel, `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
+
+    tflane convert --config tf_lane/maptr_r50:published_weights --weights maptr_tiny_r50_24e.pth --out runs/maptr
+    tflane eval runs/maptr --data nuscenes --root PATH
+
+`:published_weights` reads nuScenes as the published code does, in the lidar's axes, with the vehicle's CAN bus.
 """
 
 from dataclasses import replace
+from pathlib import Path
 
-from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.config import NuScenesData, RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
+from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
+from tflane_jax.geometry import BevGrid
 from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.lidar_axes import range_in_lidar_axes
 from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
@@ -44,7 +54,7 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return variants of the encoder."""
+    """Return variants of the encoder, and the published weights' inputs."""
     config, encoder = get_config(), PAPER_MAP_ENCODER
 
     def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
@@ -57,4 +67,30 @@ def ablations() -> dict[str, RunConfig]:
         "bevformer": with_encoder(replace(encoder, bev=replace(encoder.bev, attention="deformable"))),
         "remat": with_encoder(CameraEncoderConfig(images, bev)),
         "bfloat16": with_encoder(CameraEncoderConfig(*half)),
+        "published_weights": _published(with_encoder(replace(encoder, bev=LIDAR_BEV))),
     }
+
+
+# One frame at a time, on a grid with x to the right and y forward.
+LIDAR_BEV = replace(
+    PAPER_MAP_ENCODER.bev,
+    grid=BevGrid(range_in_lidar_axes(PAPER_RANGE), 200, 100),
+    align="bevformer",
+    temporal_value="initial",
+    memory="off",
+    motion="can_bus",
+)
+NUSCENES = NuScenesData(
+    Path("data/nuscenes"),
+    frame="lidar",
+    can_bus="reference",
+    image=TOPONET_SUBSET_B,
+    example=replace(NUSCENES_SIZES, range=PAPER_RANGE, sensor=None, map_lines=MapLinesConfig()),
+)
+
+
+def _published(config: RunConfig) -> RunConfig:
+    """Return a configuration on nuScenes in the lidar's axes."""
+    assert isinstance(config.task, LaneGraphTask)
+    task = replace(config.task, model=replace(config.task.model, axes="lidar"))
+    return replace(config, task=task, data=NUSCENES)

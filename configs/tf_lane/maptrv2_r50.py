@@ -5,23 +5,48 @@
         --optim.epoch_steps 0 --optim.warmup_steps 0
 
 Cameras, schedule and batch are those of `maptr_r50.py`; the built-in world gives the depth of every image cell.
+
+    tflane convert --config tf_lane/maptrv2_r50:published_weights --weights maptrv2_nusc_r50_24e.pth --out runs/maptrv2
+    tflane eval runs/maptrv2 --data nuscenes --root PATH
+
+`:published_weights` reads nuScenes as the published code does: in the lidar's axes, with the lift's border, and with
+cameras as calibrated, without the vehicle's motion between exposure and sweep.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config import NuScenesData, RunConfig, WorldData, load_config
+from tflane_jax.geometry import BevGrid
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
-from tflane_jax.models.maptrv2 import paper_config
+from tflane_jax.models.lidar_axes import range_in_lidar_axes
+from tflane_jax.models.maptrv2 import PAPER_LIFT_ENCODER, paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+MAPTR = str(Path(__file__).with_name("maptr_r50.py"))
 
 
 def get_config() -> RunConfig:
     """Return the paper's configuration."""
-    config = load_config(str(Path(__file__).with_name("maptr_r50.py")))
+    config = load_config(MAPTR)
     assert isinstance(config.data, WorldData)
     example = config.data.example
     assert example.cameras is not None
     # Cells of the feature maps: stride 32.
     data = replace(config.data, example=replace(example, cameras=replace(example.cameras, depth_cell=32)))
     return replace(config, task=LaneGraphTask(paper_config(), MapTrV2LossConfig(rings="both")), data=data)
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the published weights' inputs."""
+    config = load_config(f"{MAPTR}:published_weights")
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.data, NuScenesData)
+    lift = PAPER_LIFT_ENCODER.bev
+    grid = BevGrid(range_in_lidar_axes(lift.grid.range), 200, 100)
+    # There is no lidar to learn the depth from.
+    lift = replace(lift, grid=grid, border="published", supervised=False)
+    model = replace(paper_config(), encoder=replace(PAPER_LIFT_ENCODER, bev=lift), axes="lidar")
+    data = replace(config.data, camera_poses="calibration", can_bus="none")
+    task = LaneGraphTask(model, MapTrV2LossConfig(rings="both"))
+    return {"published_weights": replace(config, task=task, data=data)}

@@ -1,4 +1,4 @@
-"""Scenes of nuScenes as logs and examples, by hand-made values: tracks, traffic flow, frames, cameras, CAN bus."""
+"""Scenes of nuScenes as logs and examples, by hand-made values: tracks, traffic flow, frames, cameras."""
 
 import json
 import pickle
@@ -9,7 +9,6 @@ import pytest
 
 from tests.datasets.nuscenes_small import (
     DRIVEN,
-    EAST,
     NORTH,
     PITCH,
     START,
@@ -25,7 +24,6 @@ from tflane_jax.config_io import from_json, to_json
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesData, NuScenesDataset
-from tflane_jax.datasets.nuscenes_can_bus import can_bus
 from tflane_jax.datasets.nuscenes_log import road_user, scene_frames, scene_tracks
 from tflane_jax.datasets.nuscenes_tables import read_tables
 from tflane_jax.datasets.photometric import PhotometricConfig
@@ -180,6 +178,27 @@ def test_cameras_go_by_their_own_ego_pose(root, frame, ahead):
     pixels, depth, _ = project(np.array([[ahead, 1.0, 1.5]]), views.intrinsics[0], views.camera_from_ego[0])
     np.testing.assert_allclose(depth, 10 - 1.5 - DRIVEN, atol=1e-5)
     np.testing.assert_allclose(pixels[0], [400 - 500 / depth[0], 225.0], rtol=1e-5)
+    # The same point in the lidar's axes and in the vehicle's own frame, whatever the frame of the example is.
+    point = [ahead, 1.0, 1.5, 1.0]
+    np.testing.assert_allclose(views.vehicle.lidar_from_ego @ point, [-1.0, 9.06, 1.5 - 1.84, 1.0], atol=1e-5)
+    np.testing.assert_allclose(views.vehicle.vehicle_from_ego @ point, [10.0, 1.0, 1.5, 1.0], atol=1e-5)
+    assert views.vehicle.can_bus is None
+
+
+def test_published_weights_read_the_can_bus_and_cameras_as_calibrated(root):
+    write_images(root)
+    messages = [{"utime": START + 500_000, "accel": [0, 0, 9], "rotation_rate": [0, 0, 0.1], "vel": [5, 0, 0]}]
+    (root / "can_bus").mkdir()
+    (root / "can_bus" / "scene-0061_pose.json").write_text(json.dumps(messages))
+    settings = {"image": ImageConfig(scale=0.5), "camera_poses": "calibration", "can_bus": "reference"}
+    views = opened(root, **settings).example(1).cameras
+    depth = project(np.array([[10.0, 1.0, 1.5]]), views.intrinsics[0], views.camera_from_ego[0])[1]
+    np.testing.assert_allclose(depth, 10 - 1.5, atol=1e-5)  # without what was driven
+    np.testing.assert_allclose(views.vehicle.can_bus[:7], [400, 1105, 0, *[NORTH[0]] * 4], atol=1e-5)
+    np.testing.assert_allclose(views.vehicle.can_bus[7:], [0, 0, 9, 0, 0, 0.1, 5, 0, 0, np.pi / 2, 90], atol=1e-5)
+    (root / "can_bus" / "scene-0061_pose.json").unlink()
+    with pytest.raises(UserError, match=r"scene-0061_pose\.json"):
+        opened(root, **settings).example(1)
 
 
 def test_missing_and_strange_images_are_named(root):
@@ -260,57 +279,6 @@ def test_check_counts_and_lists_every_fault(root, capsys):
     assert "boston-seaport.json is missing" in text
     assert "scene-0061: 1 images are missing (first samples/CAM_FRONT/a2.jpg)" in text
     assert "row sample-b1: its timestamp is not later" in text
-
-
-POSES = [
-    {
-        "utime": START + 20_000 * i,
-        "pos": [9.0, 9.0, 9.0],
-        "orientation": [1.0, 0.0, 0.0, 0.0],
-        "accel": [i, 0.1, 9.8],
-        "rotation_rate": [0.0, 0.0, 10 + i],
-        "vel": [20 + i, 0.0, 0.0],
-    }
-    for i in range(3)
-]
-
-
-@pytest.mark.parametrize(
-    ("late", "rules", "message"),
-    [
-        (0, "plain", 0),
-        (30_000, "plain", 1),
-        (-5, "plain", 0),
-        (10**6, "plain", 2),
-        # The published code takes the motion of the message after the key frame.
-        (0, "reference", 1),
-        (30_000, "reference", 2),
-        (-5, "reference", 0),
-        (10**6, "reference", 2),
-    ],
-)
-def test_can_bus(tmp_path, late, rules, message):
-    (tmp_path / "scene-0061_pose.json").write_text(json.dumps(POSES))
-    found = can_bus(
-        tmp_path, "scene-0061", (START + late) * 1000, np.array([4.0, 5.0, 0.0]), np.array(NORTH), rules=rules
-    )
-    assert found.shape == (18,)
-    assert found[:3].tolist() == [4, 5, 0]
-    np.testing.assert_allclose(found[3:7], NORTH if rules == "plain" else [NORTH[0]] * 4)
-    assert found[7:16].tolist() == [message, 0.1, 9.8, 0, 0, 10 + message, 20 + message, 0, 0]
-    np.testing.assert_allclose(found[16:], [np.pi / 2, 90.0])
-
-
-def test_can_bus_without_messages(tmp_path):
-    found = can_bus(tmp_path, "scene-0161", START * 1000, np.zeros(3), np.array([NORTH[0], 0, 0, -NORTH[0]]))
-    assert not found[7:16].any()
-    np.testing.assert_allclose(found[16:], [1.5 * np.pi, 270.0])  # yaw runs from 0 to 2 pi
-    for content in ([], {"a": 1}, POSES[::-1], [{"utime": 1.5}], [POSES[0] | {"vel": [1.0, float("nan"), 0.0]}]):
-        (tmp_path / "scene-0061_pose.json").write_text(json.dumps(content))
-        with pytest.raises(UserError, match="scene-0061_pose"):
-            can_bus(tmp_path, "scene-0061", START * 1000, np.zeros(3), np.array(EAST))
-    with pytest.raises(UserError, match=r"scene-0001_pose\.json"):
-        can_bus(tmp_path, "scene-0001", START * 1000, np.zeros(3), np.array(EAST))
 
 
 def test_lines_are_cut_by_maptrs_rules(root):

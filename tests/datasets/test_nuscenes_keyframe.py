@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.shared import shared_path
-from tflane_jax.datasets.nuscenes_cameras import CAMERAS, camera_fits, sample_cameras
+from tflane_jax.datasets.nuscenes_cameras import CAMERAS, camera_fits, sample_cameras, vehicle_state
 from tflane_jax.datasets.nuscenes_log import level_poses
 from tflane_jax.datasets.nuscenes_tables import Tables
 from tflane_jax.datasets.openlane_example import camera_views
@@ -108,6 +108,15 @@ def test_the_pose_chain_of_the_tables_gives_the_same_pixels(keyframe):
     level = level_poses(global_from_ego[None], ego_from_lidar[None])[0]
     ahead = relative_pose(level, global_from_ego @ ego_from_lidar) @ [0.0, 10.0, 0.0, 1.0]
     np.testing.assert_allclose(ahead[:2], [10.0, 0.0], atol=0.01)
+
+    # From frame "lidar" into the lidar's axes, as a host of published weights has it: the published poses.
+    frame = relative_pose(level, level_poses(global_from_ego[None])[0])
+    state = vehicle_state(tables, {"name": "scene-0061"}, sample, frame)
+    level_cameras = sample_cameras(tables, sample, tables.ego_pose(sample), frame)
+    for camera in level_cameras:
+        lidar2cam = labelled(record, camera.name)[1]
+        pose = invert_pose(camera.ego_from_camera) @ invert_pose(state.lidar_from_ego)
+        np.testing.assert_allclose(pose, lidar2cam, atol=1e-4)
 
     images = camera_views(cameras, camera_fits(tables, TOPONET_SUBSET_B), TOPONET_SUBSET_B)
     images.validate()

@@ -131,6 +131,26 @@ def test_restrictions_are_composed_entry_by_entry(heads):
         np.testing.assert_array_equal(own, expected)
 
 
+def test_each_group_of_lanes_has_its_copy_of_the_instances():
+    """Entry by entry: within a group as without groups, between groups nothing."""
+    valid, pairs = random_bool(0, 3), random_bool(1, 2, 5, 3)
+    whole = SpatialMask.from_validity(
+        5, jnp.asarray(valid), jnp.asarray(np.arange(5)[:, None] // 2 == np.arange(5) // 2)
+    )
+    whole = whole.restricted(jnp.asarray(pairs))
+    copies = whole.by_group((2, 3))
+    np.testing.assert_array_equal(copies.valid, np.tile(valid, 2))
+    single, dense = (np.asarray(mask.dense()) for mask in (whole, copies))
+    np.testing.assert_array_equal(dense[:, :5, :5], single[:, :5, :5])
+    groups = [*range(2), 5, 6, 7], [*range(2, 5), 8, 9, 10]
+    for members, lanes in zip(groups, (slice(2), slice(2, 5)), strict=True):
+        kept = [*range(5)[lanes], 5, 6, 7]
+        np.testing.assert_array_equal(dense[:, members][:, :, members], single[:, kept][:, :, kept])
+    assert not dense[:, groups[0]][:, :, [8, 9, 10]].any()
+    assert not dense[:, groups[1]][:, :, [5, 6, 7]].any()
+    assert not dense[:, [5, 6, 7]][:, :, groups[1]].any()
+
+
 @pytest.mark.parametrize("frames", [0, 1, 4])
 def test_a_frame_sees_itself_and_earlier_ones(frames):
     expected = [[j <= i for j in range(frames)] for i in range(frames)]

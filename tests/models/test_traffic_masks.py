@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from tflane_jax.models.prior import HostQueries, HostSpec
 from tflane_jax.models.traffic_flow_module import (
     ALL_FUSIONS,
     LANE_FUSIONS,
+    EncodedTrafficFlow,
     SpatialEncoder,
     TemporalLayer,
     TrafficFlowConfig,
@@ -128,6 +130,45 @@ def test_heads_have_windows_of_their_own():
     mask = mask_of(TrafficMaskConfig(head_windows=(6.0, 90.0)))
     assert mask.lane_traffic.shape == (2, 2, 3)
     assert mask.lane_traffic.sum((1, 2)).tolist() == [2, 4]
+
+
+class Fusion(nn.Module):
+    """The hook of the traffic-flow prior alone, on tokens that stay the same."""
+
+    config: TrafficFlowConfig
+
+    @nn.compact
+    def __call__(self, asked):
+        tokens = EncodedTrafficFlow(jnp.linspace(-1.0, 1.0, 3 * DIM).reshape(3, DIM), tracks())
+        return self.config.build(HostSpec(DIM, RANGE, RANGE, "point")).into_queries(tokens, 0, asked)
+
+
+# In one softmax for all, tokens read lanes in the first layer and are read in the second.
+@pytest.mark.parametrize(("name", "depth"), [("paper", 1), ("joint", 2)])
+def test_groups_of_queries_hear_nothing_of_each_other(name, depth):
+    """MapTRv2's one-to-many group, by way of the road users as well: tokens read lanes, and lanes read tokens."""
+    module = TrafficFlowModuleConfig(heads=2, fusions=ALL_FUSIONS, spatial_depth=depth, masking=VARIANTS[name])
+    fusion = Fusion(TrafficFlowConfig(module=module))
+    # Two queries of the first group, then three of the second.
+    many, rows = np.arange(5) >= 2, np.arange(5) % 2
+    both = HostQueries(*(leaf[rows] for leaf in queries()[:3]), jnp.asarray(many[:, None] == many[None]), (2, 3))
+    both = both._replace(features=both.features + jnp.arange(5.0)[:, None])
+    alone = HostQueries(*(leaf[:2] for leaf in both[:3]))
+    params = random_params(fusion.init, alone)
+    pushed = [both.features.at[group].add(jnp.arange(float(DIM))[None]) for group in (slice(2, None), slice(2))]
+
+    def fused(asked, *changed):
+        return [fusion.apply(params, asked._replace(features=x)) for x in (asked.features, *changed)]
+
+    run = jax.jit(lambda: (fused(both, *pushed), fused(alone), fused(both._replace(groups=()), pushed[0])))
+    (before, second, first), (single,), leaking = run()
+    np.testing.assert_array_equal(before[:2], second[:2])
+    np.testing.assert_array_equal(before[2:], first[2:])
+    assert np.abs(before[2:] - second[2:]).max() > 0.1
+    # As if the first group were alone, which it is in evaluation.
+    np.testing.assert_allclose(before[:2], single, atol=1e-5)
+    # The host's mask alone does not keep them apart.
+    assert np.abs(leaking[0] - leaking[1])[:2].max() > 1e-3
 
 
 @pytest.mark.parametrize("temporal", ["all", "causal"])

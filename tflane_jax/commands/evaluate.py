@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"tflane eval takes one run: leave {rest[0]} out")
     trained = with_chosen_topology(with_chosen_traffic(trained, options), options)
     source = chosen_source(trained.config, options)
-    near = _nearness(trained, source)
+    near = _nearness(trained, source, options.training_root)
     groups = [] if near is None else near.groups
     protocol, rows = evaluate_run(trained, source, task=limited_task(trained, options), frame_groups=groups)
 
@@ -56,8 +56,12 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _nearness(run: Run, source: Any) -> Nearness | None:
-    """Return how far the examples are from the training frames; None where that cannot be told."""
+def _nearness(run: Run, source: Any, root: Path | None) -> Nearness | None:
+    """Return how far the examples are from the training frames; None where that cannot be told and nobody asked."""
+    if root is not None:
+        if (found := training_nearness(run.config, source, root)) is None:
+            raise UserError(f"{root}: no training frame is in a city of the evaluated frames")
+        return found
     try:
         return training_nearness(run.config, source)
     except UserError as error:

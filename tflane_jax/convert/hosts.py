@@ -32,7 +32,7 @@ from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.parameters import Params
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import CameraViews, Example
+from tflane_jax.scene import CameraViews, Example, VehicleState
 
 PublishedHost = TopoNetConfig | BevFormerDetrConfig | LaneSegNetConfig | MapTrConfig
 
@@ -115,6 +115,7 @@ def camera_shapes(encoder: CameraEncoderConfig) -> Any:
         intrinsics=shape((count, 3, 3), jnp.float32),
         camera_from_ego=shape((count, 4, 4), jnp.float32),
         valid=shape((count,), jnp.bool_),
+        vehicle=VehicleState(shape((4, 4), jnp.float32), shape((4, 4), jnp.float32), shape((18,), jnp.float32)),
     )
     nothing = dict.fromkeys(field.name for field in dataclasses.fields(Example))
     pose, flag = shape((4, 4), jnp.float32), shape((), jnp.bool_)

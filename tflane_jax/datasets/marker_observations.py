@@ -8,6 +8,7 @@ import weakref
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.prepared_map import prepare_map
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, relative_pose
 from tflane_jax.markers.detection import DetectedMarkers
 from tflane_jax.markers.observe import Detected, observe
@@ -90,6 +91,11 @@ def marker_observations(
     Detections are simulated, or found in native images of `cameras` (`MarkerConfig.pixels`). Warns
     (`TruncationWarning`) if more markers or lanes are in range than a capacity.
     """
+    if log.relief is not None:
+        raise UserError(
+            "fiducial markers are simulated on level ground only: set data.world.terrain to None, or leave out "
+            "data.example.markers"
+        )
     simulation, (markers, store) = config.simulation, _remembered(log, config.radius, bike_lanes)
     moment, before = log.keyframes[keyframe], moment_before(log, keyframe, simulation.residual_interval)
 

@@ -20,7 +20,14 @@ from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.loading import load_or_stream, stream
-from tflane_jax.datasets.nuscenes_cameras import camera_fits, missing_images, sample_cameras
+from tflane_jax.datasets.nuscenes_cameras import (
+    CameraPoses,
+    CanBus,
+    camera_fits,
+    missing_images,
+    sample_cameras,
+    vehicle_state,
+)
 from tflane_jax.datasets.nuscenes_log import (
     ReferenceFrame,
     SceneFrames,
@@ -61,6 +68,10 @@ class NuScenesConfig:
             `nuscenes_log.level_poses`). x is forward and y left in both.
         least_visibility: boxes of a lower level of visibility are `TrafficFlow.occluded`, as are those without lidar
             and radar points.
+        camera_poses: "exposure", where the vehicle was when a camera exposed; "calibration" leaves its motion out, as
+            MapTRv2's lift does.
+        can_bus: messages of the vehicle from the folder `can_bus`, by the "plain" rules or those of the "reference"
+            (`nuscenes_can_bus.can_bus`), for published weights that read them (`BevFormerConfig.motion`).
         image: scaling and cropping of the camera images; None does not read them.
         example: what is in an example, and its capacities. `example.cameras` must be None: cameras are real here.
         loading: workers that read images; they change no example.
@@ -72,6 +83,8 @@ class NuScenesConfig:
     splits: Path | None = None
     frame: ReferenceFrame = "ego"
     least_visibility: Visibility = "v0-40"
+    camera_poses: CameraPoses = "exposure"
+    can_bus: CanBus = "none"
     image: ImageConfig | None = None
     example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
@@ -115,13 +128,12 @@ class NuScenesDataset:
         if config.image is None:
             return example
         frames = self.frames(name)
-        cameras = sample_cameras(
-            self.tables,
-            frames.samples[number],
-            frames.global_from_ego[number],
-            frames.frame_from_ego[number] if config.frame == "lidar" else None,
-        )
-        return replace(example, cameras=camera_views(cameras, self._fits, config.image))
+        sample, vehicle = frames.samples[number], frames.global_from_ego[number]
+        pose = frames.frame_from_ego[number] if config.frame == "lidar" else None
+        cameras = sample_cameras(self.tables, sample, vehicle, pose, config.camera_poses)
+        views = camera_views(cameras, self._fits, config.image)
+        state = vehicle_state(self.tables, self.scenes[name], sample, pose, config.can_bus)
+        return replace(example, cameras=replace(views, vehicle=state))
 
     def info(self, index: int) -> FrameInfo:
         """Return scene, time and (level) pose of one key frame."""
@@ -182,7 +194,7 @@ class NuScenesData:
     Attributes:
         root: folder of the data set.
         train, val, test: which official split serves as each; the official test split has no annotations.
-        version, splits, frame, least_visibility, image, example, loading: see `NuScenesConfig`.
+        version, splits, frame, least_visibility, camera_poses, can_bus, image, example, loading: see `NuScenesConfig`.
         augmentation: of the colours of training images, or None.
     """
 
@@ -194,6 +206,8 @@ class NuScenesData:
     splits: Path | None = None
     frame: ReferenceFrame = "ego"
     least_visibility: Visibility = "v0-40"
+    camera_poses: CameraPoses = "exposure"
+    can_bus: CanBus = "none"
     image: ImageConfig | None = None
     example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
@@ -208,6 +222,8 @@ class NuScenesData:
             splits=self.splits,
             frame=self.frame,
             least_visibility=self.least_visibility,
+            camera_poses=self.camera_poses,
+            can_bus=self.can_bus,
             image=self.image,
             example=self.example,
             loading=self.loading,

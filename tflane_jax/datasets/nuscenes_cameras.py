@@ -7,19 +7,27 @@ therefore goes by its own ego pose: camera -> its ego -> global -> ego of the li
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.nuscenes_tables import Row, Tables
+from tflane_jax.datasets.nuscenes_can_bus import can_bus
+from tflane_jax.datasets.nuscenes_tables import LIDAR, Row, Tables
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
-from tflane_jax.geometry import relative_pose
+from tflane_jax.geometry import invert_pose, relative_pose
+from tflane_jax.scene import VehicleState
 
 # Metres that the vehicle drives at most between a camera's exposure and the lidar's sweep.
 _DRIVEN = 5.0
+CanBus = Literal["none", "plain", "reference"]
+"""Rules of `nuscenes_can_bus.can_bus`, or no messages."""
+CameraPoses = Literal["exposure", "calibration"]
+"""Pose of a camera: where the vehicle was at its exposure, or as calibrated, without the vehicle's motion until the
+lidar's sweep, as MapTRv2's lift has it."""
 CAMERAS = SUBSETS["B"].cameras
 """The order of MapTR and of OpenLane-V2's subset B; the first is the front camera."""
 
@@ -29,6 +37,7 @@ def sample_cameras(
     sample: Row,
     global_from_ego: Float[np.ndarray, "4 4"],
     frame_from_ego: Float[np.ndarray, "4 4"] | None = None,
+    poses: CameraPoses = "exposure",
 ) -> tuple[FrameCamera | None, ...]:
     """Return the cameras of a sample in the order of `CAMERAS`; None for one that the sample lacks.
 
@@ -38,12 +47,13 @@ def sample_cameras(
         global_from_ego: the vehicle's whole pose at the moment of the lidar.
         frame_from_ego: pose of the vehicle in the frame of the example, if that is another; the result's
             `ego_from_camera` is then frame_from_camera.
+        poses: see `CameraPoses`.
 
     Raises:
         UserError: a camera matrix or a pose is malformed.
     """
     return tuple(
-        _camera(tables, sample, name, row, global_from_ego, frame_from_ego) if row is not None else None
+        _camera(tables, sample, name, row, global_from_ego, frame_from_ego, poses) if row is not None else None
         for name, row in ((name, tables.data.get(sample["token"], {}).get(name)) for name in CAMERAS)
     )
 
@@ -55,6 +65,7 @@ def _camera(
     row: Row,
     global_from_ego: np.ndarray,
     frame_from_ego: np.ndarray | None,
+    poses: CameraPoses,
 ) -> FrameCamera:
     token = row["calibrated_sensor_token"]
     where = f"{tables.where('calibrated_sensor', token)}: camera_intrinsic"
@@ -62,8 +73,9 @@ def _camera(
     intrinsics = numbers(record["camera_intrinsic"], (3, 3), where).astype(np.float64)
     if not (intrinsics[0, 0] > 0.0 and intrinsics[1, 1] > 0.0 and (intrinsics[2] == (0.0, 0.0, 1.0)).all()):
         raise UserError(f"{where} is no camera matrix (positive focal lengths, last row 0 0 1)")
-    global_from_camera = tables.ego_pose(sample, name) @ tables.calibration(sample, name)
-    pose = relative_pose(global_from_ego, global_from_camera)
+    pose = tables.calibration(sample, name)
+    if poses == "exposure":
+        pose = relative_pose(global_from_ego, tables.ego_pose(sample, name) @ pose)
     driven = float(np.linalg.norm(tables.ego_pose(sample, name)[:2, 3] - global_from_ego[:2, 3]))
     if driven > _DRIVEN:
         where = tables.where("sample_data", row["token"])
@@ -73,6 +85,38 @@ def _camera(
         image=tables.root / row["filename"],
         intrinsics=intrinsics,
         ego_from_camera=pose if frame_from_ego is None else frame_from_ego @ pose,
+    )
+
+
+def vehicle_state(
+    tables: Tables,
+    scene: Row,
+    sample: Row,
+    frame_from_ego: Float[np.ndarray, "4 4"] | None = None,
+    messages: CanBus = "none",
+) -> VehicleState:
+    """Return what published weights know of the vehicle in a sample.
+
+    Args:
+        tables: of the data set.
+        scene, sample: a key frame and its scene.
+        frame_from_ego: see `sample_cameras`.
+        messages: of the CAN bus, read from the folder `can_bus` of the data set.
+
+    Raises:
+        UserError: a pose is malformed, or the messages of the scene are missing.
+    """
+    vehicle = np.eye(4) if frame_from_ego is None else invert_pose(frame_from_ego)
+    bus = None
+    if messages != "none":
+        row = tables.rows["ego_pose"][tables.sensor_file(sample, LIDAR)["ego_pose_token"]]
+        time, folder = sample["timestamp"] * 1000, tables.root / "can_bus"
+        tables.ego_pose(sample)  # checks the row
+        bus = can_bus(folder, scene["name"], time, row["translation"], row["rotation"], rules=messages)
+    return VehicleState(
+        lidar_from_ego=(invert_pose(tables.calibration(sample)) @ vehicle).astype(np.float32),
+        vehicle_from_ego=vehicle.astype(np.float32),
+        can_bus=None if bus is None else bus.astype(np.float32),
     )
 
 

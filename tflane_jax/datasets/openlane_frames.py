@@ -219,7 +219,7 @@ def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") 
         )
     return FrameFile(
         path=path,
-        global_from_ego=_pose(member(content, "pose", where), f"{where}: pose"),
+        global_from_ego=frame_pose(member(content, "pose", where), f"{where}: pose"),
         cameras=tuple(_camera(sensors, name, root, where) if name in sensors else None for name in names),
         annotation=content.get("annotation"),
     )
@@ -230,11 +230,12 @@ def _camera(sensors: Any, name: str, root: Path, where: str) -> FrameCamera:
     intrinsics = numbers(member(member(sensor, "intrinsic", where), "K", where), (3, 3), f"{where}.intrinsic.K")
     if not (intrinsics[0, 0] > 0.0 and intrinsics[1, 1] > 0.0 and (intrinsics[2] == (0.0, 0.0, 1.0)).all()):
         raise UserError(f"{where}.intrinsic.K is no camera matrix (positive focal lengths, last row 0 0 1)")
-    pose = _pose(member(sensor, "extrinsic", where), f"{where}.extrinsic")
+    pose = frame_pose(member(sensor, "extrinsic", where), f"{where}.extrinsic")
     return FrameCamera(name, root / str(member(sensor, "image_path", where)), intrinsics, pose)
 
 
-def _pose(record: Any, where: str) -> Float[np.ndarray, "4 4"]:
+def frame_pose(record: Any, where: str) -> Float[np.ndarray, "4 4"]:
+    """Return a pose of a frame's file; raises UserError where it is missing, or its rotation is none."""
     rotation = numbers(member(record, "rotation", where), (3, 3), f"{where}.rotation").astype(np.float64)
     translation = numbers(member(record, "translation", where), (3,), f"{where}.translation").astype(np.float64)
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:

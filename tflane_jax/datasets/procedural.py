@@ -23,7 +23,7 @@ from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.bev.sensor import BevSensorConfig
 from tflane_jax.world.cameras.ring import CameraRigConfig
-from tflane_jax.world.presets import CITY, STREET
+from tflane_jax.world.presets import CITY, HILLS, STREET
 from tflane_jax.world.simulate import HISTORY, WorldConfig, simulate
 
 # Scene ids of a split: [first, first + SCENES_PER_SPLIT).
@@ -183,9 +183,20 @@ class WorldData:
         """
         return cls(train, val, test, STREET, STREET_EXAMPLE)
 
+    @classmethod
+    def hills(cls, train: int = 3000, val: int = 25, test: int = 300) -> WorldData:
+        """Return the preset `hills`: `city` on hilly ground, with heights in tracks, lanes and images.
+
+        The host must perceive the same box, whose heights reach farther: `task.model.range` equal to
+        `HILLS_EXAMPLE.range`.
+        """
+        return cls(train, val, test, HILLS, HILLS_EXAMPLE)
+
 
 CITY_EXAMPLE = ExampleConfig(history_hz=2.0, tracks=192)
 """20 frames at 2 Hz, so 10 s."""
+HILLS_EXAMPLE = replace(CITY_EXAMPLE, range=replace(CITY_EXAMPLE.range, z=(-6.0, 6.0)))
+"""The same sizes; heights against the vehicle's own, tilted plane."""
 STREET_EXAMPLE = replace(
     CITY_EXAMPLE,
     range=PerceptionRange((-30.0, 30.0), (-15.0, 15.0)),
@@ -232,4 +243,5 @@ SOURCE = DataSource(
 CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
 """The same world with a ring of cameras, under a name of its own for `tflane data show`."""
 CITY_SOURCE = replace(SOURCE, name="city", choose=lambda choice: WorldData.city(*_PRESET).source(choice.split))
+HILLS_SOURCE = replace(SOURCE, name="hills", choose=lambda choice: WorldData.hills(*_PRESET).source(choice.split))
 STREET_SOURCE = replace(SOURCE, name="street", choose=lambda choice: WorldData.street(*_PRESET).source(choice.split))

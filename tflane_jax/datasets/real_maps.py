@@ -121,7 +121,7 @@ class RealMapData:
     on the training maps, from other scene numbers: its scores then say nothing about other places.
 
     Attributes:
-        maps: folder of logs: Argoverse 2, nuScenes scene files, lanes as GeoJSON.
+        maps: folder of logs: Argoverse 2, nuScenes, OpenLane-V2, or lanes as GeoJSON.
         train, val, test: number of scenes of each split.
         val_logs, test_logs: names of the logs of these splits.
         without: names of logs that no split takes.

@@ -17,6 +17,7 @@ from tflane_jax.datasets.argoverse2_map import MAP_PATTERN
 from tflane_jax.datasets.geojson_lanes import read_lanes
 from tflane_jax.datasets.nuscenes_place import SCENE_TABLE, read_scene, scene_files
 from tflane_jax.datasets.nuscenes_scene_files import read_scene_file
+from tflane_jax.datasets.openlane_maps import map_name, read_segment, segment_files
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
@@ -29,7 +30,7 @@ from tflane_jax.world.roads.road_map import RoadMap
 _SCENE_FILE = 72.0
 # The same for a map that cuts no lane, and the most that is believed, metres.
 _UNCUT, _MOST = 100.0, 120.0
-_SENSOR_FOLDERS = ("samples", "sweeps", "sensors")
+_SENSOR_FOLDERS = ("samples", "sweeps", "sensors", "image")
 # A vehicle that moves less for at least this long, off every centerline, is parked: metres, seconds, metres.
 _STANDS, _LONG, _OFF_LANE = 1.0, 4.0, 1.2
 
@@ -51,7 +52,7 @@ class MapFile:
     @property
     def recorded(self) -> bool:
         """Whether somebody drove here: the map is that of a log."""
-        return self.kind != "geojson"
+        return self.kind not in ("geojson", "openlane_v2")
 
     def content(self) -> str:
         """Return the hash of all that the map depends on."""
@@ -73,6 +74,8 @@ class MapFile:
 
     def read(self) -> RoadMap:
         """Read the map; raise UserError if a file is missing or damaged."""
+        if self.kind == "openlane_v2":
+            return read_segment(self.files)
         return read_lanes(self.files[0]) if not self.recorded else road_map_of(self.log())
 
 
@@ -80,14 +83,18 @@ def find_maps(root: Path) -> list[MapFile]:
     """Return the maps below a folder, or that of a single log, by name.
 
     Known are logs of Argoverse 2 (annotations.feather with its map), scenes of the nuScenes folder with its map
-    expansion and scene files of nuScenes (npz), and lanes as GeoJSON (`geojson_lanes`).
+    expansion and scene files of nuScenes (npz), segments of OpenLane-V2 (`openlane_maps`), and lanes as GeoJSON
+    (`geojson_lanes`).
 
     Raises UserError if there is none, or if two have the same name.
     """
     root = Path(root)
     found = sorted(_found(root), key=lambda one: one.name)
     if not found:
-        formats = f"Argoverse 2 logs ({ANNOTATIONS}), nuScenes (scene.json, or scene files npz) or lanes (geojson)"
+        formats = (
+            f"Argoverse 2 logs ({ANNOTATIONS}), nuScenes (scene.json, or scene files npz), OpenLane-V2 "
+            "(<segment>/info/<timestamp>.json) or lanes (geojson)"
+        )
         raise UserError(f"{root} holds no map: expected {formats}")
     names = [one.name for one in found]
     if twice := {name for name in names if names.count(name) > 1}:
@@ -110,6 +117,7 @@ def chosen_maps(root: Path, logs: Collection[str], without: Collection[str] = ()
 
 
 def _found(root: Path) -> Iterator[MapFile]:
+    segments: set[Path] = set()
     for file in [root] if root.is_file() else _files(root):
         if file.suffix == ".npz" and _may_hold_lanes(file):
             yield MapFile(file.stem, (file,), "nuscenes-scenes")
@@ -121,6 +129,11 @@ def _found(root: Path) -> Iterator[MapFile]:
         elif file.name == SCENE_TABLE:
             for name, files in scene_files(file):
                 yield MapFile(name, files, "nuscenes")
+        elif file.suffix == ".json" and file.parent.name == "info" and file.parent not in segments:
+            # One map for all files of the folder.
+            segments.add(file.parent)
+            if files := segment_files(file.parent):
+                yield MapFile(map_name(file.parent.parent), files, "openlane_v2")
 
 
 def _files(root: Path) -> Iterator[Path]:

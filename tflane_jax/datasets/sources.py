@@ -26,6 +26,7 @@ SOURCES: tuple[DataSource[Any], ...] = (
     procedural.CAMERAS,
     procedural.CITY_SOURCE,
     procedural.STREET_SOURCE,
+    procedural.HILLS_SOURCE,
     argoverse2.SOURCE,
     openlane_v2.SOURCE,
     nuscenes.SOURCE,

@@ -6,6 +6,7 @@ import functools
 from dataclasses import replace
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
@@ -132,6 +133,27 @@ class SpatialMask:
             traffic_lane=_both(self.traffic_lane, jnp.swapaxes(pairs, -1, -2)),
         )
 
+    def by_group(self, sizes: tuple[int, ...]) -> SpatialMask:
+        """Return the mask of as many copies of all instances as there are groups of lanes, one copy for each group.
+
+        A copy sees itself and the lanes of its group, and these see that copy, so that nothing passes from one group
+        to another by way of the instances. `lane_lane` stays, and must separate the groups itself.
+
+        Args:
+            sizes: numbers of lanes of successive groups; their sum is L.
+        """
+        count, instances = len(sizes), len(self.valid)
+        group = jnp.asarray(np.repeat(np.arange(count), sizes))
+        copy = jnp.repeat(jnp.arange(count), instances)
+        copies = replace(
+            self,
+            valid=jnp.tile(self.valid, count),
+            lane_traffic=_repeated(self.lane_traffic, count, -1),
+            traffic_lane=_repeated(self.traffic_lane, count, -2),
+            traffic_traffic=jnp.tile(self.traffic_traffic, (count, count)) & (copy[:, None] == copy[None]),
+        )
+        return copies.restricted(group[:, None] == copy[None])
+
     def dense(self) -> Bool[Array, "*h l+t l+t"]:
         """Return the whole matrix, lanes first; one for each head if a restriction has heads."""
         lanes, traffic, heads = self.lanes, self.lane_traffic.shape[-1], self.lane_traffic.shape[:-2]
@@ -146,6 +168,10 @@ class SpatialMask:
                 [full(self.traffic_lane, traffic, lanes), full(self.traffic_traffic, traffic, traffic)],
             ]
         )
+
+
+def _repeated(mask: Bool[Array, "*h q k"], count: int, axis: int) -> Bool[Array, "*h q k"]:
+    return jnp.concatenate([mask] * count, axis)
 
 
 def _both(one: Bool[Array, "*h #q #k"], other: Bool[Array, "*h #q #k"]) -> Bool[Array, "*h q k"]:

@@ -75,7 +75,7 @@ class MapTrLossConfig(HostLossConfig):
             raise ValueError("MapTR's loss needs predicted map lines")
         if batch.map_lines is None:
             raise UserError("the model learns the lines of a vector map, and these data have none (map_lines is None)")
-        lines, range_ = batch.map_lines, host.encoder.bev_range
+        lines, range_ = batch.map_lines, host.bev_range
         coordinates, classes = outputs.lines.points.shape[-1], outputs.lines.logits.shape[-1]
         targets = jax.vmap(partial(line_targets, coordinates=coordinates, classes=classes, rings=self.rings))(lines)
         loss, report = line_loss(outputs.lines, targets, range_, self)
@@ -100,7 +100,7 @@ class MapTrLossConfig(HostLossConfig):
         """
         if name != "denoised":
             raise ValueError(f"the auxiliary output {name} has no loss here")
-        terms = line_denoising_losses(output, targets, host.encoder.bev_range, self)
+        terms = line_denoising_losses(output, targets, host.bev_range, self)
         return {f"denoised_{key}": value for key, value in terms.items()}
 
 

@@ -43,7 +43,7 @@ class MapTrV2LossConfig(MapTrLossConfig):
 
     def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output, see `MapTrLossConfig.auxiliary_terms`."""
-        range_ = host.encoder.bev_range
+        range_ = host.bev_range
         lines: Any = batch.map_lines
         views: Any = batch.cameras
         if name == "one_to_many":

@@ -55,6 +55,9 @@ class BevFormerConfig:
             `bevformer.check_capacity` checks it against a frame.
         memory: "previous": temporal attention reads the BEV features of the previous frame; "off": every frame stands
             alone, as in a host that was trained on single frames. The parameters are the same.
+        motion: "moved": the queries know the motion since the previous frame, none without one. "can_bus": they know
+            heading, acceleration, rates and velocity, as published weights do (`VehicleState.can_bus`), and no motion
+            since the previous frame.
         align: how previous features are brought into the present frame, see the module docstring.
         rotation_center: centre of the rotation as (column, row), in cells from the grid's corner, unless `align` is
             "warp"; None: the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
@@ -85,6 +88,7 @@ class BevFormerConfig:
     attention: Literal["deformable", "kernel"] = "deformable"
     kernel: tuple[Count, Count] = (3, 5)
     memory: Literal["previous", "off"] = "previous"
+    motion: Literal["moved", "can_bus"] = "moved"
 
     def limits(self) -> Rules:
         """Channels split over heads, sampling points over anchors."""

@@ -64,7 +64,7 @@ class BevFormer(nn.Module):
         pose = jnp.where(memory.valid, previous_from_ego, jnp.eye(4, dtype=previous_from_ego.dtype))
         history = BevMemory(jnp.where(memory.valid, memory.features, 0.0), memory.valid)
         history, shift = align(config, history, pose)
-        motion = motion_vector(pose, memory.valid)
+        motion = motion_vector(pose, memory.valid) if config.motion == "moved" else can_bus_vector(cameras)
         return self.encode(features, cameras, history, shift, motion, deterministic=deterministic, fuse=fuse)
 
     @nn.compact
@@ -181,6 +181,20 @@ def motion_vector(previous_from_ego: Float[Array, "4 4"], valid: Bool[Array, ""]
     turned = jnp.stack([yaw, jnp.rad2deg(yaw)])
     motion = jnp.concatenate([moved, jnp.zeros(MOTION - 5, moved.dtype), turned])
     return jnp.where(valid, motion, 0.0)
+
+
+def can_bus_vector(cameras: CameraViews) -> Float[Array, " m"]:
+    """Return the CAN-bus vector as published code has it for a frame without a previous one: no position, no turn.
+
+    Raises UserError if the data have no CAN bus.
+    """
+    vehicle = cameras.vehicle
+    if vehicle is None or vehicle.can_bus is None:
+        raise UserError(
+            "the BEV encoder reads the vehicle's CAN bus (motion), and these data have none: set data.can_bus "
+            "(nuScenes), or task.model.encoder.bev.motion to moved"
+        )
+    return jnp.asarray(vehicle.can_bus).at[:3].set(0.0).at[-1].set(0.0)
 
 
 @struct.dataclass

@@ -92,9 +92,18 @@ class HostConfig:
         return {}
 
     @property
+    def bev_range(self) -> PerceptionRange:
+        """The box that the BEV features cover, in the frame of the example, metres."""
+        return self.encoder.bev_range
+
+    @property
     def spec(self) -> HostSpec:
         """The properties of the host that priors depend on."""
         return HostSpec(self.query_dim, self.range, self.encoder.bev_range, self.query_type)
+
+    def seen(self, example: Example) -> Example:
+        """Return an example as encoder and priors take it: in another frame, if the host works in one."""
+        return example
 
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
@@ -163,7 +172,7 @@ class Host(nn.Module):
         """
         tokens = encode(self.priors.by_name, observations, deterministic=not train)
         hook = bev_hook(self.priors.by_name, tokens, self.config.spec)
-        encoded = encode_example(self.encoder, example, memory, train=train, hook=hook)
+        encoded = encode_example(self.encoder, self.config.seen(example), memory, train=train, hook=hook)
         elements = None
         if self.config.elements is not None and encoded.front is not None:
             elements = self.elements(*encoded.front, deterministic=not train)

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.depth_net import DepthNet
@@ -169,6 +169,11 @@ class LiftEncoder(nn.Module):
             points = ray_points(intrinsics, pose, size, shape, self.config.depth)
         points = jnp.where(valid[..., None, None], points, jnp.nan)
         features = jnp.where(valid[..., None], features, 0.0)
+        if cameras.vehicle is not None:
+            # The depth network knows the cameras' poses in the vehicle's own frame.
+            with jax.default_matmul_precision("highest"):
+                own = pose @ invert_pose(jnp.asarray(cameras.vehicle.vehicle_from_ego))[None]
+            pose = jnp.where(valid, own, eye)
         vector = camera_vector(intrinsics, pose, self.config.image_scale)
         return self.encode(features, vector, points, train=train)
 
@@ -210,7 +215,7 @@ def camera_vector(
     """Return the parameters that the depth network knows of each camera.
 
     Focal lengths and centre of the native image, the rows of the affine map from it to the image (2 x 3), and the
-    camera's pose in the ego frame (3 x 4).
+    camera's pose in the ego frame (3 x 4), which is the vehicle's own where that is known.
     """
     count, native = len(intrinsics), intrinsics[:, :2] / scale
     lens = jnp.stack([native[:, 0, 0], native[:, 1, 1], native[:, 0, 2], native[:, 1, 2]], -1)

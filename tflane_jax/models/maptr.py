@@ -24,6 +24,14 @@ from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_groups
+from tflane_jax.models.lidar_axes import (
+    InLidarAxes,
+    in_lidar_axes,
+    level_pose,
+    lines_in_ego_axes,
+    range_in_ego_axes,
+    range_in_lidar_axes,
+)
 from tflane_jax.models.map_lines import (
     PAPER_LINE_DECODER,
     LineDecoderConfig,
@@ -34,8 +42,9 @@ from tflane_jax.models.map_lines import (
     decode_line_layers,
 )
 from tflane_jax.models.parameters import with_equal_heads
+from tflane_jax.models.prior import HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
-from tflane_jax.scene import LinePrediction, MapLines, Prediction
+from tflane_jax.scene import Example, LinePrediction, MapLines, Prediction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +55,15 @@ class MapTrConfig(HostConfig):
         decoder: decoder of map lines.
         denoising: noised lines in training (`models.lane_denoising`), with `decoder.anchors="spread"` only; None as in
             the paper.
+        axes: "ego": x forward, y left, as everywhere. "lidar": the weights published for nuScenes know x to the right
+            and y forward (`models.lidar_axes`); the grid of `encoder` is then given in these axes, and all else, the
+            predictions too, stays in the frame of the example.
         encoder, range, priors: see `HostConfig`. MapTR predicts no traffic elements.
     """
 
     decoder: LineDecoderConfig = LineDecoderConfig()
     denoising: DenoisingConfig | None = None
+    axes: Literal["ego", "lidar"] = "ego"
 
     truth: ClassVar[tuple[str, ...]] = ("map_lines",)
     predicts: ClassVar[tuple[str, ...]] = ("lines",)
@@ -71,6 +84,26 @@ class MapTrConfig(HostConfig):
         """Lines are compared point by point."""
         return {"map_lines.points": self.decoder.points}
 
+    @property
+    def bev_range(self) -> PerceptionRange:
+        """The box that the BEV features cover, in the frame of the example, metres."""
+        return self.encoder.bev_range if self.axes == "ego" else range_in_ego_axes(self.encoder.bev_range)
+
+    @property
+    def spec(self) -> HostSpec:
+        """The properties of the host that priors depend on, in the host's own axes."""
+        spec = super().spec
+        return spec if self.axes == "ego" else replace(spec, range=range_in_lidar_axes(self.range))
+
+    def seen(self, example: Example) -> Example:
+        """Return an example in the host's own axes."""
+        return example if self.axes == "ego" else in_lidar_axes(example)
+
+    def build_priors(self) -> dict[str, Prior]:
+        """Return the priors of this host, by name; they observe examples in the host's own axes."""
+        priors = super().build_priors()
+        return priors if self.axes == "ego" else {name: InLidarAxes(prior) for name, prior in priors.items()}
+
     def build(self) -> Host:
         """Return the Linen module; raises UserError where its parts do not fit together."""
         check_settings(self, "task.model.")
@@ -83,6 +116,11 @@ class MapTrConfig(HostConfig):
         yield "encoder.cells", not cells, "False: BEV cells learn directed lanes, which MapTR's truth lacks"
         known = self.denoising is None or self.decoder.anchors == "spread"
         yield "denoising", known, "None, or decoder.anchors spread: queries on noised lines know where their points are"
+        if self.axes == "lidar":
+            seen = isinstance(self.encoder, CameraEncoderConfig)
+            yield "axes", seen, "ego: BEV evidence is a raster in the ego axes"
+            yield "denoising", self.denoising is None, "None with axes lidar: noised lines are in the ego axes"
+            yield "priors.markers", self.priors.markers is None, "None with axes lidar: markers are in the ego axes"
         yield from super().limits()
 
 
@@ -110,7 +148,8 @@ class MapTr(Host):
         return with_equal_heads(super().init(*args, **kwargs), self.config.decoder.layers)
 
     def decode_example(self, example, bev, elements, tokens, *, deterministic):
-        return self.decode(bev, tokens, example.map_lines, deterministic=deterministic)
+        level = None if self.config.axes == "ego" else level_pose(example)
+        return self.decode(bev, tokens, example.map_lines, deterministic=deterministic, level=level)
 
     @nn.compact
     def decode(
@@ -120,6 +159,7 @@ class MapTr(Host):
         lines: MapLines | None = None,
         *,
         deterministic: bool = True,
+        level: Float[Array, "4 4"] | None = None,
     ) -> Prediction:
         """Return the lines of every decoder layer from BEV features and prior tokens.
 
@@ -128,8 +168,9 @@ class MapTr(Host):
             tokens: of the priors, by name.
             lines: ground truth to denoise; not used otherwise.
             deterministic: no dropout.
+            level: turns lines from the host's axes into the frame of the example; None: these are the same.
         """
-        return self.decode_one_to_one(bev, tokens, lines, deterministic)
+        return turned(self.decode_one_to_one(bev, tokens, lines, deterministic), level)
 
     def decode_one_to_one(self, bev, tokens, lines, deterministic) -> Prediction:
         """Return the predictions of the learned queries, and sow those of noised ones in training; in `decode`."""
@@ -154,6 +195,14 @@ class MapTr(Host):
             fuse=lambda layer, queries: fuse_into_queries(priors, tokens, layer, queries),
         )
         return make_prediction(outputs)
+
+
+def turned(prediction: Prediction, level: Float[Array, "4 4"] | None) -> Prediction:
+    """Return a prediction with its lines in the frame of the example; see `MapTr.decode`."""
+    if level is None or prediction.lines is None:
+        return prediction
+    points = lines_in_ego_axes(jnp.asarray(prediction.lines.points), level)
+    return replace(prediction, lines=replace(prediction.lines, points=points))
 
 
 def make_prediction(outputs: list[LineOutput]) -> Prediction:

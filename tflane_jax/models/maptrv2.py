@@ -23,6 +23,7 @@ from tflane_jax.limits import CountOrZero, Rules, check_settings
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host
+from tflane_jax.models.lidar_axes import raster_in_ego_axes
 from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.map_lines import (
     PAPER_LINE_DECODER,
@@ -32,7 +33,7 @@ from tflane_jax.models.map_lines import (
     PointQueries,
     point_position,
 )
-from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, make_prediction
+from tflane_jax.models.maptr import PAPER_MAP_ENCODER, PAPER_RANGE, MapTr, MapTrConfig, make_prediction, turned
 from tflane_jax.models.prior import HostQueries
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.scene import MapLines, Prediction
@@ -97,6 +98,7 @@ class MapTrV2(MapTr):
         lines: MapLines | None = None,
         *,
         deterministic: bool = True,
+        level: Float[Array, "4 4"] | None = None,
     ) -> Prediction:
         """Return the lines of every decoder layer from BEV features and prior tokens, as `MapTr.decode` does.
 
@@ -105,13 +107,14 @@ class MapTrV2(MapTr):
         config, count = self.config, self.config.decoder.queries
         training = self.is_mutable_collection(AUXILIARY)
         if config.line_mask and training:
-            self.sow(AUXILIARY, "line_mask", LineMaskHead(name="mask_head")(bev))
+            mask = LineMaskHead(name="mask_head")(bev)
+            self.sow(AUXILIARY, "line_mask", mask if level is None else raster_in_ego_axes(mask))
         if not config.many:
-            return self.decode_one_to_one(bev, tokens, lines, deterministic)
+            return turned(self.decode_one_to_one(bev, tokens, lines, deterministic), level)
         start = LineQueries(config.decoder, config.spec.bev_range, config.many, name="queries")()
         if not training:
             start = jax.tree.map(lambda leaf: leaf[:count], start)
-        found = self.decode_queries(start, bev, None, tokens or {}, deterministic)
+        found = turned(self.decode_queries(start, bev, None, tokens or {}, deterministic), level)
         if training:
             self.sow(AUXILIARY, "one_to_many", jax.tree.map(lambda leaf: leaf[:, count:], found.lines))
         return jax.tree.map(lambda leaf: leaf[:, :count], found)
@@ -120,15 +123,16 @@ class MapTrV2(MapTr):
         """Return the predictions of one set of queries; those of the one-to-many group exchange nothing with others."""
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         (lines, points, dim), outputs = queries.shape, []
-        groups = None
+        groups, sizes = None, ()
         if lines > config.queries:
+            sizes = config.queries * points, (lines - config.queries) * points
             many = jnp.arange(lines) >= config.queries
             groups = many[:, None] == many[None]
         every = None if groups is None else jnp.repeat(jnp.repeat(groups, points, 0), points, 1)
         for i in range(config.layers):
             placed = point_position(config, i, position, reference)
             points_alone = reference.reshape(-1, 1, reference.shape[-1])
-            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every)
+            flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every, sizes)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
             layer = DecoupledLayer(config, name=f"layer_{i}")
             queries = layer(queries, placed, reference, bev, groups, deterministic=deterministic)

@@ -74,12 +74,15 @@ class HostQueries(NamedTuple):
             `HostSpec.bev_range`.
         mask: (Q, Q) [i, j] query i may attend to query j; None: all to all. A host with groups of
             queries that must not exchange information (MapTRv2's one-to-one and one-to-many groups) masks them here.
+        groups: numbers of queries of these groups, one after the other; () for a single group. A prior whose own tokens
+            read queries needs them: nothing may pass from one group to another by way of the tokens.
     """
 
     features: Float[Array, "q d"]
     position: Float[Array, "q d"]
     reference: Float[Array, "q p c"]
     mask: Bool[Array, "q q"] | None = None
+    groups: tuple[int, ...] = ()
 
 
 class Prior:

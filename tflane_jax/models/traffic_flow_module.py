@@ -168,9 +168,13 @@ class TrafficFlowPrior(Prior):
         mask = spatial_mask(
             config.module.masking, queries, tokens.tracks, config.prior.coordinates, self.host.bev_range
         )
+        features = tokens.features
+        if len(queries.groups) > 1 and "T->L" in config.module.fusions:
+            # Tokens that read lanes would carry what they read from one group to another: each group has its own.
+            mask, features = mask.by_group(queries.groups), jnp.concatenate([features] * len(queries.groups))
         name = f"spatial_encoder_{layer}"
         spatial = SpatialEncoder(config.module, self.host.dim, self.host.query_type, name=name)
-        return spatial(queries.features, queries.position, tokens.features, mask)
+        return spatial(queries.features, queries.position, features, mask)
 
 
 class TemporalEncoder(nn.Module):

@@ -43,6 +43,7 @@ from tflane_jax.scene.truth import (
 from tflane_jax.scene.views import (
     BevChannel,
     CameraViews,
+    VehicleState,
 )
 
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "SegmentPrediction",
     "TrafficElements",
     "TrafficFlow",
+    "VehicleState",
     "shapes_of",
     "stack_examples",
 ]

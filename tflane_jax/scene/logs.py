@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tflane_jax.scene.marker_patterns import MarkerFamily
+from tflane_jax.scene.terrain import Terrain
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,19 @@ class PlacedMarkers:
 
 
 @dataclass(frozen=True)
+class Relief:
+    """Hilly ground under a simulated drive.
+
+    Attributes:
+        terrain: heights, global metres.
+        level: the same drive on level ground, from which cameras render; x, y and yaw of all poses are the same.
+    """
+
+    terrain: Terrain
+    level: Log
+
+
+@dataclass(frozen=True)
 class Log:
     """One drive.
 
@@ -161,6 +175,7 @@ class Log:
         seed: of all random numbers in rendering this log.
         markers: fiducial markers beside the road; None if there are none.
         area: place, such as a city, in whose coordinates the log is; "" if the source does not tell.
+        relief: hilly ground of a simulated drive; None on level ground and for recorded logs.
     """
 
     name: str
@@ -177,6 +192,7 @@ class Log:
     seed: int = 0
     markers: PlacedMarkers | None = None
     area: str = ""
+    relief: Relief | None = None
 
     @property
     def rate_hz(self) -> float | None:

@@ -21,6 +21,23 @@ class BevChannel(enum.IntEnum):
 
 
 @struct.dataclass
+class VehicleState:
+    """Frames and motion of the vehicle that published weights read beside the images; one frame.
+
+    "ego" is the frame of the example, to which `CameraViews.camera_from_ego` leads.
+
+    Attributes:
+        lidar_from_ego: (4, 4) pose in the lidar's axes (nuScenes: x right, y forward, z up) with its height and tilt.
+        vehicle_from_ego: (4, 4) pose in the vehicle's own frame: rear axle, x forward, y left, z up from the ground.
+        can_bus: (18,) nuScenes' CAN bus (`datasets.nuscenes_can_bus`); None if it was not read.
+    """
+
+    lidar_from_ego: Float[Array, "4 4"]
+    vehicle_from_ego: Float[Array, "4 4"]
+    can_bus: Float[Array, "18"] | None = None
+
+
+@struct.dataclass
 class CameraViews:
     """Images of V calibrated pinhole cameras in one frame.
 
@@ -36,6 +53,7 @@ class CameraViews:
         depth: (V, h, w) depth of the nearest surface in square cells of the image array, metres along the optical axis;
             only for training. None if it is not known.
         depth_valid: (V, h, w) a surface was measured in the cell.
+        vehicle: frames that published weights know; None where the data do not tell them.
     """
 
     image: UInt8[Array, "v h w 3"]
@@ -45,6 +63,7 @@ class CameraViews:
     valid: Bool[Array, " v"]
     depth: Float[Array, "v h w"] | None = None
     depth_valid: Bool[Array, "v h w"] | None = None
+    vehicle: VehicleState | None = None
 
     def validate(self) -> None:
         """Raise AssertionError naming the field whose shape does not fit the others."""
@@ -57,3 +76,7 @@ class CameraViews:
         if self.depth is not None:
             chex.assert_shape(self.depth, (v, None, None))
             chex.assert_equal_shape([self.depth, self.depth_valid])
+        if self.vehicle is not None:
+            chex.assert_shape([self.vehicle.lidar_from_ego, self.vehicle.vehicle_from_ego], (4, 4))
+            if self.vehicle.can_bus is not None:
+                chex.assert_shape(self.vehicle.can_bus, (18,))

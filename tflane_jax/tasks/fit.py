@@ -46,7 +46,9 @@ def check_fit(model: HostConfig, example: Example) -> None:
     _check_elements(model, example)
     encoder, cameras = model.encoder, example.cameras
     if isinstance(encoder, CameraEncoderConfig) and isinstance(encoder.bev, BevFormerConfig) and cameras is not None:
-        check_capacity(encoder.bev, cameras)
+        seen = model.seen(example).cameras
+        assert seen is not None
+        check_capacity(encoder.bev, seen)
 
 
 def _check_elements(model: HostConfig, example: Example) -> None:
@@ -66,7 +68,7 @@ def reads_traffic(model: HostConfig) -> bool:
 
 
 def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
-    encoder, bev_range = model.encoder, model.encoder.bev_range
+    encoder, bev_range = model.encoder, model.bev_range
     if isinstance(encoder, EvidenceEncoderConfig) and config.sensor is not None:
         raster = config.sensor.grid.range
         if raster != bev_range:

@@ -1,4 +1,4 @@
-"""Fixed worlds on which models are compared: `CITY` and `STREET`; and `REAL_MAPS`, for recorded maps.
+"""Fixed worlds: `CITY` and `STREET`, on which models are compared; `HILLS`; `REAL_MAPS`, for recorded maps.
 
 All hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and traffic as dense and
 as mixed as in real logs (docs/world.md compares them). They differ in their roads. `WorldData.city` and
@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.simulate import WorldConfig
+from tflane_jax.world.terrain import TerrainConfig
 from tflane_jax.world.traffic.simulation import TrafficConfig
 from tflane_jax.world.traffic.tracker import TrackerConfig
 
@@ -57,6 +58,9 @@ STREET = replace(
     ),
 )
 """Roads that bend, split and merge, and T junctions of streets with one lane in each direction."""
+
+HILLS = replace(CITY, terrain=TerrainConfig())
+"""`CITY` on hilly ground: the same roads and traffic, scene by scene, with heights."""
 
 REAL_MAPS = replace(
     CITY,

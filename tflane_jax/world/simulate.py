@@ -21,6 +21,7 @@ from tflane_jax.world.roads.map_networks import build_map_network
 from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
 from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, build_road_network
 from tflane_jax.world.roads.road_map import RoadMap
+from tflane_jax.world.terrain import TerrainConfig, on_terrain
 from tflane_jax.world.traffic.signals import element_states, show_signals
 from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
@@ -39,6 +40,7 @@ class Stream(enum.IntEnum):
     TRAFFIC = 1
     TRACKER = 2
     CONDITIONS = 3
+    TERRAIN = 4
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class WorldConfig:
         duration_s, rate_hz: length of a scene and its frame rate.
         keyframes: moments at which examples are made, evenly spaced from the end of the first history to the end of
             the scene.
+        terrain: hills; None: level ground. They change nothing else in a scene.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -63,6 +66,7 @@ class WorldConfig:
     duration_s: Positive = 8.0
     rate_hz: Positive = 10.0
     keyframes: Count = 4
+    terrain: TerrainConfig | None = None
 
     @property
     def frames(self) -> int:
@@ -134,7 +138,7 @@ def simulate(
     weather, paint_wear = np.clip(config.severity * _stream(scene_id, Stream.CONDITIONS).uniform(0.4, 1.6, 2), 0.0, 1.0)
     attribute = element_states(network, traffic.signals, np.arange(frames) / config.rate_hz)
     timestamps = np.round(np.arange(frames) * (1e9 / config.rate_hz)).astype(np.int64)
-    return Log(
+    log = Log(
         name=f"world-{scene_id:09d}" if place is None else f"{place.road_map.name}-{scene_id:09d}",
         source="procedural",
         map=replace(network.map, elements=show_signals(network, attribute[0])),
@@ -149,6 +153,9 @@ def simulate(
         seed=scene_id,
         markers=place_markers(network.map, scene_id, config.markers, *_chosen_by_sight(network.map, scene_id, config)),
     )
+    if config.terrain is None:
+        return log
+    return on_terrain(log, config.terrain.draw(_stream(scene_id, Stream.TERRAIN)))
 
 
 def _drive_on(

@@ -59,6 +59,13 @@ def evaluate(commands) -> None:
         "(default: the configuration's)",
     )
     parser.add_argument(
+        "--training-root",
+        metavar="DIR",
+        type=Path,
+        help="folder of the data set whose training split the model learned, for the groups near and far from training "
+        "(default: the configuration's)",
+    )
+    parser.add_argument(
         "--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json (default RUN/evaluations/<split>...)"
     )
 

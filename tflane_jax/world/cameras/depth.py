@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from tflane_jax.geometry import invert_pose
 from tflane_jax.world.cameras.faces import faces_of
 from tflane_jax.world.cameras.solids import Bodies, polygon_starts, with_blobs
+from tflane_jax.world.cameras.surface import Surface
 from tflane_jax.world.render.camera import NEAR, FrontCamera
 from tflane_jax.world.render.polygons import SHIFT, clipped, fixed_point
 
@@ -23,14 +24,15 @@ _FAR = 130.0
 
 
 def render_depth(
-    bodies: Bodies, camera: FrontCamera, cell: int
+    bodies: Bodies, camera: FrontCamera, cell: int, surface: Surface | None = None
 ) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return the depth of the nearest surface in each cell, metres along the optical axis, and where there is one.
 
     Args:
-        bodies: ego frame; the ground is the plane z = 0.
+        bodies: ego frame.
         camera: its image is covered by whole cells from the top-left corner.
         cell: side of a cell, pixels.
+        surface: hilly ground; None: the ground is the plane z = 0.
     """
     h, w = -(-camera.height // cell), -(-camera.width // cell)
     scale = _SAMPLES / cell
@@ -41,7 +43,11 @@ def render_depth(
         intrinsics=np.diag([scale, scale, 1.0]) @ camera.intrinsics,
     )
     columns, rows = np.arange(coarse.width) + 0.5, np.arange(coarse.height) + 0.5
-    ground = coarse.ground_depth(columns, rows, _FAR)
+    if surface is None:
+        ground = coarse.ground_depth(columns, rows, _FAR)
+    else:
+        place, seen, _ = surface.hits(coarse)
+        ground = np.maximum(surface.depth(coarse, place, seen), NEAR)
     inverse = np.where(ground < _FAR, 1.0 / ground, 0.0)
     _add_bodies(inverse, bodies, coarse)
     # Cells may extend beyond the image.

@@ -5,6 +5,7 @@ Directions are in the global frame unless stated otherwise: sun and hills are fi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,6 +96,8 @@ class View:
         distance: (h, w) from the ego origin, metres.
         seen: (h, w) uint8, 255 where there is ground.
         across, along: (h,) size of a pixel's footprint, metres.
+        raised: from points of the level scene to the ego frame, on hilly ground; x and y are then those of the level
+            scene.
     """
 
     camera: FrontCamera
@@ -107,6 +110,7 @@ class View:
     seen: UInt8[np.ndarray, "h w"]
     across: Float[np.ndarray, " h"]
     along: Float[np.ndarray, " h"]
+    raised: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 # Ground farther away than this is not drawn, metres.
@@ -243,7 +247,7 @@ def _fill(mask: UInt8[np.ndarray, "h w"], ring: Float[np.ndarray, "k 2"], view: 
     """Fill a polygon on the ground."""
     import cv2
 
-    points = lift(ring)
+    points = lift(ring) if view.raised is None else view.raised(lift(ring))
     pixels, depth = view.camera.image_of(points)
     if depth.max() <= NEAR:
         return

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,6 +17,7 @@ from tflane_jax.world.cameras.light import seen_from_ego
 from tflane_jax.world.cameras.ring import CameraRigConfig
 from tflane_jax.world.cameras.solids import Bodies, join, pack
 from tflane_jax.world.cameras.stage import LARGE, Stage, Stream, log_stream
+from tflane_jax.world.cameras.surface import Surface, surface_at
 from tflane_jax.world.cameras.vehicles import road_user
 from tflane_jax.world.render.weather import Weather
 
@@ -38,6 +39,7 @@ class Moment:
         bodies: static and moving bodies nearby, ego frame.
         users: (u, 7) boxes of the road users, as `Bodies.boxes`.
         grounds: ground windows, the coarsest first.
+        surface: hilly ground, on which `bodies` are; all else is that of the level scene. None on level ground.
     """
 
     place: Float[np.ndarray, "2"]
@@ -46,11 +48,19 @@ class Moment:
     bodies: Bodies
     users: Float[np.ndarray, "u 7"]
     grounds: list[Ground]
+    surface: Surface | None = None
 
 
 def moment_of(log: Log, keyframe: int, stage: Stage, config: CameraRigConfig) -> Moment:
-    """Return the scene around the vehicle at a key frame."""
+    """Return the scene around the vehicle at a key frame; `stage` is that of the level log."""
     pose = log.keyframes[keyframe].global_from_ego
+    surface = surface_at(log, pose)
+    if surface is not None and log.relief is not None:
+        level = replace(
+            log.relief.level, keyframes=(replace(log.keyframes[keyframe], global_from_ego=surface.global_from_level),)
+        )
+        moment = moment_of(level, 0, stage, config)
+        return replace(moment, bodies=surface.bodies(moment.bodies), surface=surface)
     yaw = float(pose_yaw(pose))
     return Moment(
         place=pose[:2, 3],

@@ -65,7 +65,7 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
     size = np.array([[camera.width, camera.height] for camera in cameras], np.int32)
     image = np.zeros((len(cameras), size[:, 1].max(), size[:, 0].max(), 3), np.uint8)
     for number, (camera, mount) in enumerate(zip(cameras, config.cameras, strict=True)):
-        view = _view(camera, config.supersample)
+        view = _view(camera, config.supersample, moment)
         picture = _draw(stage, moment, view, config)
         rng = camera_stream(log.seed, mount, Stream.PICTURE, keyframe)
         image[number, : camera.height, : camera.width] = _develop(
@@ -78,7 +78,7 @@ def render_cameras(log: Log, keyframe: int, config: CameraRigConfig) -> CameraVi
         depth = np.zeros((len(cameras), rows, columns), np.float32)
         depth_valid = np.zeros(depth.shape, bool)
         for number, camera in enumerate(cameras):
-            near, seen = render_depth(moment.bodies, camera, config.depth_cell)
+            near, seen = render_depth(moment.bodies, camera, config.depth_cell, moment.surface)
             depth[number, : len(near), : near.shape[1]] = near
             depth_valid[number, : len(near), : near.shape[1]] = seen
     return CameraViews(
@@ -126,7 +126,7 @@ def render_window(
         moment = moment_of(replace(log, keyframes=(keyframe,)), 0, stage, config)
     else:
         number, moment = keyframe, moment_of(log, keyframe, stage, config)
-    picture = _draw(stage, moment, _view(part, config.supersample), config)
+    picture = _draw(stage, moment, _view(part, config.supersample, moment), config)
     rng = camera_stream(log.seed, config.cameras[camera], Stream.PICTURE, number, left, top)
     return _develop(rng, picture, part, stage.weather, max(whole.width, whole.height))
 
@@ -143,6 +143,11 @@ def visible_elements(log: Log, keyframe: int, config: CameraRigConfig) -> Elemen
         return ElementViews(np.zeros((0, 2, 2)), attribute, np.zeros(0, bool))
     ego_from_global = invert_pose(moment.global_from_ego)
     box, visible = element_boxes(elements, ego_from_global, camera)
+    if log.relief is not None:
+        # What hides an element is the same on level ground: all of it moves up together.
+        log = log.relief.level
+        elements, moment = log.map.elements, log.keyframes[keyframe]
+        ego_from_global = invert_pose(moment.global_from_ego)
     standing = in_ego(stage.static, moment.global_from_ego).boxes
     shown = in_ego(element_bodies(elements, attribute), moment.global_from_ego).boxes
     occluders = np.concatenate([user_boxes(log, keyframe), standing, shown])
@@ -158,8 +163,10 @@ def _cached_view(pixels: tuple[int, int, int], intrinsics: bytes, pose: bytes) -
     return look(enlarged(camera, factor))
 
 
-def _view(camera: FrontCamera, factor: int) -> View:
-    """Return the rays and ground points of an enlarged camera; the last few small cameras are cached."""
+def _view(camera: FrontCamera, factor: int, moment: Moment) -> View:
+    """Return the rays and ground points of an enlarged camera; on level ground, the last few small ones are cached."""
+    if moment.surface is not None:
+        return moment.surface.look(enlarged(camera, factor))
     arguments = ((camera.width, camera.height, factor), camera.intrinsics.tobytes(), camera.camera_from_ego.tobytes())
     if camera.width * camera.height > _FEW_PIXELS:
         return _cached_view.__wrapped__(*arguments)

@@ -80,7 +80,8 @@ _STAGES: dict[tuple[int, CameraRigConfig], Stage] = {}
 
 
 def stage_of(log: Log, config: CameraRigConfig) -> Stage:
-    """Return the static content of a log, cached for the lifetime of the log object."""
+    """Return the static content of a log, on level ground, cached for the lifetime of the log object."""
+    log = log if log.relief is None else log.relief.level
     # Cameras and their calibration do not change the static content.
     key = id(log), replace(config, cameras=(), jitter=0.0, multiple=1, element_pixels=0.0, depth_cell=None)
     if key not in _STAGES:
@@ -129,7 +130,8 @@ _BOXES: dict[tuple[int, int], np.ndarray] = {}
 def static_boxes(log: Log) -> Float[np.ndarray, "b 7"]:
     """Return the boxes of all that stands beside the roads of a log but boards: as `Bodies.boxes`, global frame.
 
-    Nothing is drawn, but OpenCV is needed. Of real logs, which have no scenery, buildings alone are known.
+    Nothing is drawn, but OpenCV is needed. Of real logs, which have no scenery, buildings alone are known. All
+    stands on level ground.
     """
     return map_boxes(log.map, log.seed) if log.markers is not None else _buildings(log)
 

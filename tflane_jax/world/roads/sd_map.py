@@ -69,7 +69,8 @@ def make_sd_map(log: Log, keyframe: int, config: SdMapConfig) -> tuple[SdMap, in
             f"{log.source} {log.name} knows lanes but no roads, of which an SD map could be made: leave sd_map of "
             "ExampleConfig None, or read an SD map with tflane_jax.datasets.geojson"
         )
-    moment = log.keyframes[keyframe]
+    # A map of roads is flat; so is where the vehicle believes it is.
+    moment = (log if log.relief is None else log.relief.level).keyframes[keyframe]
     seconds = (moment.timestamp_ns - int(log.timestamps_ns[0])) * 1e-9
     rings = log.map.crossings if config.crossings == "include" else ()
     lines = [simplify(road[:, :2], config.tolerance) for road in log.map.roads]

@@ -1,0 +1,169 @@
+"""Hosts in the axes of nuScenes' lidar: inputs turned into them, predictions turned back."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, make_line_example
+from tests.parameters import random_params
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import BevGrid, PerceptionRange, invert_pose, project, transform_points, yaw_pose
+from tflane_jax.models.bevformer import can_bus_vector
+from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lidar_axes import (
+    in_lidar_axes,
+    level_pose,
+    lines_in_ego_axes,
+    range_in_ego_axes,
+    range_in_lidar_axes,
+    raster_in_ego_axes,
+)
+from tflane_jax.models.lift import LiftConfig
+from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.maptrv2 import MapTrV2Config
+from tflane_jax.scene import SdMap, VehicleState
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+RANGE = PerceptionRange((-30.0, 26.0), (-14.0, 16.0), (-2.0, 2.0))
+# The vehicle's own frame from the lidar's: ahead of the axle, above the ground, a quarter turn, tilted by 3 degrees.
+TILT = np.eye(4)
+TILT[1:3, 1:3] = [[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]]
+VEHICLE_FROM_LIDAR = yaw_pose(0.9, 0.1, -np.pi / 2) @ TILT
+VEHICLE_FROM_LIDAR[2, 3] = 1.8
+
+
+def make_example(seed=0, vehicle=True):
+    """Return an example of two cameras with lines, traffic and an SD map, in the vehicle's own frame."""
+    example = make_camera_example(seed).replace(map_lines=make_line_example(seed).map_lines)
+    state = VehicleState(*(np.float32(m) for m in (np.linalg.inv(VEHICLE_FROM_LIDAR), np.eye(4))), np.arange(18.0))
+    roads = SdMap(np.arange(8.0, dtype=np.float32).reshape(1, 4, 2), np.zeros(1, np.int32), np.ones(1, bool))
+    cameras = example.cameras.replace(vehicle=state if vehicle else None)
+    return example.replace(sd_map=roads, cameras=cameras)
+
+
+def test_a_point_of_the_lidars_frame_is_seen_where_it_was():
+    """The cameras know the tilt and the height of the lidar; the depth network, the vehicle's own frame."""
+    example = make_example()
+    turned = in_lidar_axes(example).cameras
+    points = np.random.default_rng(0).normal(0.0, 8.0, (20, 3)).astype(np.float32)
+    there = transform_points(np.linalg.inv(VEHICLE_FROM_LIDAR), points).astype(np.float32)
+    for v in (0, 1):
+        calibration = example.cameras.intrinsics[v]
+        for ours, theirs in zip(
+            project(points, calibration, example.cameras.camera_from_ego[v]),
+            project(there, calibration, np.asarray(turned.camera_from_ego[v])),
+            strict=True,
+        ):
+            np.testing.assert_allclose(theirs, ours, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(turned.vehicle.vehicle_from_ego, VEHICLE_FROM_LIDAR, atol=1e-6)
+    np.testing.assert_allclose(turned.vehicle.lidar_from_ego, np.eye(4), atol=1e-6)
+
+
+def test_what_lies_on_the_ground_takes_the_level_pose():
+    """MapTR's patch has the lidar's place and heading, not its tilt. A road user 20 m ahead of the lidar."""
+    example = make_example()
+    flow = example.traffic_flow
+    flow.position[0, 0], flow.yaw[0, 0] = [20.9, 0.1, 0.8], 0.5
+    turned = in_lidar_axes(example)
+    np.testing.assert_allclose(turned.traffic_flow.position[0, 0], [0.0, 20.0, -1.0], atol=1e-5)
+    np.testing.assert_allclose(turned.traffic_flow.yaw[0, 0], 0.5 + np.pi / 2, atol=1e-6)
+    np.testing.assert_allclose(turned.sd_map.points[0, 0], [-0.9, -0.9], atol=1e-5)
+    level = level_pose(example)
+    np.testing.assert_allclose(lines_in_ego_axes(turned.sd_map.points, level), example.sd_map.points, atol=1e-5)
+    np.testing.assert_allclose(
+        lines_in_ego_axes(turned.traffic_flow.position, level), example.traffic_flow.position, atol=1e-4
+    )
+    moved = example.replace(previous_from_ego=yaw_pose(*np.float32([3.0, 0.5, 0.1])))
+    ahead = np.asarray(in_lidar_axes(moved).previous_from_ego)
+    np.testing.assert_allclose(ahead[:2, 3], [-0.5, 3.0], atol=0.15)  # the lidar is not the centre of the turn
+    np.testing.assert_array_equal(turned.map_lines.points, example.map_lines.points)
+
+
+def test_without_a_known_lidar_the_axes_turn_by_a_quarter():
+    turned = in_lidar_axes(make_example(vehicle=False))
+    np.testing.assert_allclose(turned.sd_map.points[0, 1], [-3.0, 2.0], atol=1e-6)
+    np.testing.assert_allclose(turned.cameras.vehicle.vehicle_from_ego[:2, :2], [[0, 1], [-1, 0]], atol=1e-6)
+    assert turned.cameras.vehicle.can_bus is None
+
+
+def test_ranges_and_rasters_turn_as_points_do():
+    lidar = range_in_lidar_axes(RANGE)
+    assert (lidar.x, lidar.y, lidar.z) == ((-16.0, 14.0), (-30.0, 26.0), RANGE.z)
+    assert range_in_ego_axes(lidar) == RANGE
+    # A mark in the cell of one point, in either raster.
+    point = np.array([11.0, -5.0])
+    here, there = BevGrid(RANGE, 6, 8), BevGrid(lidar, 8, 6)
+    ours, theirs = np.zeros((2, 6, 8)), np.zeros((2, 8, 6))
+    for grid, raster, place in ((here, ours, point), (there, theirs, np.array([-point[1], point[0]]))):
+        column, row = np.round(grid.pixel(place)).astype(int)
+        raster[:, row, column] = 1.0
+    np.testing.assert_array_equal(raster_in_ego_axes(jnp.asarray(theirs)), ours)
+
+
+def with_cameras(range_, kind=MapTrConfig, **settings):
+    """Return a host with cameras on a grid over the range, in the grid's own axes."""
+    images = replace(CAMERA.images, stages=(3,), pyramid=replace(CAMERA.images.pyramid, levels=1))
+    grid = BevGrid(replace(range_, z=(-10.0, 10.0)), 6, 4)
+    lift = LiftConfig(grid, dim=16, cameras=2, depth=(1.0, 9.0, 2.0), pyramid=4, dropout=0.0)
+    encoder = replace(CAMERA, images=images, bev=lift, cells=False)
+    return kind(encoder=encoder, decoder=LINES.decoder, priors=SMALL_LINES.priors, **settings)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"encoder": LINES.encoder}, "BEV evidence is a raster in the ego axes"),
+        (
+            {"denoising": DenoisingConfig(), "decoder": SMALL_LINES.decoder},
+            "noised lines are in the ego axes",
+        ),
+    ],
+)
+def test_parts_without_turned_axes_are_named(changes, message):
+    with pytest.raises(UserError, match=message):
+        replace(with_cameras(range_in_lidar_axes(RANGE), range=RANGE, axes="lidar"), **changes).build()
+
+
+def test_the_can_bus_of_published_weights():
+    """Without a previous frame: no position, no turn in degrees."""
+    expected = np.arange(18.0)
+    expected[[0, 1, 2, 17]] = 0.0
+    np.testing.assert_array_equal(can_bus_vector(make_example().cameras), expected)
+    with pytest.raises(UserError, match=r"these data have none: set data\.can_bus"):
+        can_bus_vector(make_example(vehicle=False).cameras)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [MapTrConfig, partial(MapTrV2Config, many=2, line_mask=True)])
+def test_a_model_in_the_lidars_axes_gives_the_turned_lines(kind):
+    """The same parameters in a host that knows no axes, on cameras and tracks turned by hand."""
+    lidar = range_in_lidar_axes(RANGE)
+    host, plain = with_cameras(lidar, kind, range=RANGE, axes="lidar"), with_cameras(lidar, kind, range=lidar)
+    example = make_example()
+    params = random_params(LaneGraphTask(host).init, example)
+    found = jax.jit(LaneGraphTask(host).predict)(params, example).lines
+
+    level = yaw_pose(0.9, 0.1, -np.pi / 2)
+    level[2, 3] = 1.8
+    flow, cameras = example.traffic_flow, example.cameras
+    state = cameras.vehicle.replace(vehicle_from_ego=np.float32(VEHICLE_FROM_LIDAR))
+    by_hand = example.replace(
+        cameras=cameras.replace(
+            camera_from_ego=(cameras.camera_from_ego @ VEHICLE_FROM_LIDAR).astype(np.float32), vehicle=state
+        ),
+        traffic_flow=flow.replace(
+            position=transform_points(invert_pose(level), flow.position).astype(np.float32),
+            yaw=(flow.yaw + np.pi / 2).astype(np.float32),
+        ),
+    )
+    there = jax.jit(LaneGraphTask(plain).predict)(params, by_hand).lines
+    x, y = np.moveaxis(np.asarray(there.points), -1, 0)
+    np.testing.assert_allclose(found.points, np.stack([y + 0.9, -x + 0.1], -1), atol=1e-2)
+    np.testing.assert_allclose(found.logits, there.logits, atol=1e-3)
+    assert np.ptp(found.points) > 1.0
+    # What the model sees depends on the turn.
+    assert np.abs(jax.jit(LaneGraphTask(plain).predict)(params, example).lines.logits - there.logits).max() > 1e-3

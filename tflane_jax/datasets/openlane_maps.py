@@ -1,0 +1,247 @@
+"""A segment of OpenLane-V2 as a map for the built-in world: lanes of all its frames, joined in the global frame.
+
+A frame's annotation holds the lanes within +-50 m x +-25 m of the vehicle, cut at that border, and their topology. From
+frame to frame a lane is followed by where it lies, because ids hold within a frame only; its pieces are joined, and so
+are the frames' topologies. Any folder of this form will do:
+
+    <segment>/info/<timestamp>.json, or -ls.json     pose and annotation of each frame
+
+Lane-segment files (-ls) tell boundaries, markings and road edges. Centerline files tell none of these: lanes get a
+width of 3.5 m. Crossings are left out; cameras, images and traffic elements are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from tflane_jax.datasets.identities import line_distances
+from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
+from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
+from tflane_jax.datasets.openlane_frames import frame_pose
+from tflane_jax.datasets.plausible import check_motion
+from tflane_jax.errors import UserError
+from tflane_jax.files.fields import load_json, member
+from tflane_jax.files.openlane import CENTERLINE, SEGMENT
+from tflane_jax.geometry import transform_points
+from tflane_jax.geometry.polylines import arc_length, resample_lines, sample_at
+from tflane_jax.scene import AreaType, LineType
+from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.world.roads.road_map import RoadMap
+
+# Distance across the road up to which frames are complete, metres.
+COMPLETE = 25.0
+# Lines whose mean distance is less are one line, metres; the ends of pieces differ by less than half as much.
+_SAME = 0.75
+_POINTS = 41
+# Timestamps of Argoverse 2 are nanoseconds, of more digits; those of nuScenes microseconds.
+_NANOSECONDS = 10**17
+
+
+def segment_files(folder: Path) -> tuple[Path, ...]:
+    """Return the frames' files of a segment by time: those with lane segments, if there are any.
+
+    Args:
+        folder: `info`, with a file for each frame.
+    """
+    files = {suffix: [] for suffix in (SEGMENT.suffix, CENTERLINE.suffix)}
+    for path in sorted(folder.glob("*.json")):
+        suffix = SEGMENT.suffix if path.stem.endswith(SEGMENT.suffix) else CENTERLINE.suffix
+        if path.stem.removesuffix(suffix).isdecimal():
+            files[suffix].append(path)
+    return tuple(sorted(files[SEGMENT.suffix] or files[CENTERLINE.suffix], key=_time))
+
+
+def _time(path: Path) -> int:
+    return int(path.stem.removesuffix(SEGMENT.suffix))
+
+
+def read_segment(files: Sequence[Path]) -> RoadMap:
+    """Read the map of a segment; `files` as from `segment_files`.
+
+    Raises UserError, which names file and field, for a frame that is damaged or has no annotation, for a vehicle that
+    jumps, and where no frame has a lane.
+    """
+    lanes, edges, poses = _Lines(3), _Lines(1), []
+    for path in files:
+        names = SEGMENT if path.stem.endswith(SEGMENT.suffix) else CENTERLINE
+        content, where = load_json(path), str(path)
+        pose = frame_pose(member(content, "pose", where), f"{where}: pose")
+        if content.get("annotation") is None:
+            raise UserError(f"{where} has no annotation, as in the test split: take another segment")
+        found = read_annotation(content["annotation"], names, where)
+        lanes.step(_global(found, pose), found.is_connector, np.stack([found.left_type, found.right_type], -1))
+        lanes.connect(found.successor)
+        border = [
+            line for line, kind in zip(found.areas, found.area_category, strict=True) if kind == AreaType.ROAD_BOUNDARY
+        ]
+        edges.step([(transform_points(pose, line),) for line in border])
+        poses.append(pose)
+    places = np.stack(poses)[:, :2, 3]
+    times = np.array([_time(path) for path in files], np.int64)
+    times = times if times.max() >= _NANOSECONDS else 1000 * times
+    check_motion(places, times, [str(path) for path in files])
+    segments = dict(_segments(lanes, sides=files[0].stem.endswith(SEGMENT.suffix)))
+    segment = files[0].parent.parent
+    if not segments:
+        raise UserError(f"{segment}: no frame has a lane: take another segment")
+    border = tuple(parts[0] for parts in edges.parts)
+    return RoadMap(map_name(segment), "openlane_v2", VectorMap(segments, (), border), places, COMPLETE)
+
+
+def map_name(segment: Path) -> str:
+    """Return the name of a segment's map: split and number."""
+    return f"{segment.parent.name}-{segment.name}"
+
+
+def _global(found: Annotation, pose: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+    """Return centerline, left and right of each lane, global metres."""
+    sides = (found.lines, found.left or found.lines, found.right or found.lines)
+    return [tuple(transform_points(pose, line) for line in three) for three in zip(*sides, strict=True)]
+
+
+@dataclass
+class _Lines:
+    """Lines followed from frame to frame.
+
+    Attributes:
+        count: lines that belong together, of which the first decides what is the same.
+        parts: of each line found so far.
+        connector: whether each is in an intersection; kinds: (left, right) `LineType` of each.
+        after: numbers of the lines that continue each.
+    """
+
+    count: int
+    parts: list[tuple[np.ndarray, ...]] = field(default_factory=list)
+    connector: list[bool] = field(default_factory=list)
+    kinds: list[tuple[int, int]] = field(default_factory=list)
+    after: list[set[int]] = field(default_factory=list)
+    _before: list[np.ndarray] = field(default_factory=list)
+    _numbers: list[int] = field(default_factory=list)
+
+    def step(
+        self,
+        found: Sequence[tuple[np.ndarray, ...]],
+        connector: Sequence[bool] | np.ndarray = (),
+        kinds: Sequence[Sequence[int]] | np.ndarray = (),
+    ) -> None:
+        """Take the lines of the next frame, global metres."""
+        found = [tuple(_clean(line) for line in parts) for parts in found]
+        now = [parts[0] for parts in found]
+        known = same_lines(now, self._before)
+        numbers = []
+        for row, parts in enumerate(found):
+            if row in known:
+                number = self._numbers[known[row]]
+                pairs = zip(self.parts[number], parts, strict=True)
+                self.parts[number] = tuple(joined(before, after) for before, after in pairs)
+            else:
+                number = len(self.parts)
+                self.parts.append(parts)
+                self.connector.append(bool(len(connector) and connector[row]))
+                self.kinds.append((int(kinds[row][0]), int(kinds[row][1])) if len(kinds) else (0, 0))
+                self.after.append(set())
+            numbers.append(number)
+        self._before, self._numbers = now, numbers
+
+    def connect(self, successor: np.ndarray) -> None:
+        """Add the topology (n, n) of the latest frame."""
+        for i, j in zip(*np.nonzero(successor), strict=True):
+            if i != j and self._numbers[i] != self._numbers[j]:
+                self.after[self._numbers[i]].add(self._numbers[j])
+
+
+def _segments(lanes: _Lines, *, sides: bool) -> Iterator[tuple[int, LaneSegment]]:
+    keep = _without_copies([parts[0] for parts in lanes.parts])
+    lines = {i: lanes.parts[i][0] for i, number in enumerate(keep) if number == i and len(lanes.parts[i][0]) > 1}
+    after: dict[int, set[int]] = {i: set() for i in lines}
+    for i, following in enumerate(lanes.after):
+        after.setdefault(keep[i], set()).update(keep[j] for j in following)
+    alone = {} if sides else {i: LaneOutline(_plain(line), None) for i, line in lines.items()}
+    beside = boundaries(alone, {})
+    for i, line in lines.items():
+        left, right = lanes.parts[i][1:]
+        if not sides:
+            line = alone[i].centerline
+            left, right, line = (np.pad(one, ((0, 0), (0, 1))) for one in (*beside[i], line))
+        yield (
+            i,
+            LaneSegment(
+                id=i,
+                centerline=line,
+                left=left,
+                right=right,
+                left_type=LineType(lanes.kinds[i][0]),
+                right_type=LineType(lanes.kinds[i][1]),
+                is_intersection=lanes.connector[i],
+                successors=tuple(sorted(j for j in after[i] if j in lines and j != i)),
+            ),
+        )
+
+
+def same_lines(now: Sequence[np.ndarray], before: Sequence[np.ndarray]) -> dict[int, int]:
+    """Return the line of the frame before that each line continues, by numbers; new lines are left out.
+
+    A line may be cut shorter: the smaller one of the mean distances from one to the other counts.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    if not len(now) or not len(before):
+        return {}
+    ours, theirs = (resample_lines(list(lines), _POINTS) for lines in (now, before))
+    there, place = line_distances(ours, theirs)
+    back = line_distances(theirs, ours)[0].mean(-1).T
+    apart = np.minimum(there.mean(-1), back) + 1e-3 * np.maximum(there.mean(-1), back)
+    # The same direction.
+    apart = np.where(place[..., -1] >= place[..., 0], apart, 1e6)
+    pairs = zip(*linear_sum_assignment(apart), strict=True)
+    return {int(i): int(j) for i, j in pairs if apart[i, j] < _SAME}
+
+
+def joined(before: Float[np.ndarray, "n 3"], after: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "k 3"]:
+    """Return the union of two pieces of a line: the later one, and what the earlier one has beyond its ends."""
+    along = arc_length(before)
+    start, end = (_station(before, along, point) for point in (after[0], after[-1]))
+    head = before[along < start - 0.5 * _SAME] if start > 0.5 * _SAME else before[:0]
+    tail = before[along > end + 0.5 * _SAME] if end < along[-1] - 0.5 * _SAME else before[:0]
+    return _clean(np.concatenate([head, after, tail]))
+
+
+def _station(line: np.ndarray, along: np.ndarray, point: np.ndarray) -> float:
+    """Return the distance along a line of its place nearest to a point."""
+    _, place = line_distances(point[None, None], line[None])
+    return float(np.interp(place[0, 0, 0], np.arange(len(line)), along))
+
+
+def _without_copies(lines: Sequence[np.ndarray]) -> Int[np.ndarray, " n"]:
+    """Return for each line its own number, or that of a longer line on which it lies wholly."""
+    keep = np.arange(len(lines))
+    if not len(lines):
+        return keep
+    dense = resample_lines(list(lines), _POINTS)
+    distance, place = line_distances(dense, dense)
+    on = (distance.max(-1) < 0.5 * _SAME) & (place[..., -1] > place[..., 0])
+    length = np.array([arc_length(line)[-1] for line in lines])
+    for i in np.argsort(length, kind="stable").tolist():
+        longer = [j for j in np.flatnonzero(on[i]) if (length[j], j) > (length[i], i)]
+        if longer:
+            keep[i] = max(longer, key=lambda j: length[j])
+    while (keep[keep] != keep).any():
+        keep = keep[keep]
+    return keep
+
+
+def _clean(line: np.ndarray) -> np.ndarray:
+    """Return a line without points that repeat the one before."""
+    apart = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1) > 1e-3
+    return line[np.concatenate([[True], apart])]
+
+
+def _plain(line: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    """Return a line on the plane with points at most 2 m apart."""
+    along = arc_length(line)
+    return sample_at(line, np.linspace(0.0, along[-1], max(int(along[-1] // 2) + 1, 2)))[:, :2]

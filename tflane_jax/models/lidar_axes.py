@@ -1,0 +1,124 @@
+"""Hosts that work in the axes of nuScenes' lidar (x right, y forward), as published weights of MapTR and MapTRv2 do.
+
+Such a host turns its inputs into the lidar's frame and its lines back into the frame of the example, so that data,
+losses, metrics and pictures stay in one frame. Cameras take the lidar's whole pose, with height and tilt, as the
+published code does. All else takes the level pose: the lidar's place and heading above the ground.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, transform_points, yaw_pose
+from tflane_jax.models.prior import BevCells, HostQueries, Prior
+from tflane_jax.scene import CameraViews, Example, SdMap, TrafficFlow, VehicleState
+
+
+def range_in_lidar_axes(range_: PerceptionRange) -> PerceptionRange:
+    """Return the box of the ego axes (x forward, y left) in the lidar's: (x, y) is (-y, x) there."""
+    return PerceptionRange((-range_.y[1], -range_.y[0]), range_.x, range_.z)
+
+
+def range_in_ego_axes(range_: PerceptionRange) -> PerceptionRange:
+    """Return the box of the lidar's axes in the ego axes, the inverse of `range_in_lidar_axes`."""
+    return PerceptionRange(range_.y, (-range_.x[1], -range_.x[0]), range_.z)
+
+
+def raster_in_ego_axes(raster: Float[Array, "*b y x"]) -> Float[Array, "*b x y"]:
+    """Return cells of the lidar's axes as cells of the ego axes; rows run along y, columns along x in both."""
+    return jnp.flip(jnp.swapaxes(raster, -1, -2), -2)
+
+
+def lidar_from_ego(example: Example) -> Float[Array, "4 4"]:
+    """Return the lidar's pose in which cameras are seen; for data that do not tell it, a quarter turn."""
+    vehicle = None if example.cameras is None else example.cameras.vehicle
+    if vehicle is None:
+        return invert_pose(yaw_pose(*jnp.array([0.0, 0.0, -math.pi / 2])))
+    return jnp.asarray(vehicle.lidar_from_ego)
+
+
+def level_pose(example: Example) -> Float[Array, "4 4"]:
+    """Return ego_from_lidar without tilt."""
+    with jax.default_matmul_precision("highest"):
+        pose = invert_pose(lidar_from_ego(example))
+    level = yaw_pose(pose[0, 3], pose[1, 3], pose_yaw(pose))
+    return level.at[2, 3].set(pose[2, 3])
+
+
+def in_lidar_axes(example: Example) -> Example:
+    """Return cameras, traffic flow, SD map and motion of an example in the lidar's frame; the truth stays as it is."""
+    # Full float32: accelerators may multiply matrices at lower precision by default.
+    with jax.default_matmul_precision("highest"):
+        level = level_pose(example)
+        lidar = invert_pose(level)
+        return replace(
+            example,
+            cameras=None if example.cameras is None else _cameras(example.cameras, lidar_from_ego(example)),
+            traffic_flow=None if example.traffic_flow is None else _traffic(example.traffic_flow, lidar),
+            sd_map=None if example.sd_map is None else _sd_map(example.sd_map, lidar),
+            previous_from_ego=lidar @ jnp.asarray(example.previous_from_ego) @ level,
+        )
+
+
+def lines_in_ego_axes(points: Float[Array, "*b p d"], level: Float[Array, "4 4"]) -> Float[Array, "*b p d"]:
+    """Return points (x, y or x, y, z) of the lidar's frame in that of the example, see `level_pose`."""
+    size = points.shape[-1]
+    pose = level if size == 3 else level[jnp.array([0, 1, 3])][:, jnp.array([0, 1, 3])]
+    with jax.default_matmul_precision("highest"):
+        return transform_points(pose, points.reshape(-1, size)).reshape(points.shape)
+
+
+def _cameras(cameras: CameraViews, lidar: Float[Array, "4 4"]) -> CameraViews:
+    ego, vehicle = invert_pose(lidar), cameras.vehicle
+    own = jnp.eye(4, dtype=lidar.dtype) if vehicle is None else jnp.asarray(vehicle.vehicle_from_ego)
+    state = VehicleState(jnp.eye(4, dtype=lidar.dtype), own @ ego, None if vehicle is None else vehicle.can_bus)
+    return replace(cameras, camera_from_ego=jnp.asarray(cameras.camera_from_ego) @ ego, vehicle=state)
+
+
+def _traffic(flow: TrafficFlow, lidar: Float[Array, "4 4"]) -> TrafficFlow:
+    position = transform_points(lidar, jnp.asarray(flow.position))
+    return replace(flow, position=position, yaw=jnp.asarray(flow.yaw) + pose_yaw(lidar))
+
+
+def _sd_map(sd_map: SdMap, lidar: Float[Array, "4 4"]) -> SdMap:
+    return replace(sd_map, points=lines_in_ego_axes(jnp.asarray(sd_map.points), lidar))
+
+
+class InLidarAxes(Prior):
+    """A prior of a host in the lidar's axes: it observes the turned example.
+
+    Args:
+        prior: built with the ranges of the lidar's axes.
+    """
+
+    def __init__(self, prior: Prior):
+        self.prior = prior
+        self.reads = prior.reads  # pyright: ignore[reportAttributeAccessIssue]
+
+    def modules(self) -> dict[str, nn.Module]:
+        return self.prior.modules()
+
+    def start(self) -> Any:
+        return self.prior.start()
+
+    def observe(self, example: Example, memory: Any) -> tuple[Any, Any]:
+        return self.prior.observe(in_lidar_axes(example), memory)
+
+    def encode(self, observation: Any, *, deterministic: bool) -> Any:
+        return self.prior.encode(observation, deterministic=deterministic)
+
+    def into_bev(self, tokens: Any, layer: int, cells: BevCells) -> Float[Array, "q c"]:
+        return self.prior.into_bev(tokens, layer, cells)
+
+    def into_queries(self, tokens: Any, layer: int, queries: HostQueries) -> Float[Array, "q d"]:
+        return self.prior.into_queries(tokens, layer, queries)
+
+    def fuses_into_bev(self) -> bool:
+        return self.prior.fuses_into_bev()

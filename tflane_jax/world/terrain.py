@@ -1,0 +1,130 @@
+"""Slopes: a simulated scene is laid over hilly ground.
+
+Roads and traffic are simulated on the level. Then every point moves up by the height of the ground below it, and
+vehicles stand on the slope. Speeds and sight lines stay those of the level world: hills hide nothing from the tracker
+and from the evidence sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.errors import UserError
+from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
+from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Relief, Tracks, VectorMap
+from tflane_jax.scene.terrain import Terrain
+
+# Straight lines get a vertex every so many metres, to follow the ground.
+_STEP = 4.0
+
+
+@dataclass(frozen=True)
+class TerrainConfig:
+    """Hills.
+
+    Attributes:
+        grade: root mean square of the slope in the steepest direction, metres a metre; 0.05 is 5 %.
+        wavelength: shortest and longest distance from hill to hill, metres.
+        waves: how many waves are added up.
+    """
+
+    grade: float = 0.05
+    wavelength: tuple[float, float] = (150.0, 400.0)
+    waves: int = 6
+
+    def draw(self, rng: np.random.Generator) -> Terrain:
+        """Return random ground; raises UserError for settings that give none."""
+        low, high = self.wavelength
+        if not (0.0 <= self.grade <= 0.2 and 50.0 <= low <= high and self.waves >= 1):
+            raise UserError(
+                "terrain needs a grade from 0 to 0.2, wavelengths from 50 m upwards and at least one wave, not "
+                f"{self.grade:g}, {low:g} to {high:g} m and {self.waves}"
+            )
+        length = np.exp(rng.uniform(np.log(low), np.log(high), self.waves))
+        turn, phase = rng.uniform(0.0, 2.0 * np.pi, (2, self.waves))
+        number = 2.0 * np.pi / length
+        waves = number[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+        # The mean square of a cosine is a half.
+        return Terrain(waves, phase, self.grade * np.sqrt(2.0 / self.waves) / number)
+
+
+def on_terrain(log: Log, terrain: Terrain) -> Log:
+    """Return the scene of a level world on hilly ground.
+
+    Args:
+        log: level, with poses on the plane z = 0.
+        terrain: the ground.
+    """
+    level = log.global_from_ego
+    poses = terrain.pose(level[:, :2, 3], pose_yaw(level))
+    moments = (replace(moment, global_from_ego=poses[moment.track_frame]) for moment in log.keyframes)
+    tracks = _tracks(log.tracks, level, poses, terrain)
+    return replace(
+        log,
+        map=_map(log.map, terrain),
+        global_from_ego=poses,
+        tracks=tracks,
+        actors=tracks if log.actors is log.tracks else _tracks(log.actors, level, poses, terrain),
+        keyframes=tuple[KeyFrame, ...](moments),
+        markers=None if log.markers is None else replace(log.markers, pose=_raised_poses(log.markers.pose, terrain)),
+        relief=Relief(terrain, log),
+    )
+
+
+def _map(level: VectorMap, terrain: Terrain) -> VectorMap:
+    def lines(found: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+        return tuple(terrain.raised(with_vertices(line)) for line in found)
+
+    def segment(lane: LaneSegment) -> LaneSegment:
+        centerline, left, right = lines([lane.centerline, lane.left, lane.right])
+        return replace(lane, centerline=centerline, left=left, right=right)
+
+    return replace(
+        level,
+        segments={number: segment(lane) for number, lane in level.segments.items()},
+        # Their corners have a meaning.
+        crossings=tuple(terrain.raised(ring) for ring in level.crossings),
+        road_boundaries=lines(level.road_boundaries),
+        elements=tuple(replace(e, position=terrain.raised(np.asarray(e.position, float))) for e in level.elements),
+        roads=lines(level.roads),
+        dividers=None if level.dividers is None else lines(level.dividers),
+    )
+
+
+def with_vertices(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return a line with further vertices, at most 4 m apart; a line driven the other way gets the same ones."""
+    if len(line) < 2:
+        return line
+    start, step = line[:-1], np.diff(line, axis=0)
+    count = np.maximum(np.ceil(np.linalg.norm(step[:, :2], axis=-1) / _STEP), 1).astype(int)
+    parts = [
+        a + np.arange(n)[:, None] / n * d if n > 1 else a[None] for a, d, n in zip(start, step, count, strict=True)
+    ]
+    return np.concatenate([*parts, line[-1:]])
+
+
+def _tracks(level: Tracks, poses: np.ndarray, raised: np.ndarray, terrain: Terrain) -> Tracks:
+    """Return boxes, each in the frame of its own moment, of vehicles that stand on the ground."""
+    there = terrain.raised(transform_points(poses, level.position))
+    position = transform_points(invert_pose(raised), there)
+    yaw = level.yaw + pose_yaw(poses)[:, None]
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], -1)
+    ahead = np.concatenate([ahead, (terrain.slope(there[..., :2]) * ahead).sum(-1, keepdims=True)], -1)
+    ahead = ahead @ raised[:, :3, :3]  # into the ego frame
+    yaw = np.arctan2(ahead[..., 1], ahead[..., 0])
+    return replace(
+        level,
+        position=np.where(level.valid[..., None], position, level.position),
+        yaw=np.where(level.valid, yaw, level.yaw),
+    )
+
+
+def _raised_poses(poses: Float[np.ndarray, "m 4 4"], terrain: Terrain) -> Float[np.ndarray, "m 4 4"]:
+    """Return boards moved up; they stay upright."""
+    found = poses.copy()
+    found[:, :3, 3] = terrain.raised(poses[:, :3, 3])
+    return found

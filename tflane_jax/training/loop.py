@@ -33,7 +33,7 @@ from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter, Unwritten
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config
-from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
 from tflane_jax.training.step import compiled_update, update_all
 from tflane_jax.training.task import Trainable
@@ -52,7 +52,9 @@ class TrainingConfig:
 
     Attributes:
         steps: updates.
-        batch_size: examples of an update (of each seed).
+        batch_size: examples of an update (of each seed), on all devices together.
+        accumulate: parts in which a batch passes through the model, one after the other, to save memory; see
+            docs/scale.md for what is equal to one pass. `batch_size` must be a multiple of it times the devices.
         seeds: roots of all random numbers in training. Several seeds train side by side, each as it would alone; n
             seeds take n times as long.
         log_every: steps between records; a record holds means over the steps since the last one.
@@ -67,6 +69,7 @@ class TrainingConfig:
 
     steps: int = 10_000
     batch_size: int = 8
+    accumulate: int = 1
     seeds: tuple[int, ...] = (0,)
     log_every: int = 50
     eval_every: int = 1000
@@ -151,7 +154,8 @@ def train(
     """
     _check(config)
     progress = progress and is_first()
-    mesh = training_mesh(config.batch_size)
+    mesh = training_mesh(config.batch_size, config.accumulate)
+    optim = scaled_to_batch(optim, config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
     if adaptive is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
@@ -216,7 +220,8 @@ def train(
         batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1, mesh=mesh)
+            form: dict[str, Any] = {"donate": len(states) == 1, "mesh": mesh, "accumulate": config.accumulate}
+            update = compiled_update(task, optim, config.steps, states[0], batch[0], **form)
         compile_seconds = time.perf_counter() - began
         if progress:
             tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)
@@ -295,7 +300,15 @@ def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
 
 
 def _check(config: TrainingConfig) -> None:
-    for name in ("steps", "batch_size", "log_every", "eval_every", "checkpoint_every", "keep_checkpoints"):
+    for name in (
+        "steps",
+        "batch_size",
+        "accumulate",
+        "log_every",
+        "eval_every",
+        "checkpoint_every",
+        "keep_checkpoints",
+    ):
         if getattr(config, name) < 1:
             raise UserError(f"training.{name} is {getattr(config, name)}: it must be at least 1")
     if not config.seeds or len(set(config.seeds)) < len(config.seeds):

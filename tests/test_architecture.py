@@ -40,7 +40,7 @@ FLOORS = (
     "convert",
     "config",
     "runs",
-    "summary export",
+    "summary plan export",
     "ablations",
     "demo",
     "commands",

@@ -22,6 +22,7 @@ from tests.training.stub_run import CONFIG, run
 from tflane_jax.devices import active, divided, everywhere, replicated, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predictions
+from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS, BatchNorm
 from tflane_jax.matching import match
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -99,6 +100,25 @@ def in_parts(accumulate: int = 2) -> list:
     return [np.asarray(update(state, batch)[0].params["line"]["kernel"]).tolist(), moved]
 
 
+def normalised(*, frozen: bool = False) -> dict[str, Any]:
+    """Return what a batch norm in training gives for a divided batch, and the number of exchanges between devices."""
+    x = np.random.default_rng(5).normal(size=(BATCH, 3, 2)).astype(np.float32)
+    x += np.arange(BATCH, dtype=np.float32)[:, None, None]  # devices have different means
+    norm, mesh = BatchNorm(frozen), training_mesh(BATCH)
+    variables = norm.init(jax.random.key(0), x[0], train=True)
+
+    def apply(variables, x):
+        one = lambda x: norm.apply(variables, x, train=True, mutable=[STATISTICS])  # noqa: E731
+        return jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, None))(x)
+
+    with active(mesh):
+        program: Any = jax.jit(apply).lower(replicated(variables, mesh), divided(x, mesh)).compile()
+        found, updated = program(replicated(variables, mesh), divided(x, mesh))
+    exchanges = program.as_text().count(" all-reduce(") + program.as_text().count(" all-reduce-start(")
+    statistics = {name: np.asarray(value).tolist() for name, value in updated[STATISTICS].items()}
+    return {"output": np.asarray(found).tolist(), "statistics": statistics, "exchanges": exchanges}
+
+
 def main() -> None:
     folder = Path(sys.argv[1])
     jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -114,6 +134,7 @@ def main() -> None:
         "predicted": predicted(BATCH),
         "predicted by one": predicted(BATCH - 1),
         "in parts": in_parts(),
+        "norms": {"learned": normalised(), "frozen": normalised(frozen=True)},
         "host": host_terms() if jax.device_count() == 2 else {},  # compiling takes long
     }
     print(json.dumps(facts))

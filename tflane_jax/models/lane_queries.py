@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.layers.precision import Precision
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class LaneDecoderConfig:
         metres: unit of change along x, y and z of output "metric".
         proposals: queries from a heat map of lanes beside the learned ones; None for learned ones only.
         dropout: probability, for attention weights, hidden channels, messages and every residual branch.
+        precision: dtype of linear layers, see `layers.precision`; parameters, points and scores are float32.
+        remat: recompute each layer's activations for the gradient instead of keeping them.
     """
 
     dim: int = 64
@@ -72,6 +75,8 @@ class LaneDecoderConfig:
     metres: tuple[float, float, float] = (5.0, 5.0, 0.3)
     proposals: LaneProposalConfig | None = None
     dropout: float = 0.0
+    precision: Precision = "float32"
+    remat: bool = False
 
     @property
     def learned_queries(self) -> int:

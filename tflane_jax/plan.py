@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene import shapes_of
@@ -158,7 +159,7 @@ def make_plan(
 
 def _gib(tree: Any) -> float:
     """Return the size of arrays given by their shapes; random keys count nothing."""
-    plain = [leaf for leaf in jax.tree.leaves(tree) if not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+    plain = [leaf for leaf in jax.tree.leaves(tree) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in plain) / GIB
 
 

@@ -1,6 +1,6 @@
 """bfloat16 and recomputed activations: where they act, and what stays float32."""
 
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 
 import flax.linen as nn
 import jax
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.gpu.steps import everywhere
 from tests.models.cases import WITH_TRAFFIC, make_example
 from tflane_jax.config import load_config
 from tflane_jax.layers.attention import MultiHeadAttention
@@ -109,7 +110,7 @@ def test_a_layer_keeps_a_dtype_of_its_own():
 def test_every_part_of_a_host_has_both(name):
     config = load_config(name)
     example = config.task.shapes(config.data)
-    task = replace(config.task, model=everywhere(config.task.model, Settings("bfloat16", True)))
+    task = replace(config.task, model=everywhere(config.task.model, "bfloat16", remat=True))
     plain, params = (shapes_of_params(each, example) for each in (config.task, task))
     assert plain == params
     program = jax.make_jaxpr(jax.value_and_grad(task.loss, has_aux=True), return_shape=True)
@@ -125,20 +126,10 @@ def test_losses_in_half_precision_are_close_and_recomputing_changes_nothing():
     losses = {}
     batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), make_example())
     for settings in (Settings(), Settings(remat=True), Settings("bfloat16")):
-        task = LaneGraphTask(everywhere(WITH_TRAFFIC, settings))
+        task = LaneGraphTask(everywhere(WITH_TRAFFIC, settings.precision, remat=settings.remat))
         params = LaneGraphTask(WITH_TRAFFIC).init(jax.random.key(0), make_example())
         losses[settings] = float(jax.jit(task.loss)(params, batch, jax.random.key(0))[0])
     exact, again, half = losses.values()
     assert again == pytest.approx(exact, rel=1e-6)
     assert half == pytest.approx(exact, rel=0.05)
     assert half != exact
-
-
-def everywhere(config, settings):
-    """Return a configuration in which every part that has the settings takes these."""
-    if not is_dataclass(config):
-        return config
-    changes = {field.name: everywhere(getattr(config, field.name), settings) for field in fields(config)}
-    if "precision" in changes:
-        changes |= {"precision": settings.precision, "remat": settings.remat}
-    return replace(config, **changes)

@@ -58,8 +58,8 @@ def make_update_step(
         accumulate: parts of a batch, see `TrainingConfig.accumulate`.
     """
     update = _update(task, optim, steps, accumulate)
-    # Parts and frames of clips are the loops that hold gradients of convolutions.
-    update = _traced_once(with_fast_convolutions(update) if accumulate > 1 else update)
+    loops = accumulate > 1 or getattr(task, "loops", False)
+    update = _traced_once(with_fast_convolutions(update) if loops else update)
     placed: Any = {} if mesh is None else {"out_shardings": everywhere(mesh)}
     return jax.jit(update, donate_argnums=0 if donate else (), **placed)
 

@@ -137,9 +137,8 @@ def summary(commands) -> None:
     parser.add_argument(
         "--plan", metavar="DEVICES", type=int, help="estimate memory and time of the training on so many accelerators"
     )
-    parser.add_argument(
-        "--kind", choices=["a100", "h100", "h200", "rtx3090", "rtx4090"], default="h100", help="of them"
-    )
+    kinds = ["a100", "h100", "h200", "rtx3090", "rtx4090"]  # of plan.KINDS
+    parser.add_argument("--kind", choices=kinds, default="h100", help="kind of the accelerators (default h100)")
     parser.add_argument(
         "--utilisation", type=float, default=0.25, help="fraction of the peak that --plan assumes (default 0.25)"
     )

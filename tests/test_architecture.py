@@ -44,6 +44,7 @@ FLOORS = (
     "run_checks",
     "runs",
     "summary export",
+    "plan",
     "ablations",
     "demo",
     "commands",

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks import marker_occlusion, metrics, paper_sizes
+from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config_io import to_text
 from tflane_jax.markers.square_pose import solve_square
 from tflane_jax.training.schedule import make_optimizer
 
@@ -64,6 +66,31 @@ def test_composites_show_the_board_where_they_say(damage, tmp_path, monkeypatch,
             assert abs(fit.camera_from_marker[0, 2, 3] - 10.0) < 0.4
         else:
             assert not len(found.marker_id)
+
+
+@pytest.mark.slow
+def test_matching_on_the_device_is_compared_with_the_callback(tmp_path):
+    record = matching.run(tmp_path, tiny=True, seconds=0.0)
+    assert record["problems"]["tiny"]["same"]
+    assert "| tiny" in (tmp_path / "gpu_matching.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", steps.CONFIGS)
+def test_updates_on_an_accelerator_start(model, tmp_path):
+    record = steps.run(tmp_path, [model], tiny=True)
+    found = record["models"][model]
+    assert found["finite"]
+    assert found["gflop"] > 0
+    assert found["update_s"] > 0
+
+
+@pytest.mark.parametrize("model", steps.CONFIGS)
+def test_every_part_of_a_paper_size_model_is_in_half_precision(model):
+    text = to_text(steps.configuration(model, "bfloat16", remat=True, tiny=False))
+    chosen = [line.rpartition(" = ")[2] for line in text.splitlines() if ".precision" in line]
+    assert len(chosen) >= 3
+    assert set(chosen) == {"'bfloat16'"}
 
 
 def test_table_is_aligned():

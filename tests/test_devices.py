@@ -10,7 +10,7 @@ import pytest
 
 from tests.shared import ROOT
 from tests.slow import with_slow
-from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, predicted
+from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, in_parts, normalised, predicted
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
 
@@ -59,6 +59,21 @@ def test_each_device_matches_its_own_examples(forced):
 def test_devices_share_predictions_or_one_makes_them(forced):
     for found in (forced[1]["predicted"], forced[1]["predicted by one"]):
         np.testing.assert_allclose(found, predicted(BATCH), rtol=1e-5, atol=1e-6)
+
+
+def test_parts_of_a_batch_are_spread_over_the_devices(forced):
+    kernel, moved = forced[1]["in parts"]
+    np.testing.assert_allclose(kernel, in_parts(1)[0], rtol=1e-5)
+    assert moved == 0
+
+
+def test_batch_norms_take_the_statistics_of_all_devices(forced):
+    for kind, frozen in (("learned", False), ("frozen", True)):
+        expected, found = normalised(frozen=frozen), forced[1]["norms"][kind]
+        np.testing.assert_allclose(found["output"], expected["output"], rtol=1e-5, atol=1e-6)
+        for name, value in expected["statistics"].items():
+            np.testing.assert_allclose(found["statistics"][name], value, rtol=1e-5, err_msg=name)
+        assert (found["exchanges"] == 0) == frozen
 
 
 @pytest.mark.slow

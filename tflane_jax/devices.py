@@ -22,12 +22,18 @@ DATA_AXIS = "data"
 """Axis of the mesh that divides a batch."""
 
 
-def training_mesh(batch_size: int) -> Mesh | None:
+def training_mesh(batch_size: int, accumulate: int = 1) -> Mesh | None:
     """Return the mesh over all devices of all processes; None if there is one device.
 
-    Raises UserError if the devices cannot share a batch evenly.
+    Raises UserError if the devices cannot share each of the `accumulate` parts of a batch evenly.
     """
     devices = jax.device_count()
+    if accumulate > 1 and batch_size % (devices * accumulate):
+        shared = "" if devices == 1 else f" times {devices} devices"
+        raise UserError(
+            f"training.batch_size is {batch_size}, which {accumulate} parts (training.accumulate){shared} cannot share "
+            f"evenly: choose a multiple of {devices * accumulate}"
+        )
     if batch_size % devices:
         raise UserError(
             f"training.batch_size is {batch_size}, which {devices} devices cannot share evenly: "

@@ -34,7 +34,7 @@ from tflane_jax.training.loop import Draw, TrainingResult, train
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record
 from tflane_jax.training.run_folder import Start, check_start, claimed, read_config
-from tflane_jax.training.schedule import make_optimizer
+from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.state import per_seed, state_of
 
 
@@ -188,7 +188,7 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
     Raises UserError if the folder is not empty.
     """
     config = replace(config, training=replace(config.training, seeds=(0,)))
-    optimizer = make_optimizer(config.optim, config.training.steps)
+    optimizer = make_optimizer(scaled_to_batch(config.optim, config.training.batch_size), config.training.steps)
     state = state_of(params, optimizer, jax.random.key(0))
     with claimed(folder, "new"):
         add_provenance(folder)

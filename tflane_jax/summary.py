@@ -15,7 +15,7 @@ import jax
 
 from tflane_jax.scene import shapes_of
 from tflane_jax.tasks.base import AnyTask
-from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
 
@@ -72,7 +72,7 @@ def training_program(
     task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
     """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
-    example = _trained_on(task, example)
+    example, optim = _trained_on(task, example), scaled_to_batch(optim, batch_size)
     optimizer, step = make_optimizer(optim, 1000), make_update_step(task, optim, 1000)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
     lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))

@@ -10,6 +10,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,9 +22,13 @@ from tests.training.stub_run import CONFIG, run
 from tflane_jax.devices import active, divided, everywhere, replicated, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predictions
+from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS, BatchNorm
 from tflane_jax.matching import match
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.state import init_states
+from tflane_jax.training.step import compiled_update
 
 BATCH = 8
 EVENLY = dataclasses.replace(CONFIG, batch_size=BATCH, seeds=(0, 1))
@@ -73,6 +78,47 @@ def host_terms() -> dict[str, float]:
     } | {name: float(value) for name, value in terms.items()}
 
 
+class Quiet(LineTask):
+    """The stub without dropout, whose loss is a mean over examples."""
+
+    def loss(self, params, batch, key):
+        fit = ((jax.vmap(lambda x: self._apply(params, x))(batch["x"]) - batch["y"][:, None]) ** 2).mean()
+        return fit, {"fit": fit}
+
+
+def in_parts(accumulate: int = 2) -> list:
+    """Return parameters after an update of a batch that passes through the model in parts, and the number of gathers.
+
+    Each device holds examples of every part, so that no example moves.
+    """
+    arrays, optim = line_arrays(2 * BATCH), OptimConfig(lr=0.05, warmup_steps=0)
+    mesh = training_mesh(2 * BATCH, accumulate)
+    [state] = init_states(Quiet(), make_optimizer(optim, 9), [0], {"x": arrays["x"][0]})
+    state, batch = replicated(state, mesh), divided(arrays, mesh)
+    update: Any = compiled_update(Quiet(), optim, 9, state, batch, mesh=mesh, accumulate=accumulate)
+    moved = sum(update.as_text().count(name) for name in (" all-gather(", " all-to-all(", " collective-permute("))
+    return [np.asarray(update(state, batch)[0].params["line"]["kernel"]).tolist(), moved]
+
+
+def normalised(*, frozen: bool = False) -> dict[str, Any]:
+    """Return what a batch norm in training gives for a divided batch, and the number of exchanges between devices."""
+    x = np.random.default_rng(5).normal(size=(BATCH, 3, 2)).astype(np.float32)
+    x += np.arange(BATCH, dtype=np.float32)[:, None, None]  # devices have different means
+    norm, mesh = BatchNorm(frozen), training_mesh(BATCH)
+    variables = norm.init(jax.random.key(0), x[0], train=True)
+
+    def apply(variables, x):
+        one = lambda x: norm.apply(variables, x, train=True, mutable=[STATISTICS])  # noqa: E731
+        return jax.vmap(one, axis_name=BATCH_AXIS, out_axes=(0, None))(x)
+
+    with active(mesh):
+        program: Any = jax.jit(apply).lower(replicated(variables, mesh), divided(x, mesh)).compile()
+        found, updated = program(replicated(variables, mesh), divided(x, mesh))
+    exchanges = program.as_text().count(" all-reduce(") + program.as_text().count(" all-reduce-start(")
+    statistics = {name: np.asarray(value).tolist() for name, value in updated[STATISTICS].items()}
+    return {"output": np.asarray(found).tolist(), "statistics": statistics, "exchanges": exchanges}
+
+
 def main() -> None:
     folder = Path(sys.argv[1])
     jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -87,6 +133,8 @@ def main() -> None:
         "refused": refused(),
         "predicted": predicted(BATCH),
         "predicted by one": predicted(BATCH - 1),
+        "in parts": in_parts(),
+        "norms": {"learned": normalised(), "frozen": normalised(frozen=True)},
         "host": host_terms() if jax.device_count() == 2 else {},  # compiling takes long
     }
     print(json.dumps(facts))

@@ -19,6 +19,7 @@ from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.scene import shapes_of, stack_examples
 from tflane_jax.summary import parameter_counts, shapes_of_params, training_program
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.loop_convolutions import with_fast_convolutions
 from tflane_jax.training.schedule import OptimConfig
 
 ALONE = LaneGraphTask(replace(BASELINE, priors=replace(BASELINE.priors, markers=CONFIG)))
@@ -129,6 +130,30 @@ def test_cameras_are_trained_on_clips_too():
     assert loss.shape == ()
     same = jax.tree.map(lambda a, b: a.shape == b.shape, terms["batch_stats"], params["batch_stats"])
     assert all(jax.tree.leaves(same))
+
+
+CAMERA_CLIPS = LaneGraphTask(CAMERA_TOPONET, clip=3)
+
+
+@pytest.mark.slow
+def test_a_scan_over_time_gives_the_losses_and_gradients_of_the_unrolled_form():
+    clip = stack_examples([make_camera_example(i).replace(has_previous=np.asarray(i > 0)) for i in range(3)])
+    batch, params = stack_examples([clip]), random_params(CAMERA_CLIPS.init, clip, spread=0.1)
+    results = []
+    for task in (CAMERA_CLIPS, replace(CAMERA_CLIPS, time="scan")):
+        of = with_fast_convolutions(jax.value_and_grad(task.loss, has_aux=True))
+        results.append(jax.jit(of)(params, batch, jax.random.key(0)))
+    ((loss, terms), gradient), ((scanned, same), again) = results
+    np.testing.assert_allclose(scanned, loss, rtol=1e-6)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-5, atol=1e-6), terms, same)
+    size = np.sqrt(sum(np.square(leaf).sum() for leaf in jax.tree.leaves(gradient)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-5 * size), gradient, again)
+
+
+def test_only_a_host_with_bev_memory_loops_over_time():
+    assert replace(CAMERA_CLIPS, time="scan").loops
+    for task in (CAMERA_CLIPS, replace(CLIPS, time="scan"), replace(CAMERA_CLIPS, clip=1, time="scan")):
+        assert not task.loops
 
 
 def test_frames_are_grouped_by_marker_visibility(params):

@@ -256,6 +256,8 @@ def test_two_processes_never_share_a_folder(tmp_path):
     [
         ({"steps": 0}, "steps"),
         ({"batch_size": 0}, "batch_size"),
+        ({"accumulate": 0}, "accumulate"),
+        ({"batch_size": 4, "accumulate": 3}, "batch_size"),
         ({"log_every": 0}, "log_every"),
         ({"seeds": ()}, "seeds"),
         ({"seeds": (1, 1)}, "seeds"),
@@ -265,6 +267,14 @@ def test_invalid_settings_are_named(tmp_path, change, name):
     with pytest.raises(UserError, match=rf"training\.{name} is"):
         run(tmp_path / "run", config=dataclasses.replace(CONFIG, **change))
     assert not (tmp_path / "run").exists()
+
+
+def test_the_batch_scales_the_rate_and_passes_in_parts(tmp_path):
+    config = dataclasses.replace(CONFIG, steps=4, batch_size=6, accumulate=3, log_every=1)
+    optim = dataclasses.replace(OPTIM, lr_scaling="linear", reference_batch=3, warmup_steps=0)
+    run(tmp_path / "run", config=config, optim=optim)
+    first = next(record for record in read_records(tmp_path / "run" / "metrics.jsonl") if record["split"] == "train")
+    assert first["learning_rate"] == pytest.approx(2 * OPTIM.lr)
 
 
 def test_training_needs_no_evaluation(tmp_path):

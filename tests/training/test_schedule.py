@@ -12,7 +12,14 @@ import pytest
 from tests.golden import case_id, golden_modules, load_module_case
 from tflane_jax.errors import UserError
 from tflane_jax.training.restarts import RestartsConfig
-from tflane_jax.training.schedule import DropsConfig, OptimConfig, make_optimizer, make_rate, make_schedule
+from tflane_jax.training.schedule import (
+    DropsConfig,
+    OptimConfig,
+    make_optimizer,
+    make_rate,
+    make_schedule,
+    scaled_to_batch,
+)
 from tflane_jax.training.vectors import layout_of, norm, ravel
 
 CASES = pytest.mark.parametrize("path", golden_modules("lr_schedules*"), ids=case_id)
@@ -262,3 +269,21 @@ def test_a_constant_rate_drops_at_its_steps():
 def test_drops_that_cannot_be_followed_are_named(settings, message):
     with pytest.raises(UserError, match=message):
         make_optimizer(OptimConfig(warmup_steps=0, **settings), 10)
+
+
+@pytest.mark.parametrize(
+    ("rule", "batch", "expected"), [("none", 64, 0.1), ("linear", 64, 0.8), ("linear", 4, 0.05), ("sqrt", 32, 0.2)]
+)
+def test_the_rate_is_scaled_by_the_global_batch(rule, batch, expected):
+    config = OptimConfig(lr=0.1, lr_scaling=rule, reference_batch=8)
+    scaled = scaled_to_batch(config, batch)
+    assert scaled.lr == pytest.approx(expected)
+    assert replace(scaled, lr=0.1) == replace(config, lr_scaling="none")
+    assert scaled_to_batch(scaled, batch) is scaled
+
+
+def test_an_unscaled_rate_and_a_reference_batch_of_zero_are_refused():
+    with pytest.raises(ValueError, match="scaled_to_batch"):
+        make_optimizer(OptimConfig(lr_scaling="sqrt"), 1000)
+    with pytest.raises(UserError, match=r"optim\.reference_batch is 0"):
+        scaled_to_batch(OptimConfig(reference_batch=0), 8)

@@ -8,6 +8,7 @@ import pytest
 
 from tests.training.stub import LineTask, line_arrays
 from tflane_jax.datasets.batches import batch_indices
+from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_schedule
 from tflane_jax.training.state import init_states
@@ -131,6 +132,38 @@ def test_several_seeds_each_equal_a_single_seed():
         np.testing.assert_array_equal(metrics["loss"], [m["loss"] for _, m in results])
     for one, same in zip(singles, states, strict=True):
         jax.tree.map(np.testing.assert_array_equal, (one.params, one.ema_params), (same.params, same.ema_params))
+
+
+class Quiet(LineTask):
+    """The stub without dropout: its loss is a mean over examples. Statistics count examples and calls."""
+
+    def init(self, key, example):
+        return super().init(key, example) | {STATISTICS: {"mean": jnp.zeros(()), "calls": jnp.zeros(())}}
+
+    def loss(self, params, batch, key):
+        error = jax.vmap(lambda x: self._apply(params, x))(batch["x"]) - batch["y"][:, None]
+        old, fit = params[STATISTICS], (error**2).mean()
+        new = {"mean": 0.5 * old["mean"] + 0.5 * batch["y"].mean(), "calls": old["calls"] + 1}
+        return fit, {"fit": fit, STATISTICS: new}
+
+
+def test_parts_of_a_batch_give_the_step_of_the_whole_where_the_loss_is_a_mean_over_examples():
+    example = jax.tree.map(lambda leaf: leaf[0], ARRAYS)
+    batch, results = batch_of(0, 0, size=6), []
+    for parts in (1, 3):
+        [state] = init_states(Quiet(), make_optimizer(OPTIM, STEPS), [0], example)
+        results.append(make_update_step(Quiet(), OPTIM, STEPS, accumulate=parts)(state, batch))
+    (whole, metrics), (parts, of_parts) = results
+    assert metrics.keys() == of_parts.keys()
+    for name, value in metrics.items():
+        np.testing.assert_allclose(of_parts[name], value, rtol=1e-6, err_msg=name)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-6), whole.learned, parts.learned)
+    # Running statistics move with every part, in order; part p has the examples p, p + 3.
+    expected = 0.0
+    for part in range(3):
+        expected = 0.5 * expected + 0.5 * batch["y"][part::3].mean()
+    assert parts.statistics[STATISTICS]["calls"] == 3
+    np.testing.assert_allclose(parts.statistics[STATISTICS]["mean"], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,26 @@
-"""`tflane summary`: parameters, operations and memory of a configuration, computed from shapes alone."""
+"""`tflane summary`: parameters, operations, memory and an estimate of the training, computed from shapes alone."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from typing import Any
 
 from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.plan import make_plan
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
 from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
-    """Print the two tables, and save them to --out."""
+    """Print the two tables, and save them to --out; or the estimate of --plan."""
     configure_jax(keep_programs=False)  # compiling is timed
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)
     example = config.task.shapes(config.data)
+    if options.plan is not None:
+        return _plan(options, config, example)
     params = shapes_of_params(config.task, example)
     counts = parameter_counts(params, options.depth)
     total = sum(counts.values())
@@ -48,4 +52,25 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if options.out is not None:
         meta = {"config": options.config, "parameters": counts}
         print(f"\nwritten: {save_table(options.out, rows, meta, title=title, digits=1)[0]}")
+    return 0
+
+
+def _plan(options: argparse.Namespace, config: RunConfig, example: Any) -> int:
+    plan = make_plan(
+        config.task,
+        example,
+        config.optim,
+        config.training,
+        devices=options.plan,
+        kind=options.kind,
+        utilisation=options.utilisation,
+        compiled=not options.no_compile,
+    )
+    title = f"Estimate, not a measurement: {options.config or 'the default configuration'} on {options.plan} x "
+    title += f"{options.kind}, batch {config.training.batch_size}"
+    print(format_table(plan.rows, title=title))
+    print("\nAssumptions\n" + "\n".join(f"- {sentence}" for sentence in plan.assumptions))
+    if options.out is not None:
+        meta = {"config": options.config, "assumptions": plan.assumptions}
+        print(f"\nwritten: {save_table(options.out, plan.rows, meta, title=title)[0]}")
     return 0

@@ -192,9 +192,9 @@ def _attend_backward(shapes, residuals, cotangent):
         return jnp.zeros_like(value), None, location, weight
     table = value.reshape(-1, value.shape[-1])
     parts = _in_steps((start, location, weight, cotangent), weight.size * 4 * table.shape[1], _BACKWARD_STEP)
-    total, parts = lax.scan(
-        lambda total, part: _step_backward(shapes, table, total, *part), jnp.zeros(table.shape, cotangent.dtype), parts
-    )
+    # Many samples add to one cell: their sum is float32 also for bfloat16.
+    start_of_sum = jnp.zeros(table.shape, jnp.promote_types(cotangent.dtype, jnp.float32))
+    total, parts = lax.scan(lambda total, part: _step_backward(shapes, table, total, *part), start_of_sum, parts)
     by_x, by_y, by_weight = (x.reshape(-1, *weight.shape[1:])[: len(start)] for x in parts)
     return total.reshape(value.shape).astype(value.dtype), None, jnp.stack([by_x, by_y], -1), by_weight
 

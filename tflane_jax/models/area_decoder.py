@@ -59,6 +59,8 @@ class AreaDecoder(nn.Module):
     def __call__(self, bev: Float[Array, "h w e"], *, deterministic: bool) -> AreaPrediction:
         """Return areas with a leading axis over decoder layers; `deterministic`: no dropout."""
         start = LineQueries(self.config, self.range, name="queries")()
-        outputs = decode_line_layers(self.config, start, bev, self.range, self.limits, deterministic=deterministic)
+        outputs = decode_line_layers(
+            self, self.config, start, bev, self.range, self.limits, deterministic=deterministic
+        )
         layers: LineOutput = jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs)
         return AreaPrediction(layers.points, layers.logits)

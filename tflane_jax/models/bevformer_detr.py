@@ -7,6 +7,7 @@ relationship heads. A lane is 11 points or a Bezier curve.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import flax.linen as nn
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry.bezier import bezier_basis
+from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, at_least, check_settings
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
@@ -113,9 +115,9 @@ class BevFormerDetr(Host):
         for i in range(config.layers):
             last = i == config.layers - 1
             queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, position, reference))
-            layer = LaneDecoderLayer(config, name=f"layer_{i}")
-            around = attention_reference(reference, config)
-            queries = layer(queries, position, around, bev, None, deterministic=deterministic)
+            layer = partial(LaneDecoderLayer, config, name=f"layer_{i}")
+            inputs = queries, position, attention_reference(reference, config), bev, None
+            queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             element_queries = None if elements is None else elements.queries[i]
             heads = LaneHeads(config, spec.bev_range, last, spec.range, name=f"heads_{i}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import image_sine_encoding, inverse_sigmoid
+from tflane_jax.layers.precision import Precision, run_layer
 from tflane_jax.layers.transformer import FeedForward, Residual, TransformerConfig
 from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Rules, splits
 
@@ -38,6 +40,8 @@ class ElementDecoderConfig:
         sampling_points: per head and level.
         hidden: channels inside the feed-forward blocks.
         dropout: probability, for attention weights, hidden channels and every residual branch.
+        precision: dtype of linear layers, see `layers.precision`; parameters, boxes and scores are float32.
+        remat: recompute each layer's activations for the gradient instead of keeping them.
     """
 
     dim: Count = 64
@@ -49,6 +53,8 @@ class ElementDecoderConfig:
     sampling_points: Count = 4
     hidden: Count = 128
     dropout: FractionBelowOne = 0.0
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels split over heads, and over rows and columns."""
@@ -127,8 +133,8 @@ class ElementDecoder(nn.Module):
         cells = jnp.concatenate([cell_centres(shape, ratio) for shape, ratio in zip(shapes, ratios, strict=True)])
         around = cells[:, None, None] * ratios[None, None]  # (T, 1, L, 2): the same point on every level
         for i in range(config.encoder_layers):
-            layer = ElementEncoderLayer(config, name=f"encoder_{i}")
-            tokens = layer(tokens, position, around, shapes, valid, deterministic=deterministic)
+            layer, given = partial(ElementEncoderLayer, config, name=f"encoder_{i}"), (tokens, position, around, valid)
+            tokens = run_layer(self, layer, config, *given, shapes=shapes, deterministic=deterministic)
         return self._decode(tokens, shapes, valid, ratios, size, deterministic)
 
     def _decode(self, memory, shapes, valid, ratios, size, deterministic: bool) -> ElementOutput:
@@ -142,8 +148,9 @@ class ElementDecoder(nn.Module):
         for i in range(config.layers):
             scale = jnp.tile(ratios, (1, reference.shape[-1] // 2))
             around = reference[:, None, None] * scale[None, None]
-            layer = ElementDecoderLayer(config, name=f"decoder_{i}")
-            queries = layer(queries, position, memory, around, shapes, valid, deterministic=deterministic)
+            layer = partial(ElementDecoderLayer, config, name=f"decoder_{i}")
+            given = queries, position, memory, around, valid
+            queries = run_layer(self, layer, config, *given, shapes=shapes, deterministic=deterministic)
             logits = nn.Dense(self.classes, bias_init=nn.initializers.constant(-np.log(99.0)), name=f"class_{i}")(
                 queries
             )
@@ -159,7 +166,7 @@ class ElementEncoderLayer(nn.Module):
     config: ElementDecoderConfig
 
     @nn.compact
-    def __call__(self, tokens, position, around, shapes, valid: Bool[Array, " t"], *, deterministic: bool):
+    def __call__(self, tokens, position, around, valid: Bool[Array, " t"], *, shapes, deterministic: bool):
         """Return the tokens (T, C) after the layer."""
         config, sizes = self.config, _sizes(self.config)
         attend = DeformableAttention(config.dim, config.heads, config.sampling_points, config.levels, name="attention")
@@ -179,7 +186,7 @@ class ElementDecoderLayer(nn.Module):
 
     @nn.compact
     def __call__(
-        self, queries, position, memory, around, shapes, valid: Bool[Array, " t"], *, deterministic: bool
+        self, queries, position, memory, around, valid: Bool[Array, " t"], *, shapes, deterministic: bool
     ) -> Float[Array, "e c"]:
         """Return the queries after the layer."""
         config, sizes = self.config, _sizes(self.config)

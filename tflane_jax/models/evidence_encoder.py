@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float, UInt8
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.layers.precision import Precision, computing, run_layer, run_part
 from tflane_jax.limits import Count, Rules
 from tflane_jax.models.auxiliary import LaneCellHead
 from tflane_jax.models.prior import BevHook
@@ -31,6 +33,8 @@ class EvidenceEncoderConfig:
         levels: channels of the coarser levels of a U-Net before these blocks, each half as fine as the one before:
             context from the whole box.
         coordinates: whether x, y, abs x and abs y of the cells are input channels.
+        precision: dtype of convolutions, see `layers.precision`; parameters and features are float32.
+        remat: recompute the activations of each block and of the U-Net for the gradient instead of keeping them.
     """
 
     dim: Count = 32
@@ -40,6 +44,8 @@ class EvidenceEncoderConfig:
     range: PerceptionRange = BevGrid().range
     levels: tuple[Count, ...] = ()
     coordinates: bool = False
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Four groups of channels encode the positions of cells."""
@@ -77,17 +83,24 @@ class EvidenceEncoder(nn.Module):
         if self.config.coordinates:
             places = 2.0 * cell_points(BevGrid(rows=h // n, columns=w // n)).reshape(h // n, w // n, 2) - 1.0
             x = jnp.concatenate([x, jnp.asarray(np.concatenate([places, np.abs(places)], -1))], -1)
-        x = nn.relu(_norm("stem_norm")(nn.Conv(self.config.dim, (3, 3), name="stem")(x)))
+        with computing(self.config.precision):
+            x = nn.Conv(self.config.dim, (3, 3), name="stem")(x)
+        x = nn.relu(_norm("stem_norm")(x))
         fused = 0
         if self.config.levels:
             x, fused = _fused(fuse, fused, x), 1
-            x = UNet(self.config.levels, name="context")(x)
+            x = run_layer(self, partial(UNet, self.config.levels, name="context"), self.config, x)
         for i, dilation in enumerate(self.config.dilations):
-            y = nn.Conv(self.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
-            x = _fused(fuse, fused + i, nn.relu(x + _norm(f"block_{i}_norm")(y)))
+            x = _fused(fuse, fused + i, run_part(self, partial(_block, i, dilation), self.config, x))
         if self.config.cells:
             LaneCellHead(name="cells")(x)
         return x
+
+
+def _block(i: int, dilation: int, encoder: EvidenceEncoder, x: Float[Array, "h w d"]) -> Float[Array, "h w d"]:
+    """Return the features after residual block `i`, which is a part of the encoder."""
+    y = nn.Conv(encoder.config.dim, (3, 3), kernel_dilation=(dilation, dilation), name=f"block_{i}")(x)
+    return nn.relu(x + _norm(f"block_{i}_norm")(y))
 
 
 class UNet(nn.Module):

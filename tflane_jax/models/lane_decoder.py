@@ -13,6 +13,7 @@ Small models need "iterative" to converge.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, NamedTuple, Protocol
 
 import flax.linen as nn
@@ -27,6 +28,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
 from tflane_jax.layers.graph import ElementNodes, Mlp, RelationshipHead, SceneGraphFeedForward
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
+from tflane_jax.layers.precision import run_layer
 from tflane_jax.layers.sampling import sample_bilinear
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
 from tflane_jax.models.element_decoder import ElementOutput
@@ -205,10 +207,17 @@ class LaneHeads(nn.Module):
         unit = refined_points(config, self.range, self.limits, change, reference, queries, bev)
         successor = element_lane = None
         if self.relations:
-            successor = RelationshipHead(config.relation, name="successor")(queries, queries)
+            successor = relate(self, config, "successor", queries, queries)
             if elements is not None:
-                element_lane = RelationshipHead(config.relation, name="element_lane")(queries, elements)
+                element_lane = relate(self, config, "element_lane", queries, elements)
         return LaneOutput(self.range.denormalise(unit), unit, logits, successor, element_lane)
+
+
+def relate(
+    parent: nn.Module, config: LaneDecoderConfig, name: str, a: Float[Array, "a c"], b: Float[Array, "b c"]
+) -> Float[Array, "a b"]:
+    """Return a logit for each pair, by the submodule `name` of a compact module."""
+    return run_layer(parent, partial(RelationshipHead, config.relation, name=name), config, a, b)
 
 
 def refined_points(

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.layers.precision import Precision
 from tflane_jax.limits import Count, FractionBelowOne, Positive, PositiveOrZero, Rules, at_least, splits
 
 
@@ -56,6 +57,8 @@ class LaneDecoderConfig:
         metres: unit of change along x, y and z of output "metric".
         proposals: queries from a heat map of lanes beside the learned ones; None for learned ones only.
         dropout: probability, for attention weights, hidden channels, messages and every residual branch.
+        precision: dtype of linear layers, see `layers.precision`; parameters, points and scores are float32.
+        remat: recompute each layer's activations for the gradient instead of keeping them.
     """
 
     dim: Count = 64
@@ -73,6 +76,8 @@ class LaneDecoderConfig:
     metres: tuple[Positive, Positive, Positive] = (5.0, 5.0, 0.3)
     proposals: LaneProposalConfig | None = None
     dropout: FractionBelowOne = 0.0
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels split over heads, sampling points over directions, and proposals are among the queries."""

@@ -9,6 +9,7 @@ Source: docs/reference/lanesegnet.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import flax.linen as nn
@@ -18,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.datasets.segment_targets import Center
-from tflane_jax.layers.graph import RelationshipHead
+from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER, AreaDecoder, AreaDecoderConfig
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
@@ -26,7 +27,7 @@ from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementOutput
 from tflane_jax.models.encoders import element_limits
 from tflane_jax.models.host import Host, HostConfig
-from tflane_jax.models.lane_decoder import LaneDecoderLayer, lane_position
+from tflane_jax.models.lane_decoder import LaneDecoderLayer, lane_position, relate
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_lanes, lane_auxiliary
 from tflane_jax.models.lane_segments import (
     PAPER_SEGMENT_DECODER,
@@ -167,8 +168,8 @@ class LaneSegNet(Host):
         for i in range(config.layers):
             placed = lane_position(config, i, position, reference)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, HostQueries(queries, placed, reference))
-            layer = LaneDecoderLayer(config, "star", name=f"layer_{i}")
-            queries = layer(queries, placed, around, bev, None, deterministic=deterministic)
+            layer, inputs = partial(LaneDecoderLayer, config, "star", name=f"layer_{i}"), (queries, placed, around, bev)
+            queries = run_layer(self, layer, config, *inputs, None, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             heads = SegmentHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
             output = heads(queries, reference, bev, masks=training or self.is_initializing())
@@ -178,11 +179,11 @@ class LaneSegNet(Host):
             outputs.append(output)
             boundaries = [spec.bev_range.normalise(line) for line in (output.left, output.right)]
             around = lax.stop_gradient(regions(*boundaries, config))
-        successor = RelationshipHead(config.relation, name="successor")(queries, queries)
+        successor = relate(self, config, "successor", queries, queries)
         found = make_prediction(outputs, successor)
         if elements is None:
             return found
-        governed = RelationshipHead(config.relation, name="element_lane")(queries, elements.queries[-1])
+        governed = relate(self, config, "element_lane", queries, elements.queries[-1])
         return replace(found, elements=ElementPrediction(elements.box, elements.logits, governed[None]))
 
 

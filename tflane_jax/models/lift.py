@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import flax.linen as nn
@@ -23,6 +24,7 @@ from tflane_jax.geometry.pillars import cell_points
 from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.depth_net import DepthNet
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.layers.precision import Precision, run_layer, run_part
 from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules
 from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.prior import BevHook
@@ -44,6 +46,8 @@ class LiftConfig:
         image_scale: of the images, relative to the camera's own. The depth network knows the cameras' native
             intrinsics and this scale.
         supervised: whether the network learns the depth of image cells, for which the training data must have it.
+        precision: dtype of convolutions, see `layers.precision`; parameters, depth and BEV features are float32.
+        remat: recompute the activations of depth network and convolutions for the gradient instead of keeping them.
         border: "exact": points outside the range are left out. "published": those up to a cell below its lower ends
             count for the first cells, as the published code's rounding towards zero has it.
     """
@@ -58,6 +62,8 @@ class LiftConfig:
     image_scale: Positive = 0.5
     supervised: bool = False
     border: Literal["exact", "published"] = "exact"
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """The depth bins follow each other."""
@@ -98,23 +104,12 @@ class LiftEncoder(nn.Module):
             train: norms use batch statistics, and dropout is on.
         """
         config, grid = self.config, self.config.grid
-        network = DepthNet(config.dim, config.bins, config.pyramid, config.dropout, name="depth_net")
-        logits, context = network(features, cameras, train=train)
+        network = partial(DepthNet, config.dim, config.bins, config.pyramid, config.dropout, name="depth_net")
+        logits, context = run_layer(self, network, config, features, cameras, train=train)
         rows, columns = grid.rows * config.fine, grid.columns * config.fine
         cells = cell_numbers(points, BevGrid(grid.range, rows, columns), config.border)
         x = collect(context, jax.nn.softmax(logits, -1), cells, rows * columns).reshape(rows, columns, config.dim)
-        for i, stride in enumerate((1, config.fine, 1)):
-            conv = nn.Conv(
-                config.dim,
-                (3, 3),
-                (stride, stride),
-                [(1, 1), (1, 1)],
-                use_bias=False,
-                kernel_init=nn.initializers.xavier_uniform(),
-                name=f"conv_{i}",
-            )
-            x = nn.relu(BatchNorm(name=f"norm_{i}")(conv(x), train=train))
-        return x, logits
+        return run_part(self, partial(_convolved, train), config, x), logits
 
     def __call__(
         self,
@@ -176,6 +171,22 @@ class LiftEncoder(nn.Module):
             pose = jnp.where(valid, own, eye)
         vector = camera_vector(intrinsics, pose, self.config.image_scale)
         return self.encode(features, vector, points, train=train)
+
+
+def _convolved(train: bool, encoder: LiftEncoder, x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
+    """Return the BEV features after the three convolutions, which are a part of the encoder."""
+    for i, stride in enumerate((1, encoder.config.fine, 1)):
+        conv = nn.Conv(
+            encoder.config.dim,
+            (3, 3),
+            (stride, stride),
+            [(1, 1), (1, 1)],
+            use_bias=False,
+            kernel_init=nn.initializers.xavier_uniform(),
+            name=f"conv_{i}",
+        )
+        x = nn.relu(BatchNorm(name=f"norm_{i}")(conv(x), train=train))
+    return x
 
 
 def ray_points(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
@@ -20,6 +21,7 @@ from jaxtyping import Array, Float
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.positions import inverse_sigmoid, sine_encoding
+from tflane_jax.layers.precision import Precision, run_layer
 from tflane_jax.limits import Count, FractionBelowOne, Positive, Rules, at_least, splits
 from tflane_jax.models.lane_decoder import LaneDecoderLayer, clipped
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
@@ -52,6 +54,8 @@ class LineDecoderConfig:
             a fault that published weights need, see `models.area_decoder`.
         metres: unit of change along x, y and z of output "metric".
         dropout: probability, for attention weights, hidden channels and every residual branch.
+        precision: dtype of linear layers, see `layers.precision`; parameters, points and scores are float32.
+        remat: recompute each layer's activations for the gradient instead of keeping them.
     """
 
     dim: Count = 64
@@ -68,6 +72,8 @@ class LineDecoderConfig:
     output: Literal["sigmoid", "metric", "raw"] = "sigmoid"
     metres: tuple[Positive, Positive, Positive] = (5.0, 5.0, 0.3)
     dropout: FractionBelowOne = 0.0
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels split over heads, sampling points over directions."""
@@ -205,6 +211,7 @@ class LineHeads(nn.Module):
 
 
 def decode_line_layers(
+    module: nn.Module,
     config: LineDecoderConfig,
     start: PointQueries,
     bev: Float[Array, "h w e"],
@@ -217,6 +224,7 @@ def decode_line_layers(
     """Return the outputs of all decoder layers; part of a compact module, with `layer_{i}` and `heads_{i}`.
 
     Args:
+        module: the compact module that is being called.
         config: sizes and forms.
         start: queries and points before the first layer.
         bev: BEV features.
@@ -231,8 +239,8 @@ def decode_line_layers(
         if fuse is not None:
             queries = fuse(i, HostQueries(queries, placed, reference.reshape(queries.shape[0], 1, -1)))
         around = reference[..., :2].reshape(-1, 1, 2)
-        layer = LaneDecoderLayer(config, name=f"layer_{i}")
-        queries = layer(queries, placed, around, bev, None, deterministic=deterministic)
+        layer, inputs = partial(LaneDecoderLayer, config, name=f"layer_{i}"), (queries, placed, around, bev, None)
+        queries = run_layer(module, layer, config, *inputs, deterministic=deterministic)
         heads = LineHeads(config, range_, limits, name=f"heads_{i}")
         outputs.append(heads(queries.reshape(content.shape), reference))
         reference = lax.stop_gradient(outputs[-1].unit)

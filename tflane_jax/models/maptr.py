@@ -186,6 +186,7 @@ class MapTr(Host):
         """Return the predictions of one set of queries."""
         spec, priors = self.config.spec, self.priors.by_name
         outputs = decode_line_layers(
+            self,
             self.config.decoder,
             start,
             bev,

@@ -9,6 +9,7 @@ docs/reference/maptrv2.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import flax.linen as nn
 import jax
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.deformable import DeformableAttention
+from tflane_jax.layers.precision import run_layer
 from tflane_jax.layers.transformer import FeedForward, TransformerConfig
 from tflane_jax.limits import CountOrZero, Rules, check_settings
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName, LineMaskHead
@@ -134,8 +136,9 @@ class MapTrV2(MapTr):
             points_alone = reference.reshape(-1, 1, reference.shape[-1])
             flat = HostQueries(queries.reshape(-1, dim), placed.reshape(-1, dim), points_alone, every, sizes)
             queries = fuse_into_queries(self.priors.by_name, tokens, i, flat).reshape(queries.shape)
-            layer = DecoupledLayer(config, name=f"layer_{i}")
-            queries = layer(queries, placed, reference, bev, groups, deterministic=deterministic)
+            layer = partial(DecoupledLayer, config, name=f"layer_{i}")
+            inputs = queries, placed, reference, bev, groups
+            queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
             heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
             outputs.append(heads(queries, reference))
             reference = lax.stop_gradient(outputs[-1].unit)

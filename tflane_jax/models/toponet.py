@@ -9,12 +9,14 @@ are the same. Source: docs/reference/toponet.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from tflane_jax.layers.graph import ElementNodes, edge_probabilities
+from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.auxiliary import AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER
@@ -120,9 +122,9 @@ class TopoNet(Host):
                 embed = ElementEmbedding(config, name=f"element_embedding_{i}")
                 embedded = embed(elements.queries[i], deterministic=deterministic)
                 nodes = ElementNodes(embedded, elements.logits[i], element_edges)
-            layer = LaneDecoderLayer(config, edge_weight=config.edge_weight, name=f"layer_{i}")
-            around = attention_reference(reference, config)
-            queries = layer(queries, placed, around, bev, adjacency, nodes, deterministic=deterministic)
+            layer = partial(LaneDecoderLayer, config, edge_weight=config.edge_weight, name=f"layer_{i}")
+            inputs = queries, placed, attention_reference(reference, config), bev, adjacency, nodes
+            queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
             self.sow("intermediates", "layer_queries", queries)
             heads = LaneHeads(config, spec.bev_range, limits=spec.range, name=f"heads_{i}")
             output = heads(queries, reference, bev, embedded)

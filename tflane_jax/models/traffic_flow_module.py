@@ -10,6 +10,7 @@ The paper leaves much open; docs/tf_lane.md lists what we chose, and the setting
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import flax.linen as nn
@@ -21,6 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.layers.positions import sine_encoding
+from tflane_jax.layers.precision import Precision, run_layer, run_part
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.prior import BevCells, HostQueries, HostSpec, Prior
 from tflane_jax.models.traffic_masks import TrafficMaskConfig, sees_any, spatial_mask, temporal_mask
@@ -56,6 +58,9 @@ class TrafficFlowModuleConfig:
         width: channels inside the temporal encoder.
         heads: attention heads in both encoders.
         masking: restrictions of the masks.
+        precision: dtype of linear layers, see `layers.precision`; parameters and results are float32.
+        remat: recompute the activations of each temporal layer and of the spatial encoder for the gradient instead of
+            keeping them.
     """
 
     fusions: Annotated[tuple[Fusion, ...], NOT_EMPTY, DIFFERENT] = LANE_FUSIONS
@@ -68,6 +73,8 @@ class TrafficFlowModuleConfig:
     width: Count = 32
     heads: Count = 4
     masking: TrafficMaskConfig = TrafficMaskConfig()
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels split over heads, and each head has its window."""
@@ -196,7 +203,8 @@ class TemporalEncoder(nn.Module):
         x = self._embed(tokens)
         for i in range(self.config.depth):
             mask = temporal_mask(self.config.masking, tokens.frame_valid)
-            x = TemporalLayer(self.config.width, self.config.heads, name=f"layer_{i}")(x, mask)
+            layer = partial(TemporalLayer, self.config.width, self.config.heads, name=f"layer_{i}")
+            x = run_layer(self, layer, self.config, x, mask)
         x = nn.LayerNorm(name="norm")(x)
         weight = tokens.frame_valid.astype(x.dtype)
         mean = jnp.einsum("tnc,tn->tc", x, weight) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
@@ -277,7 +285,10 @@ class SpatialEncoder(nn.Module):
             traffic: TF_Feat.
             mask: M_s; quadrants of unused fusion modules are never built.
         """
+        return run_part(self, SpatialEncoder._encode, self.config, lanes, lane_position, traffic, mask)
 
+    def _encode(self, lanes, lane_position, traffic, mask: SpatialMask) -> Float[Array, "l d"]:
+        """Return L'_Feat; called by the compact method."""
         config = self.config
 
         def fuse(name: Fusion, layer: int, x, x_position, y, y_position, quadrant):

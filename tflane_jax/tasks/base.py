@@ -69,6 +69,11 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         """Number of successive frames in a training example; 1 for single frames."""
         return 1
 
+    @property
+    def loops(self) -> bool:
+        """Whether the gradient of the loss has loops around the model, see `training.loop_convolutions`."""
+        return False
+
     def init(self, key: jax.Array, example: ExampleT) -> Params:
         """Return initial parameters; only the shapes of `example` are used."""
         raise NotImplementedError

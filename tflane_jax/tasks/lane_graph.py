@@ -52,6 +52,9 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         losses: weights of the host's matching costs and losses.
         clip: number of successive frames that training processes with memory. A training example is then a clip, with a
             leading axis on every leaf, and evaluation streams through the scenes. 1: single frames.
+        time: how training passes through the frames of a clip, if the host carries BEV features from frame to frame.
+            "unrolled": the program holds every frame, and compiling takes as much longer; "scan": it holds one.
+            Losses are equal up to rounding.
         empty_frames: "skip" trains without frames that have none of the lanes or crossings of the host's ground truth,
             as LaneSegNet does.
     """
@@ -59,6 +62,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     model: HostConfig = TopoNetConfig()
     losses: HostLossConfig = TopoNetLossConfig()
     clip: Count = 1
+    time: Literal["unrolled", "scan"] = "unrolled"
     empty_frames: Literal["keep", "skip"] = "keep"
 
     columns: ClassVar[tuple[str, ...]] = score_names.COLUMNS
@@ -72,6 +76,11 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def frames(self) -> int:
         """Number of frames of a clip."""
         return self.clip
+
+    @property
+    def loops(self) -> bool:
+        """Whether the frames of a clip pass through the model in a loop."""
+        return self.clip > 1 and self.time == "scan" and self.start().bev is not None
 
     def init(self, key: jax.Array, example: Example) -> Params:
         """Return initial parameters; only the shapes of `example`, or of a clip, are used."""
@@ -104,8 +113,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
                 return (bev, updated), found
 
             frames = examples, observations, jax.random.split(key, self.clip)
-            # Unrolled: inside a loop, XLA's gradient of a convolution is 25 times slower on a CPU.
-            (_, updated), found = lax.scan(body, (start.bev, statistics), frames, unroll=self.clip)
+            unroll = self.clip if self.time == "unrolled" else 1
+            (_, updated), found = lax.scan(body, (start.bev, statistics), frames, unroll=unroll)
             return found, updated
 
         if self.clip > 1 and start.bev is None:

@@ -34,7 +34,7 @@ from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter, Unwritten
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config
-from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
 from tflane_jax.training.step import compiled_update, update_all
 from tflane_jax.training.task import Trainable
@@ -53,7 +53,9 @@ class TrainingConfig:
 
     Attributes:
         steps: updates.
-        batch_size: examples of an update (of each seed).
+        batch_size: examples of an update (of each seed), on all devices together.
+        accumulate: parts in which a batch passes through the model, one after the other, to save memory; see
+            docs/scale.md for what is equal to one pass. `batch_size` must be a multiple of it times the devices.
         seeds: roots of all random numbers in training. Several seeds train side by side, each as it would alone; n
             seeds take n times as long.
         log_every: steps between records; a record holds means over the steps since the last one.
@@ -68,6 +70,7 @@ class TrainingConfig:
 
     steps: Count = 10_000
     batch_size: Count = 8
+    accumulate: Count = 1
     seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)
     log_every: Count = 50
     eval_every: Count = 1000
@@ -152,7 +155,8 @@ def train(
     """
     check_settings(config, "training.")
     progress = progress and is_first()
-    mesh = training_mesh(config.batch_size)
+    mesh = training_mesh(config.batch_size, config.accumulate)
+    optim = scaled_to_batch(optim, config.batch_size)
     adaptive = None if optim.restarts is None or optim.restarts.adaptive is None else optim.restarts
     if adaptive is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
@@ -217,7 +221,8 @@ def train(
         batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
-            update = compiled_update(task, optim, config.steps, states[0], batch[0], donate=len(states) == 1, mesh=mesh)
+            form: dict[str, Any] = {"donate": len(states) == 1, "mesh": mesh, "accumulate": config.accumulate}
+            update = compiled_update(task, optim, config.steps, states[0], batch[0], **form)
         compile_seconds = time.perf_counter() - began
         if progress:
             tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)

@@ -1,13 +1,14 @@
 """Adam (or Muon) with linear warm-up, cosine decay and gradient clipping; the defaults are TopoNet's.
 
 The cosine goes down once over the run, by step or by epoch, or in cycles with warm restarts (`training.restarts`). Or
-the rate is constant and drops at given steps.
+the rate is constant and drops at given steps. The rate may grow with the batch, and differ between parameters.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import jax
@@ -31,6 +32,7 @@ from tflane_jax.limits import (
     check_settings,
 )
 from tflane_jax.training.muon import scale_by_muon
+from tflane_jax.training.rate_factors import Factors, scale_by_factors
 from tflane_jax.training.restarts import (
     Cycle,
     RestartsConfig,
@@ -61,7 +63,15 @@ class OptimConfig:
     """Optimiser and averaging.
 
     Attributes:
-        lr: peak learning rate; 0 changes nothing but running statistics and averages.
+        lr: peak learning rate; of a batch of `reference_batch` examples if `lr_scaling` is not "none". 0 changes
+            nothing but running statistics and averages.
+        lr_scaling: how `lr` changes with the batch size B of the run (of all devices, see `scaled_to_batch`): "none";
+            "linear", times B / reference_batch (Goyal et al. 2017, for SGD); "sqrt", times the square root of it, often
+            used with Adam.
+        reference_batch: examples of an update that `lr` was chosen for; 8 is TopoNet's.
+        lr_factors: (pattern, factor) pairs. The parameters of a module whose path matches the pattern, for example
+            `encoder/images/backbone`, learn at `factor` times the rate, their weight decay included; `*` stands for any
+            text, the first pattern that matches decides, and 0 keeps parameters as they are. Every pattern must match.
         warmup_steps: steps of linear rise from `warmup_ratio * lr` to `lr`.
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
         weight_decay: on kernels and embeddings only.
@@ -81,6 +91,9 @@ class OptimConfig:
     """
 
     lr: PositiveOrZero = 2e-4
+    lr_scaling: Literal["none", "linear", "sqrt"] = "none"
+    reference_batch: Count = 8
+    lr_factors: Factors = ()
     warmup_steps: CountOrZero = 500
     warmup_ratio: Fraction = 1 / 3
     final_ratio: Fraction = 1e-3
@@ -108,6 +121,16 @@ class OptimConfig:
 
 Rate = Callable[[Any, Int[ArrayLike, ""]], Float[Array, ""]]
 """(the optimiser's state, the number of updates made) -> learning rate of the next update."""
+
+
+def scaled_to_batch(config: OptimConfig, batch_size: int) -> OptimConfig:
+    """Return the settings with the learning rate of a batch of `batch_size` examples, and `lr_scaling` "none"."""
+    check_settings(config, "optim.")
+    if config.lr_scaling == "none":
+        return config
+    ratio = batch_size / config.reference_batch
+    factor = ratio if config.lr_scaling == "linear" else math.sqrt(ratio)
+    return replace(config, lr=config.lr * factor, lr_scaling="none")
 
 
 def make_rate(config: OptimConfig, steps: int) -> Rate:
@@ -164,7 +187,11 @@ def warmup_factor(config: OptimConfig, step: Int[ArrayLike, "..."]) -> Float[Arr
 def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformation:
     """Return the gradient transformation of a run of `steps` updates, for `Vectors`.
 
-    Raises UserError where a setting cannot work, see `make_schedule` and `RestartsConfig`.
+    Its `init` raises UserError for `lr_factors` that match nothing.
+
+    Raises:
+        UserError: a setting cannot work, see `make_schedule` and `RestartsConfig`.
+        ValueError: the learning rate is not yet that of the batch, see `scaled_to_batch`.
     """
     _check(config, steps)
     decay = optax.masked(_decay_what_learns(config.weight_decay), is_decayed)
@@ -172,6 +199,7 @@ def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformat
     return optax.chain(
         _clip_by_norm(config.clip_norm),
         optax.chain(*((adam, decay) if config.decay == "decoupled" else (decay, adam)), _scale_by_rate(config, steps)),
+        *((scale_by_factors(config.lr_factors),) if config.lr_factors else ()),
     )
 
 
@@ -242,6 +270,8 @@ def warmup_fits(config: OptimConfig, steps: int) -> tuple[str, bool, str]:
 
 
 def _check(config: OptimConfig, steps: int) -> None:
+    if config.lr_scaling != "none":
+        raise ValueError("call scaled_to_batch first: the learning rate depends on the batch size")
     check_settings(config, "optim.")
     setting, fits, allowed = warmup_fits(config, steps)
     if not fits:

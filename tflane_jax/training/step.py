@@ -1,5 +1,9 @@
 """The update step: loss, gradient, optimiser, moving average. It is traced once.
 
+A batch may pass through the model in parts, one after the other, so that only the activations of one part are held at a
+time. Loss and gradient are then means over the parts. This equals the whole batch for what is a mean over examples;
+docs/scale.md names what is not: normalisers counted per batch, statistics of batch norms, dropout.
+
 Several seeds share one compiled update of a single seed. One program for all of them (`vmap`) would be slower, because
 XLA turns convolutions with a kernel for each seed into grouped ones.
 """
@@ -19,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.devices import active, everywhere
 from tflane_jax.models.parameters import Params, split_statistics
+from tflane_jax.training.loop_convolutions import with_fast_convolutions
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
 from tflane_jax.training.state import TrainState
@@ -30,7 +35,13 @@ UpdateStep = Callable[[TrainState, Any], tuple[TrainState, Metrics]]
 
 
 def make_update_step(
-    task: Trainable, optim: OptimConfig, steps: int, *, donate: bool = True, mesh: Mesh | None = None
+    task: Trainable,
+    optim: OptimConfig,
+    steps: int,
+    *,
+    donate: bool = True,
+    mesh: Mesh | None = None,
+    accumulate: int = 1,
 ) -> UpdateStep:
     """Return the jitted update (state, batch) -> (state, metrics) of one seed.
 
@@ -44,8 +55,11 @@ def make_update_step(
         steps: of the whole run.
         donate: give the memory of the input state to the new one; the input state cannot be used again.
         mesh: of several devices, on each of which the new state and the metrics are.
+        accumulate: parts of a batch, see `TrainingConfig.accumulate`.
     """
-    update = _traced_once(_update(task, optim, steps))
+    update = _update(task, optim, steps, accumulate)
+    loops = accumulate > 1 or getattr(task, "loops", False)
+    update = _traced_once(with_fast_convolutions(update) if loops else update)
     placed: Any = {} if mesh is None else {"out_shardings": everywhere(mesh)}
     return jax.jit(update, donate_argnums=0 if donate else (), **placed)
 
@@ -75,19 +89,21 @@ def compiled_update(
     *,
     donate: bool = True,
     mesh: Mesh | None = None,
+    accumulate: int = 1,
 ) -> UpdateStep:
     """Return the update of one seed, compiled for the shapes of a state and a batch.
 
     A process compiles it once: trainings that differ only in seeds or starting parameters use the same program.
 
     Args:
-        task, optim, steps, donate: see `make_update_step`.
+        task, optim, steps, donate, accumulate: see `make_update_step`.
         state, batch: with `mesh` as `devices.replicated` and `devices.divided` return them.
         mesh: see `devices.training_mesh`.
     """
     leaves, tree = jax.tree.flatten((state, batch))
     placed = tuple(leaf.sharding if mesh is not None else None for leaf in leaves)
-    return _compiled(task, optim, steps, donate, tree, tuple(jax.typeof(leaf) for leaf in leaves), placed, mesh)
+    types = tuple(jax.typeof(leaf) for leaf in leaves)
+    return _compiled(task, optim, steps, donate, tree, types, placed, mesh, accumulate)
 
 
 @functools.lru_cache(maxsize=16)
@@ -100,8 +116,9 @@ def _compiled(
     types: tuple[Any, ...],
     placed: tuple[Any, ...],
     mesh: Mesh | None,
+    accumulate: int,
 ) -> UpdateStep:
-    update: Any = make_update_step(task, optim, steps, donate=donate, mesh=mesh)
+    update: Any = make_update_step(task, optim, steps, donate=donate, mesh=mesh, accumulate=accumulate)
     shapes = [
         jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type, sharding=where)
         for each, where in zip(types, placed, strict=True)
@@ -127,26 +144,32 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
     return checked
 
 
-def _update(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
+def _update(task: Trainable, optim: OptimConfig, steps: int, accumulate: int) -> UpdateStep:
     optimizer, rate = make_optimizer(optim, steps), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
-        key = stream(state.key, "dropout", state.step)
+        key, learned = stream(state.key, "dropout", state.step), state.learned.tree()
 
-        def loss_of(learned: Params):
-            return task.loss(learned | state.statistics, batch, key)
+        def of_part(statistics: Params, batch: Any, key: jax.Array) -> tuple[Vectors, Any, Params]:
+            def loss_of(learned: Params):
+                return task.loss(learned | statistics, batch, key)
 
-        (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(state.learned.tree())
-        terms, statistics = split_statistics(aux)
-        gradient = ravel(grads, state.learned.layout)
+            (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(learned)
+            terms, statistics = split_statistics(aux)
+            return ravel(grads, state.learned.layout), (loss, terms), statistics
+
+        if accumulate == 1:
+            gradient, (loss, terms), statistics = of_part(state.statistics, batch, key)
+        else:
+            gradient, (loss, terms), statistics = _over_parts(of_part, state, batch, key, accumulate)
         grad_norm = norm(gradient)
         updates, opt_state = optimizer.update(gradient, state.opt_state, state.learned)  # pyright: ignore
-        learned: Vectors = optax.apply_updates(state.learned, updates)  # pyright: ignore
+        changed: Vectors = optax.apply_updates(state.learned, updates)  # pyright: ignore
         new = TrainState(
             step=state.step + 1,
-            learned=learned,
+            learned=changed,
             statistics=statistics,
-            ema_learned=moving_average(state.ema_learned, learned, state.step, optim.ema_decay),
+            ema_learned=moving_average(state.ema_learned, changed, state.step, optim.ema_decay),
             ema_statistics=moving_average(state.ema_statistics, statistics, state.step, optim.ema_decay),
             opt_state=opt_state,
             key=state.key,
@@ -160,6 +183,32 @@ def _update(task: Trainable, optim: OptimConfig, steps: int) -> UpdateStep:
         return jax.tree.map(lambda after, before: jnp.where(metrics["finite"], after, before), new, state), metrics
 
     return update
+
+
+def _over_parts(
+    of_part: Callable[[Params, Any, jax.Array], tuple[Vectors, Any, Params]],
+    state: TrainState,
+    batch: Any,
+    key: jax.Array,
+    parts: int,
+) -> tuple[Vectors, Any, Params]:
+    """Return mean gradient and mean loss terms over the parts of a batch, and the statistics after the last part.
+
+    Example i belongs to part i mod `parts`: where devices divide the batch, each has the same number of every part.
+    """
+
+    def split(leaf: jax.Array) -> jax.Array:
+        return leaf.reshape(leaf.shape[0] // parts, parts, *leaf.shape[1:]).swapaxes(0, 1)
+
+    def body(carry: tuple[Vectors, Params], part: tuple[Any, jax.Array]) -> tuple[tuple[Vectors, Params], Any]:
+        total, statistics = carry
+        gradient, found, updated = of_part(statistics, *part)
+        return (jax.tree.map(jnp.add, total, gradient), updated), found
+
+    start = jax.tree.map(jnp.zeros_like, state.learned), state.statistics
+    (total, statistics), found = jax.lax.scan(body, start, (jax.tree.map(split, batch), jax.random.split(key, parts)))
+    gradient = jax.tree.map(lambda leaf: leaf / parts, total)
+    return gradient, jax.tree.map(lambda leaf: leaf.mean(0), found), statistics
 
 
 def moving_average(average: Any, params: Any, step: int | Int[Array, ""], decay: float | Float[Array, ""]) -> Any:

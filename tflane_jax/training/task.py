@@ -11,7 +11,10 @@ from tflane_jax.models.parameters import Params
 
 
 class Trainable(Protocol):
-    """A model with its loss. Implementations are frozen dataclasses: jit takes them as static arguments."""
+    """A model with its loss. Implementations are frozen dataclasses: jit takes them as static arguments.
+
+    An attribute `loops` that is True says that the loss passes through the model in a loop (`tasks.base.Task.loops`).
+    """
 
     def init(self, key: jax.Array, example: Any) -> Params:
         """Return initial parameters for examples shaped like `example`."""

@@ -1,0 +1,87 @@
+"""Training on clips, unrolled and as a scan over time: size of the program, time to compile, loss.
+
+    python -m benchmarks.clip_scan --out runs/bench                      # loss and gradient; minutes
+    python -m benchmarks.clip_scan --out runs/bench --tiny --what loss   # one decoder layer, the loss alone
+
+Compile times are CPU seconds of this process, tracing apart. Inputs are invented numbers in the shapes of the data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from benchmarks.gpu.steps import invented
+from benchmarks.timing import machine, markdown_table, save
+from tflane_jax.config import load_config
+from tflane_jax.scene import shapes_of
+from tflane_jax.summary import shapes_of_params
+from tflane_jax.training.loop_convolutions import with_fast_convolutions
+
+CONFIG = "markers/cameras"
+CLIPS = (2, 4)
+
+
+def measured(clip: int, form: Literal["unrolled", "scan"], what: str, *, tiny: bool) -> dict[str, Any]:
+    """Return what the program of one clip takes, and its loss."""
+    config = load_config(CONFIG)
+    task: Any = replace(config.task, clip=clip, time=form)
+    if tiny:
+        task = replace(task, model=replace(task.model, decoder=replace(task.model.decoder, layers=1), elements=None))
+    shapes = task.shapes(config.data)
+    params = jax.tree.map(lambda leaf: 0.1 * leaf, invented(shapes_of_params(task, shapes)))
+    batch = invented(shapes_of(shapes_of(shapes, clip), 1))
+    of_loss = lambda *arguments: task.loss(*arguments)[0]  # noqa: E731
+    function = of_loss if what == "loss" else jax.value_and_grad(of_loss)
+    began = time.process_time()
+    lowered = jax.jit(with_fast_convolutions(function)).lower(params, batch, jax.random.key(0))
+    traced = time.process_time()
+    compiled = lowered.compile()
+    done = time.process_time()
+    found = compiled(params, batch, jax.random.key(0))
+    loss = float(found if what == "loss" else found[0])
+    return {
+        "clip": clip,
+        "form": form,
+        "lines": lowered.as_text().count("\n"),
+        "trace_s": traced - began,
+        "compile_s": done - traced,
+        "loss": loss,
+    }
+
+
+def run(out: Path, what: str = "gradient", *, tiny: bool = False) -> list[dict[str, Any]]:
+    """Compare both forms, print the table, and write `clip_scan.json` and `.md` into `out`."""
+    rows = [measured(clip, form, what, tiny=tiny) for clip in CLIPS for form in ("unrolled", "scan")]
+    header = ["clip", "form", "lines of StableHLO", "trace, CPU s", "compile, CPU s", "loss"]
+    lines = [
+        [str(r["clip"]), r["form"], f"{r['lines']:,}", f"{r['trace_s']:.0f}", f"{r['compile_s']:.0f}", repr(r["loss"])]
+        for r in rows
+    ]
+    text = markdown_table(header, lines)
+    print(text)
+    save(out, "clip_scan", machine() | {"what": what, "tiny": tiny, "rows": rows}, text)
+    losses = {clip: [row["loss"] for row in rows if row["clip"] == clip] for clip in CLIPS}
+    for clip, found in losses.items():
+        np.testing.assert_allclose(*found, rtol=1e-6, err_msg=f"losses of clip {clip}")
+    return rows
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the JSON and the table")
+    parser.add_argument("--what", choices=["gradient", "loss"], default="gradient")
+    parser.add_argument("--tiny", action="store_true", help="one decoder layer")
+    options = parser.parse_args()
+    run(options.out, options.what, tiny=options.tiny)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Benchmarks of accelerators; each module runs alone, and with `--tiny` on a CPU, which shows only that it starts."""

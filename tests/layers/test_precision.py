@@ -1,0 +1,135 @@
+"""bfloat16 and recomputed activations: where they act, and what stays float32."""
+
+from dataclasses import dataclass, replace
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.gpu.steps import everywhere
+from tests.models.cases import WITH_TRAFFIC, make_example
+from tflane_jax.config import load_config
+from tflane_jax.layers.attention import MultiHeadAttention
+from tflane_jax.layers.precision import Precision, computing, run_layer
+from tflane_jax.scene import shapes_of
+from tflane_jax.summary import shapes_of_params
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+
+@dataclass(frozen=True)
+class Settings:
+    precision: Precision = "float32"
+    remat: bool = False
+
+
+class Block(nn.Module):
+    @nn.compact
+    def __call__(self, x, *, deterministic):
+        attended = MultiHeadAttention(8, 2, name="attention")(x, x, x, deterministic=deterministic)
+        return nn.LayerNorm(name="norm")(x + nn.Dropout(0.1, name="drop")(attended, deterministic=deterministic))
+
+
+class Stack(nn.Module):
+    config: Settings
+
+    @nn.compact
+    def __call__(self, x):
+        x = run_layer(self, lambda: Block(name="block"), self.config, x, deterministic=False)
+        return nn.Dense(3, name="head")(x)
+
+
+X = np.random.default_rng(0).normal(size=(5, 8)).astype(np.float32)
+VARIABLES = {"params": jax.eval_shape(Stack(Settings()).init, {"params": jax.random.key(0)}, X)["params"]}
+
+
+def program(config):
+    """Return a function of parameters and its gradient's steps."""
+
+    def loss(params):
+        return Stack(config).apply({"params": params}, X, rngs={"dropout": jax.random.key(1)}).sum()
+
+    return loss, list(steps(jax.make_jaxpr(jax.grad(loss))(VARIABLES["params"]).jaxpr))
+
+
+def steps(jaxpr):
+    """Yield the steps of a program and of those inside it."""
+    for step in jaxpr.eqns:
+        yield step
+        for value in step.params.values():
+            for inner in value if isinstance(value, tuple | list) else [value]:
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from steps(inner)
+
+
+def halves(found):
+    return [s for s in found if s.primitive.name == "dot_general" and s.invars[0].aval.dtype == jnp.bfloat16]
+
+
+@pytest.mark.parametrize("remat", [False, True])
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_part_computes_as_its_settings_say(precision, remat):
+    config = Settings(precision, remat)
+    made = jax.eval_shape(Stack(config).init, {"params": jax.random.key(0), "dropout": jax.random.key(1)}, X)
+    assert jax.tree.map(jnp.shape, made) == jax.tree.map(jnp.shape, VARIABLES)
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(made)} == {"float32"}
+    _, found = program(config)
+    assert len(halves(found)) >= (12 if precision == "bfloat16" else 0)
+    assert bool(halves(found)) == (precision == "bfloat16")
+    assert any(step.primitive.name == "remat2" for step in found) == remat
+    # The head behind the part and every norm are float32.
+    assert all(s.outvars[0].aval.dtype == jnp.float32 for s in found if s.primitive.name == "rsqrt")
+    outside = [s for s in found if s.primitive.name == "dot_general" and 3 in s.outvars[0].aval.shape]
+    assert all(s.invars[0].aval.dtype == jnp.float32 for s in outside)
+
+
+def test_the_default_is_the_program_without_settings():
+    class Plain(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            return nn.Dense(3, name="head")(Block(name="block")(x, deterministic=False))
+
+    def loss(params):
+        return Plain().apply({"params": params}, X, rngs={"dropout": jax.random.key(1)}).sum()
+
+    expected, found = (jax.make_jaxpr(jax.grad(f))(VARIABLES["params"]) for f in (loss, program(Settings())[0]))
+    assert str(found) == str(expected)
+
+
+def test_a_layer_keeps_a_dtype_of_its_own():
+    dense = nn.Dense(2, dtype=jnp.float32)
+    with computing("bfloat16"):
+        found = jax.eval_shape(lambda x: dense.init_with_output(jax.random.key(0), x)[0], X)
+    assert found.dtype == jnp.float32
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tf_lane/toponet_tfm", "tf_lane/lanesegnet", "tf_lane/maptr", "camera/toponet"])
+def test_every_part_of_a_host_has_both(name):
+    config = load_config(name)
+    example = config.task.shapes(config.data)
+    task = replace(config.task, model=everywhere(config.task.model, "bfloat16", remat=True))
+    plain, params = (shapes_of_params(each, example) for each in (config.task, task))
+    assert plain == params
+    program = jax.make_jaxpr(jax.value_and_grad(task.loss, has_aux=True), return_shape=True)
+    closed, ((loss, _), gradient) = program(params, shapes_of(example, 2), jax.random.key(0))
+    assert {leaf.dtype.name for leaf in jax.tree.leaves((loss, gradient))} == {"float32"}
+    found = list(steps(closed.jaxpr))
+    assert halves(found)
+    assert sum(step.primitive.name == "remat2" for step in found) >= config.task.model.decoder.layers
+
+
+@pytest.mark.slow
+def test_losses_in_half_precision_are_close_and_recomputing_changes_nothing():
+    losses = {}
+    batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), make_example())
+    for settings in (Settings(), Settings(remat=True), Settings("bfloat16")):
+        task = LaneGraphTask(everywhere(WITH_TRAFFIC, settings.precision, remat=settings.remat))
+        params = LaneGraphTask(WITH_TRAFFIC).init(jax.random.key(0), make_example())
+        losses[settings] = float(jax.jit(task.loss)(params, batch, jax.random.key(0))[0])
+    exact, again, half = losses.values()
+    assert again == pytest.approx(exact, rel=1e-6)
+    assert half == pytest.approx(exact, rel=0.05)
+    assert half != exact

@@ -1,0 +1,108 @@
+"""`tflane summary --plan`: the arithmetic of the estimate, without compiling."""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+import pytest
+
+from tests.training.stub import LineTask
+from tflane_jax import plan as module
+from tflane_jax.cli import main
+from tflane_jax.commands import summary as command
+from tflane_jax.errors import UserError
+from tflane_jax.plan import GIB, KINDS, make_plan
+from tflane_jax.summary import Program
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
+
+
+@dataclass(frozen=True)
+class Task(LineTask):
+    frames: int = 1
+    precision: str = "float32"
+
+
+EXAMPLE = {"x": jax.ShapeDtypeStruct((2**20,), np.float32), "y": jax.ShapeDtypeStruct((), np.float32)}
+LEARNED = (2**20 * 4 + 64) * 4 / GIB  # kernel of 2^20 x 4, and a row for the bias
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Stand in for the counted program; return the batch sizes that were asked for."""
+    asked = []
+
+    def program(task, example, batch_size, optim, *, compiled):
+        asked.append(batch_size)
+        return Program("training step", batch_size, 1000.0 * batch_size, None, 512.0 if compiled else None)
+
+    monkeypatch.setattr(module, "training_program", program)
+    return asked
+
+
+def estimate(task=None, accumulate=1, devices=4, **settings):
+    training = TrainingConfig(steps=3600, batch_size=16, accumulate=accumulate)
+    options = {"devices": devices, "kind": "h100", "utilisation": 0.5} | settings
+    return make_plan(task or Task(features=4), EXAMPLE, OptimConfig(lr_scaling="sqrt"), training, **options)
+
+
+def test_memory_and_time_of_a_step(counted):
+    plan = estimate()
+    assert counted == [4]
+    batch = 4 * (2**20 + 1) * 4 / GIB
+    # Parameters, average, two moments of Adam; and what the compiler plans.
+    assert plan.memory == pytest.approx(4 * LEARNED + batch + 0.5, rel=1e-5)
+    computing = 4e12 / (KINDS["h100"].float32 * 1e12 * 0.5)
+    exchange = 2 * 3 / 4 * LEARNED * GIB / (KINDS["h100"].link * 1e9)
+    assert plan.step_s == pytest.approx(computing + exchange)
+    assert plan.run_s == pytest.approx(3600 * plan.step_s)
+    assert any("a guess" in sentence for sentence in plan.assumptions)
+
+
+def test_parts_of_a_batch_take_memory_for_a_further_gradient_and_the_same_operations(counted):
+    whole, parts = estimate(), estimate(accumulate=2)
+    assert counted == [4, 2]
+    assert parts.step_s == pytest.approx(whole.step_s)
+    assert parts.memory == pytest.approx(whole.memory + LEARNED)
+
+
+def test_half_precision_and_one_device(counted):
+    full, half = (estimate(Task(features=4, precision=p), devices=1) for p in ("float32", "bfloat16"))
+    assert full.step_s / half.step_s == pytest.approx(KINDS["h100"].bfloat16 / KINDS["h100"].float32)
+
+
+def test_without_compiling_memory_is_not_estimated(counted):
+    plan = estimate(compiled=False)
+    assert plan.memory is None
+    assert [row["value"] for row in plan.rows].count("not compiled") == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"devices": 3}, "choose a multiple of 3"),
+        ({"devices": 0}, "at least one device"),
+        ({"utilisation": 1.5}, "1.5"),
+    ],
+)
+def test_what_cannot_be_is_named(counted, change, message):
+    with pytest.raises(UserError, match=message):
+        estimate(**change)
+
+
+def test_the_command_prints_an_estimate_with_its_assumptions(counted, monkeypatch, tmp_path, capsys):
+    plan = estimate(compiled=False)
+    monkeypatch.setattr(command, "make_plan", lambda *args, devices, kind, utilisation, compiled: plan)
+    arguments = ["summary", "--config", "gtn_lane/lstr", "--plan", "2", "--kind", "a100", "--no-compile"]
+    assert main([*arguments, "--out", str(tmp_path / "plan")]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("Estimate, not a measurement: gtn_lane/lstr on 2 x a100")
+    assert "- computing reaches 50% of the peak: a guess" in printed
+    assert (tmp_path / "plan.json").exists()
+
+
+def test_the_parser_offers_every_kind(capsys):
+    with pytest.raises(SystemExit):
+        main(["summary", "--kind", "abacus"])
+    message = capsys.readouterr().err
+    assert all(kind in message for kind in KINDS)

@@ -1,0 +1,68 @@
+"""Precision and memory of a part of a model: bfloat16 projections, activations computed again for the gradient.
+
+In bfloat16, linear layers and convolutions take bfloat16 inputs and kernels, and attention multiplies what they give.
+Parameters, residual sums, layer norms, softmax, sampling locations and the outputs of a part are float32.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import Any, Literal, Protocol, TypeVar
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+T = TypeVar("T")
+Precision = Literal["float32", "bfloat16"]
+
+
+class Computation(Protocol):
+    """Settings of a part.
+
+    `precision` is the dtype of linear layers and convolutions; `remat`: compute the activations of each layer again for
+    the gradient instead of keeping them.
+    """
+
+    @property
+    def precision(self) -> Precision: ...
+    @property
+    def remat(self) -> bool: ...
+
+
+def computing(precision: Precision) -> contextlib.AbstractContextManager[Any]:
+    """Return a context in which linear layers and convolutions that name no dtype of their own compute in this one."""
+    return contextlib.nullcontext() if precision == "float32" else nn.intercept_methods(_in_half)
+
+
+def run_part(parent: nn.Module, run: Callable[..., T], config: Computation, *arrays: Any) -> T:
+    """Return `run(parent, *arrays)` in the precision of a part; recomputed for the gradient if it says so.
+
+    Args:
+        parent: compact module that is being called.
+        run: makes and calls submodules of `parent`.
+        config: of the part; float32 without `remat` changes nothing.
+        arrays: what `run` takes beside the module.
+    """
+    with computing(config.precision):
+        found = nn.remat(run)(parent, *arrays) if config.remat else run(parent, *arrays)
+    return full(found)
+
+
+def run_layer(parent: nn.Module, layer: Callable[[], Any], config: Computation, *arrays: Any, **static: Any) -> Any:
+    """Return `layer()(*arrays, **static)` by `run_part`; `layer` makes a named submodule of `parent`."""
+    return run_part(parent, lambda parent, *arrays: layer()(*arrays, **static), config, *arrays)
+
+
+def full(tree: T) -> T:
+    """Return a tree with its bfloat16 arrays in float32."""
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf, tree)
+
+
+def _in_half(call: Any, arguments: Any, settings: Any, context: Any) -> Any:
+    module = context.module
+    if context.method_name == "__call__" and isinstance(module, nn.Dense | nn.Conv) and module.dtype is None:
+        # A module is frozen, but lives for one trace only.
+        object.__setattr__(module, "dtype", jnp.bfloat16)
+    return call(*arguments, **settings)

@@ -1,0 +1,183 @@
+"""An estimate of a training on accelerators: memory, operations and time, from shapes and public peak numbers.
+
+Nothing is measured. Memory of the state follows from shapes; that of gradients and activations is what XLA's compiler
+for this machine plans. Time is operations over an assumed fraction of the peak. `Plan.assumptions` says what enters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from tflane_jax.errors import UserError
+from tflane_jax.scene import shapes_of
+from tflane_jax.summary import training_program
+from tflane_jax.tasks.base import AnyTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
+from tflane_jax.training.state import init_state
+
+GIB = 2**30
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Peak numbers of an accelerator, from the maker's data sheet (dense matrices, no sparsity).
+
+    Attributes:
+        memory: GB (10^9 bytes).
+        bandwidth: of its memory, GB/s.
+        float32, bfloat16: TFLOP/s of matrix products of such inputs; float32 as XLA computes them by default (TF32 on
+            NVIDIA GPUs).
+        link: GB/s to the other devices of its host, in one direction.
+    """
+
+    memory: float
+    bandwidth: float
+    float32: float
+    bfloat16: float
+    link: float
+
+
+KINDS = {
+    "a100": Kind(80, 2039, 156, 312, 300),
+    "h100": Kind(80, 3350, 494, 989, 450),
+    "h200": Kind(141, 4800, 494, 989, 450),
+    "rtx3090": Kind(24, 936, 35.6, 71, 32),
+    "rtx4090": Kind(24, 1008, 82.6, 165, 32),
+}
+"""The SXM forms with 80 and 141 GB, linked by NVLink; the RTX cards are linked by PCI Express 4.0 x16."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The estimate. Memory is of one device, GiB; time in seconds.
+
+    Attributes:
+        rows: quantity and value, for a table.
+        assumptions: one sentence each.
+        memory: all parts together; None if nothing was compiled.
+        step_s: of an update.
+        run_s: of all updates.
+    """
+
+    rows: tuple[dict[str, str], ...]
+    assumptions: tuple[str, ...]
+    memory: float | None
+    step_s: float
+    run_s: float
+
+
+def make_plan(
+    task: AnyTask,
+    example: Any,
+    optim: OptimConfig,
+    training: TrainingConfig,
+    *,
+    devices: int,
+    kind: str,
+    utilisation: float,
+    compiled: bool = True,
+) -> Plan:
+    """Return the estimate for a training of one seed.
+
+    Args:
+        task, optim, training: of the run.
+        example: shapes of an example.
+        devices: how many devices share each batch.
+        kind: of the devices, a name in `KINDS`.
+        utilisation: assumed fraction of the peak.
+        compiled: compile the step of one device for its memory; else its memory is not estimated.
+
+    Raises:
+        UserError: the batch cannot be shared, or a number is out of range.
+    """
+    if devices < 1 or not 0.0 < utilisation <= 1.0:
+        raise UserError(f"--plan {devices} --utilisation {utilisation}: at least one device, above 0 and at most 1")
+    passes = devices * training.accumulate
+    if training.batch_size % passes:
+        raise UserError(
+            f"training.batch_size is {training.batch_size}, which {devices} devices and {training.accumulate} parts "
+            f"(training.accumulate) cannot share evenly: choose a multiple of {passes}"
+        )
+    device, optim = KINDS[kind], scaled_to_batch(optim, training.batch_size)
+    part = training.batch_size // passes
+    program = training_program(task, example, part, optim, compiled=compiled)
+    frames = example if task.frames == 1 else shapes_of(example, task.frames)
+    state: Any = jax.eval_shape(partial(init_state, task, make_optimizer(optim, 10**6)), jax.random.key(0), frames)
+    learned = _gib(state.learned)
+    between = None if program.between is None else program.between / 1024
+    # Parts add up in a further gradient.
+    activations = None if between is None else between + (learned if training.accumulate > 1 else 0.0)
+    parts = {
+        "parameters": _gib((state.learned, state.statistics)),
+        "their moving average": _gib((state.ema_learned, state.ema_statistics)),
+        "optimizer": _gib(state.opt_state),
+        "batch": _gib(shapes_of(frames, part * training.accumulate)),
+        "gradients and activations": activations,
+    }
+    memory = None if activations is None else sum(value for value in parts.values() if value is not None)
+
+    half = _in_half(task)
+    peak = device.bfloat16 if half else device.float32
+    operations = program.gflop * training.accumulate
+    compute = operations / (1e3 * peak * utilisation)
+    exchange = 2 * (devices - 1) / devices * learned * GIB / (1e9 * device.link)
+    step = compute + exchange
+    rows = {
+        **{f"memory: {name}, GiB": _number(value) for name, value in parts.items()},
+        f"memory of a device, GiB (it has {device.memory * 1e9 / GIB:.0f})": _number(memory),
+        "operations of a step on a device, GFLOP": f"{operations:,.0f}",
+        "computing, s a step": _number(compute),
+        "exchange of gradients, s a step": _number(exchange),
+        "time of a step, s": _number(step),
+        "examples a second, all devices": f"{training.batch_size / step:,.1f}" if step else "-",
+        f"time of {training.steps:,} steps, hours": _number(step * training.steps / 3600),
+    }
+    return Plan(
+        tuple({"estimate": name, "value": value} for name, value in rows.items()),
+        (
+            f"{kind}: {device.memory:g} GB, {peak:g} TFLOP/s of {'bfloat16' if half else 'float32 (TF32)'} products, "
+            f"{device.link:g} GB/s to the others; peak numbers of the data sheet",
+            f"computing reaches {utilisation:.0%} of the peak: a guess, not measured (--utilisation)",
+            "operations are XLA's count before fusion; what a loop does counts once",
+            "gradients and activations need what the compiler for this machine plans; a GPU's plan differs",
+            "gradients are exchanged after computing, in a ring, at full speed of the link",
+            "loading, evaluation, checkpoints and compiling take no time",
+        ),
+        memory,
+        step,
+        step * training.steps,
+    )
+
+
+def _gib(tree: Any) -> float:
+    """Return the size of arrays given by their shapes; random keys count nothing."""
+    plain = [leaf for leaf in jax.tree.leaves(tree) if not jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)]
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in plain) / GIB
+
+
+def _number(value: float | None) -> str:
+    return "not compiled" if value is None else f"{value:.3g}"
+
+
+def _in_half(task: AnyTask) -> bool:
+    """Return whether all parts of a task that have a precision compute in bfloat16."""
+    found: list[str] = []
+
+    def visit(config: Any) -> None:
+        for field in dataclasses.fields(config):
+            value = getattr(config, field.name)
+            if field.name == "precision":
+                found.append(value)
+            elif dataclasses.is_dataclass(value):
+                visit(value)
+
+    visit(task)
+    return bool(found) and set(found) == {"bfloat16"}

@@ -38,6 +38,8 @@ def arguments_of(name: str, steps: int, exported: Path) -> list[str]:
     arguments = ["--training.steps", str(steps), "--training.log_every", "1", "--training.batch_size", batch]
     arguments += ["--training.eval_every", str(steps), "--training.checkpoint_every", str(steps)]
     arguments += ["--evaluation.pictures", "0", "--optim.warmup_steps", "1"]
+    if paper_size:  # frozen stages need weights to start from, which are not at hand
+        arguments += ["--task.model.encoder.images.frozen_stages", "0"]
     if name.startswith(_PAPER_SIZE_ON_THE_WORLD):
         scale = ["--data.example.cameras.scale", "0.1", "--optim.epoch_steps", "0"]
         return [*arguments, *_FEW_SCENES, *scale]

@@ -69,6 +69,11 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         """Number of successive frames in a training example; 1 for single frames."""
         return 1
 
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """Paths of modules that are never trained, and so need weights to start from."""
+        return ()
+
     def init(self, key: jax.Array, example: ExampleT) -> Params:
         """Return initial parameters; only the shapes of `example` are used."""
         raise NotImplementedError

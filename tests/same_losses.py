@@ -45,6 +45,8 @@ def arguments_of(name: str, steps: int, exported: Path) -> list[str]:
         return [*arguments, *_FEW_SCENES, *scale]
     if paper_size:
         arguments += ["--optim.epoch_steps", "0", "--data.root", str(exported), "--data.image.scale", "1.0"]
+        if name.startswith("markers."):  # exported scenes have two frames
+            arguments += ["--training.init_from", "None", "--task.clip", "2", "--data.example.sd_map", "None"]
         return [*arguments, "--data.image.front_rows", "None", "--data.image.front_size", "None"]
     if name.startswith("markers."):
         arguments += ["--training.init_from", "None"]

@@ -1,19 +1,28 @@
 """Virtual markers of OpenLane-V2 segments: where they stand, what a frame's cameras see of them."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tests.datasets.test_openlane_lanes import seen, straight
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_markers import BoardsConfig, DriveFrame, SegmentBoards
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
+from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, relative_pose, transform_points
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import PERFECT, MarkerConfig
 from tflane_jax.world.render.camera import FrontCamera
 from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
 
+SIZES = ExampleConfig(lanes=5, segments=4, areas=2, elements=3)
 RANGE = PerceptionRange((-50.0, 50.0), (-25.0, 25.0))
 PRIOR = MarkerConfig(lanes=4, points=5, simulation=PERFECT)
 AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -122,3 +131,33 @@ def test_a_segment_without_lanes_has_no_boards():
 def test_photographs_have_no_boards_to_read():
     with pytest.raises(UserError, match=r"photographs show no boards .*markers.pixels to None"):
         boards(drive(), replace(PRIOR, pixels=PixelConfig()))
+
+
+def test_examples_have_boards_and_the_sd_map(tmp_path):
+    """The lane of 20 m that ends at an intersection has a board; images need not be at hand."""
+    folder = export_openlane_v2({"train": DriveDataset(DriveConfig(scenes=1))}, tmp_path / "made", progress=False)
+
+    def opened(**other):
+        settings = {"subset": "B", "image": None, "example": priors} | other
+        return OpenLaneV2Dataset(OpenLaneV2Config(folder, **settings))
+
+    priors = replace(SIZES, markers=MarkerConfig(lanes=4, points=5, simulation=PERFECT), sd_map=SdMapConfig(points=3))
+    (folder / "train/01000/sdmap.json").write_text('[{"category": "road", "points": [[0, 0], [20, 0]]}]')
+    shutil.rmtree(folder / "train/01000/image")
+    dataset = opened()
+    boards = replace(dataset.config.boards, placement=PlacementConfig(height=2.0))
+    for made, height in ((dataset, 3.3), (opened(boards=boards), 2.3)):
+        first, last = made.example(0), made.example(FRAMES - 1)
+        first.validate()
+        (place,) = made._boards.markers("train/01000").pose[:, :3, 3]
+        np.testing.assert_allclose(place, [20.0, -3.05, height], atol=1e-3)
+        np.testing.assert_allclose(last.sd_map.points[0, 0], [-5.0 * np.cos(0.04), 5.0 * np.sin(0.04)], atol=1e-4)
+    nominal = nominal_example(replace(dataset.config, image=TOPONET_SUBSET_B))
+    assert nominal.markers.lanes.shape == first.markers.lanes.shape
+    assert nominal.sd_map.points.shape == first.sd_map.points.shape
+    for path in (folder / "train").rglob("info/*[0-9].json"):
+        record = json.loads(path.read_text())
+        record["annotation"]["lane_centerline"][1].pop("id")
+        path.write_text(json.dumps(record))
+    with pytest.raises(UserError, match=r"lane_centerline\[1\] lacks the entry 'id'"):
+        opened().example(0)

@@ -20,7 +20,7 @@ from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_frames import MAP_CHANGES, list_frames
-from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import (
@@ -34,9 +34,6 @@ from tflane_jax.datasets.view_images import (
 )
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import project
-from tflane_jax.markers.simulation import PERFECT, MarkerConfig
-from tflane_jax.world.roads.markers import PlacementConfig
-from tflane_jax.world.roads.sd_map import SdMapConfig
 
 SIZES = ExampleConfig(lanes=5, segments=4, areas=2, elements=3)
 NATIVE = ImageConfig(divisor=16)
@@ -187,29 +184,6 @@ def test_a_split_without_annotations(folder):
     assert not example.lanes.valid.any()
     assert not example.traffic_elements.valid.any()
     assert example.has_previous
-
-
-def test_boards_and_the_sd_map_are_priors(folder):
-    """The lane of 20 m that ends at an intersection has a board; images need not be at hand."""
-    priors = replace(SIZES, markers=MarkerConfig(lanes=4, points=5, simulation=PERFECT), sd_map=SdMapConfig(points=3))
-    (folder / "train/01000/sdmap.json").write_text('[{"category": "road", "points": [[0, 0], [20, 0]]}]')
-    shutil.rmtree(folder / "train/01000/image")
-    dataset = opened(folder, None, example=priors)
-    boards = replace(dataset.config.boards, placement=PlacementConfig(size=0.5))
-    small = opened(folder, None, example=priors, boards=boards)
-    for made in (dataset, small):
-        first, last = made.example(0), made.example(FRAMES - 1)
-        first.validate()
-        (place,) = made._boards.markers("train/01000").pose[:, :3, 3]
-        np.testing.assert_allclose(place, [20.0, -3.05, 3.3], atol=1e-3)
-        np.testing.assert_allclose(last.sd_map.points[0, 0], [-5.0 * np.cos(0.04), 5.0 * np.sin(0.04)], atol=1e-4)
-    nominal = nominal_example(replace(dataset.config, image=TOPONET_SUBSET_B))
-    assert nominal.markers.lanes.shape == first.markers.lanes.shape
-    assert nominal.sd_map.points.shape == first.sd_map.points.shape
-    for path in (folder / "train").rglob("info/*[0-9].json"):
-        change(path, lambda record: record["annotation"]["lane_centerline"][1].pop("id"))
-    with pytest.raises(UserError, match=r"lane_centerline\[1\] lacks the entry 'id'"):
-        opened(folder, None, example=priors).example(0)
 
 
 def test_a_camera_that_a_frame_lacks_is_not_valid(folder):

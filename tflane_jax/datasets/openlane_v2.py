@@ -23,6 +23,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_check import check_openlane_v2
+from tflane_jax.datasets.openlane_check_cameras import Images
 from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
@@ -325,9 +326,9 @@ def _choose(choice: Choice) -> OpenLaneV2Config:
     return OpenLaneV2Config(choice.root, choice.split, subset, image=image, example=choice.configured.example)
 
 
-def _check(root: Path, tracks: Path | None = None) -> FolderCheck:
-    found = check_openlane_v2(root, tracks)
-    return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults)
+def _check(root: Path, tracks: Path | None = None, images: Images = "ends") -> FolderCheck:
+    found = check_openlane_v2(root, tracks, images=images)
+    return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults, found.skipped)
 
 
 SOURCE = DataSource(

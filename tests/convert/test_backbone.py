@@ -137,6 +137,7 @@ def test_a_run_starts_from_the_backbone_alone(file, tmp_path):
 def test_frozen_random_weights_are_refused_before_data_are_read(tmp_path):
     config = load_config("camera/toponet_r50")
     assert frozen_modules(config.task.model) == config.task.frozen == (f"{PART}/conv1", f"{PART}/layer1_0")
+    config = replace(config, data=replace(config.data, root=tmp_path))
     with pytest.raises(UserError, match=r"conv1, .*layer1_0 would stay random: .*tflane convert"):
         train_run(config, tmp_path / "run", progress=False)
     assert not (tmp_path / "run").exists()

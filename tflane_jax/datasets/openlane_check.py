@@ -85,7 +85,7 @@ def check_openlane_v2(
     if not any(on_disk.values()):
         raise UserError(f"{root} holds no <split>/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
     subsets = _subsets(root, on_disk)
-    present = sorted(set(subsets.values()))
+    present: list[SubsetName] = sorted(set(subsets.values()))
     rows = []
     for split in SPLITS:
         every = sorted({*named[split], *on_disk[split]}, key=lambda key: (key.segment, int(key.timestamp)))
@@ -194,7 +194,8 @@ def _subsets(root: Path, on_disk: Mapping[Split, list[FrameKey]]) -> dict[tuple[
         if found.get(segment) is None and tried[segment] < _TRIED:
             tried[segment] += 1
             found[segment] = _subset(root, key)
-    other: SubsetName = next((subset for subset in found.values() if subset is not None), "A")
+    known: list[SubsetName] = [subset for subset in found.values() if subset is not None]
+    other = known[0] if known else "A"
     return {segment: other if subset is None else subset for segment, subset in found.items()}
 
 

@@ -38,11 +38,15 @@ def arguments_of(name: str, steps: int, exported: Path) -> list[str]:
     arguments = ["--training.steps", str(steps), "--training.log_every", "1", "--training.batch_size", batch]
     arguments += ["--training.eval_every", str(steps), "--training.checkpoint_every", str(steps)]
     arguments += ["--evaluation.pictures", "0", "--optim.warmup_steps", "1"]
+    if paper_size:  # frozen stages need weights to start from, which are not at hand
+        arguments += ["--task.model.encoder.images.frozen_stages", "0"]
     if name.startswith(_PAPER_SIZE_ON_THE_WORLD):
         scale = ["--data.example.cameras.scale", "0.1", "--optim.epoch_steps", "0"]
         return [*arguments, *_FEW_SCENES, *scale]
     if paper_size:
         arguments += ["--optim.epoch_steps", "0", "--data.root", str(exported), "--data.image.scale", "1.0"]
+        if name.startswith("markers."):  # exported scenes have two frames
+            arguments += ["--training.init_from", "None", "--task.clip", "2", "--data.example.sd_map", "None"]
         return [*arguments, "--data.image.front_rows", "None", "--data.image.front_size", "None"]
     if name.startswith("markers."):
         arguments += ["--training.init_from", "None"]

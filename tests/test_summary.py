@@ -1,14 +1,18 @@
 """`tflane summary`: parameters, operations and memory, counted from shapes."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from tests.shared import ROOT
 from tflane_jax.cli import main
 from tflane_jax.config import load_config
+from tflane_jax.convert.hosts import camera_shapes
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.parameters import split_statistics
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 LSTR = ROOT / "configs" / "gtn_lane" / "lstr.py"
 
@@ -49,3 +53,21 @@ def test_depth_changes_the_listing_and_not_the_sum(depth):
 class _Leaf:
     def __init__(self, *shape: int) -> None:
         self.shape = shape
+
+
+@pytest.mark.slow
+def test_the_marker_papers_full_size():
+    """Markers add tokens and, in each of six encoder layers, an attention with its norm: 4 (256 x 256 + 256) + 512."""
+    counts = {}
+    for name in ("markers/toponet_r50", "markers/toponet_r50:toponet"):
+        config = load_config(name)
+        assert isinstance(config.task, LaneGraphTask)
+        assert isinstance(config.task.model.encoder, CameraEncoderConfig)
+        assert (config.task.model.encoder.bev.layers, config.optim.lr) == (6, 1e-4)
+        learned, _ = split_statistics(
+            shapes_of_params(replace(config.task, clip=1), camera_shapes(config.task.model.encoder))
+        )
+        counts[name] = parameter_counts(learned)
+    ours, toponet = counts.values()
+    assert sum(toponet.values()) == 65_283_139
+    assert sum(ours.values()) == 69_977_667 == 65_283_139 + ours["marker_tokens"] + 6 * 263_680

@@ -37,6 +37,9 @@ from tflane_jax.training.run_folder import Start, check_start, claimed, read_con
 from tflane_jax.training.schedule import make_optimizer, scaled_to_batch
 from tflane_jax.training.state import per_seed, state_of
 
+# In `Manifest.progress`: the only module that a folder holds.
+_PART = "part"
+
 
 @dataclass(frozen=True)
 class Run:
@@ -63,6 +66,8 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
     task = config.task
     check_run(config)
+    if start != "resume":
+        _check_frozen(config)
     if config.training.init_from is not None and start != "resume":
         check_origins(config.training.init_from, config.training.seeds)
     data: Any = task.load(config.data.source("train"), progress=progress)
@@ -86,8 +91,20 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         prepare=task.prepare(config.data),
         evaluate=evaluate,
         draw=_drawing(config),
+        frozen=task.frozen,
         progress=progress,
     )
+
+
+def _check_frozen(config: RunConfig) -> None:
+    """Raise UserError if modules are frozen that would start from random weights."""
+    if config.task.frozen and config.training.init_from is None:
+        raise UserError(
+            f"{', '.join(config.task.frozen)} would stay random: this configuration freezes them "
+            "(task.model.encoder.images.frozen_stages) and starts from no weights. Convert ImageNet's from a "
+            "torchvision file (tflane convert --config FILE --weights resnet50.pth --out runs/imagenet) and set "
+            "training.init_from=runs/imagenet and training.init_partly; or train them, with frozen_stages 0"
+        )
 
 
 def build_data(source: Any) -> None:
@@ -162,6 +179,11 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
     if which is None:
         which = "last" if checkpoints.best_step() is None else "best"
     step = checkpoints.find(which)
+    if (part := checkpoints.manifest(step).progress.get(_PART)) is not None:
+        raise UserError(
+            f"{folder} holds the weights of {part} alone: train a model from it (training.init_from={folder}, "
+            "training.init_partly), and use that"
+        )
     averaged, seeds = checkpoints.params(step), config.training.seeds
     if len(seeds) > 1 and any(leaf.shape[:1] != (len(seeds),) for leaf in jax.tree.leaves(averaged)):
         raise UserError(f"{checkpoints.path(step)} has not the parameters of {len(seeds)} seeds (training.seeds)")
@@ -182,8 +204,10 @@ def open_weights(config: RunConfig) -> Run:
     return Run(str(config.weights), replace(config, training=replace(config.training, seeds=(0,))), 0, (params,))
 
 
-def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
+def save_weights(config: RunConfig, params: Params, folder: Path, *, part: str | None = None) -> None:
     """Write a run folder at step 0 with the given parameters, usable like a trained run.
+
+    With `part`, the path of a module, they are that module's alone, and the folder is one to start training from.
 
     Raises UserError if the folder is not empty.
     """
@@ -193,7 +217,9 @@ def save_weights(config: RunConfig, params: Params, folder: Path) -> None:
     with claimed(folder, "new"):
         add_provenance(folder)
         write_text(folder / "config.txt", to_text(config))
-        Checkpoints(folder / "checkpoints").save(state, Manifest(step=0, config=to_json(config)))
+        Checkpoints(folder / "checkpoints").save(
+            state, Manifest(step=0, config=to_json(config), progress={} if part is None else {_PART: part})
+        )
         write_json(folder / "config.json", to_json(config))  # last: this file marks a complete run
 
 

@@ -1,7 +1,9 @@
 """OpenLane-V2's large baseline at its full size, on subset A: 100 queries, lanes as Bezier curves.
 
     tflane summary --config camera/bevformer_detr_r50 --no-compile   # needs no data
-    tflane train --config camera/bevformer_detr_r50 --data.root PATH
+    tflane convert --config camera/bevformer_detr_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config camera/bevformer_detr_r50 --data.root PATH \\
+        --training.init-from runs/imagenet --training.init-partly
 
 Encoder and training are those of `toponet_r50.py`; control points, loss weights and image sizes are the baseline's.
 """

@@ -2,7 +2,7 @@
 
     tflane data export --config camera/native_ring --out data/world
     tflane train --config camera/toponet_r50 --data.root data/world --training.batch_size 1 \\
-        --training.steps 2 --optim.epoch_steps 0 --optim.warmup_steps 0
+        --training.steps 2 --optim.epoch_steps 0 --optim.warmup_steps 0 --task.model.encoder.images.frozen-stages 0
 
 The second command makes two updates of the paper-size model, for users without OpenLane-V2.
 """

@@ -1,7 +1,9 @@
 """TopoNet at the paper's size, on OpenLane-V2 subset A: ResNet-50, seven cameras, 200 x 100 BEV cells, 200 queries.
 
     tflane summary --config camera/toponet_r50 --no-compile          # needs no data
-    tflane train --config camera/toponet_r50 --data.root PATH
+    tflane convert --config camera/toponet_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config camera/toponet_r50 --data.root PATH \\
+        --training.init-from runs/imagenet --training.init-partly
 
 The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each. `:remat` recomputes activations in the
 backward pass, `:bfloat16` does so in half precision, `:six_layers` has six encoder layers instead of TopoNet's three.

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
@@ -42,6 +43,7 @@ def get_config() -> RunConfig:
         data=WorldData(train=1000, val=15, test=100, world=WORLD, example=EXAMPLE),
         optim=OptimConfig(lr=2e-3, warmup_steps=100, optimizer="muon", b2=0.99, clip_norm=5.0),
         training=TrainingConfig(steps=2500, batch_size=4, eval_every=2500),
+        evaluation=EvaluationConfig(versions=("v2.1", "v1.0")),
     )
 
 

@@ -9,6 +9,7 @@ Every row starts from the host of `host.py` trained with the same seed and makes
 without a prior. The rows differ only in the prior. A clip has four frames, half a second apart.
 """
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,8 +76,7 @@ def _tables_2_to_4(base: MarkerFusionConfig) -> dict[str, RunConfig]:
 
 def _tuned(host: str = "host", **priors: Any) -> RunConfig:
     """Return the fine-tuning of a host with priors."""
-    path = str(Path(__file__).with_name("host.py"))
-    config = load_config(path if host == "host" else f"{path}:{host}")
+    config = _host(host)
     assert isinstance(config.task, LaneGraphTask)
     # Denoising speeds up training from random weights; this decoder is trained already.
     model = replace(config.task.model, denoising=None, priors=PriorsConfig(**priors))
@@ -94,3 +94,9 @@ def _tuned(host: str = "host", **priors: Any) -> RunConfig:
             init_partly=True,
         ),
     )
+
+
+@functools.cache
+def _host(name: str) -> RunConfig:
+    path = str(Path(__file__).with_name("host.py"))
+    return load_config(path if name == "host" else f"{path}:{name}")

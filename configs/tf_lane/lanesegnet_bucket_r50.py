@@ -1,7 +1,9 @@
 """LaneSegNet's map-element-bucket variant at its size: segments, areas and traffic elements, on OpenLane-V2 subset A.
 
     tflane summary --config tf_lane/lanesegnet_bucket_r50 --no-compile          # needs no data
-    tflane train --config tf_lane/lanesegnet_bucket_r50 --data.root PATH
+    tflane convert --config tf_lane/lanesegnet_bucket_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config tf_lane/lanesegnet_bucket_r50 --data.root PATH \\
+        --training.init-from runs/imagenet --training.init-partly
 
 Six encoder layers, images times 0.33, no photometric distortion. Crossings are areas, no segments. `:published_fault`
 predicts areas as the published code does, without the reference that its decoder refines.

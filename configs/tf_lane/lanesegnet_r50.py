@@ -1,7 +1,9 @@
 """LaneSegNet at the paper's size, on OpenLane-V2 subset A: ResNet-50, seven cameras, 200 queries.
 
     tflane summary --config tf_lane/lanesegnet_r50 --no-compile          # needs no data
-    tflane train --config tf_lane/lanesegnet_r50 --data.root PATH
+    tflane convert --config tf_lane/lanesegnet_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config tf_lane/lanesegnet_r50 --data.root PATH \\
+        --training.init-from runs/imagenet --training.init-partly
 
 Sizes, schedule and capacity are those of TopoNet (`camera/toponet_r50`): the reference trains 24 epochs on eight GPUs,
 one frame each. `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.

@@ -1,7 +1,9 @@
 """LaneSegNet with the traffic-flow module at the papers' sizes: the main host of TF-Lane.
 
     tflane summary --config tf_lane/lanesegnet_tfm_r50 --no-compile          # needs no data
-    tflane train --config tf_lane/lanesegnet_tfm_r50 --data.root PATH --data.tracks PATH
+    tflane convert --config tf_lane/lanesegnet_tfm_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config tf_lane/lanesegnet_tfm_r50 --data.root PATH --data.tracks PATH \\
+        --training.init-from runs/imagenet --training.init-partly
 
 Host and labels are those of `lanesegnet_r50.py`, with the same ablations; module and tracks those of
 `toponet_tfm_r50.py`.

@@ -1,7 +1,9 @@
 """TopoNet with the traffic-flow module at the papers' sizes, on OpenLane-V2 subset A with the tracks of Argoverse 2.
 
     tflane summary --config tf_lane/toponet_tfm_r50 --no-compile          # needs no data
-    tflane train --config tf_lane/toponet_tfm_r50 --data.root PATH --data.tracks PATH
+    tflane convert --config tf_lane/toponet_tfm_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config tf_lane/toponet_tfm_r50 --data.root PATH --data.tracks PATH \\
+        --training.init-from runs/imagenet --training.init-partly
 
 Host, schedule and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16` and
 `:six_layers`. Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of its module: it is as wide

@@ -7,9 +7,12 @@ import numpy as np
 from tests.fakes import fake_views
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.geometry import invert_pose, relative_pose, transform_points, yaw_pose
-from tflane_jax.scene import Areas, Example, LaneGraph, TrafficElements
+from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING
 
 FRAMES, STEP = 3, 2.5
+# The ego axes in a camera that looks ahead.
+AHEAD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 # Two lanes one after the other, and one beside them; global frame.
 CENTRELINES = [[(0.0, 0.0), (20.0, 0.0)], [(20.0, 0.0), (38.0, 6.0)], [(0.0, 3.5), (20.0, 3.5)]]
 
@@ -77,5 +80,16 @@ class DriveDataset:
             traffic_elements=elements,
             previous_from_ego=relative_pose(before, pose).astype(np.float32),
             has_previous=np.asarray(frame > 0),
-            cameras=fake_views(index, cameras=self.config.cameras),
+            cameras=_official(fake_views(index, cameras=self.config.cameras)),
         )
+
+
+def _official(views: CameraViews) -> CameraViews:
+    """Return the views turned to where the cameras of OpenLane-V2 look; other numbers of them stay."""
+    rings = [ring for ring in (ARGOVERSE2_RING, NUSCENES_RING) if len(ring) == len(views.valid)]
+    for i, mount in enumerate(rings[0] if rings else ()):
+        turn = yaw_pose(0.0, 0.0, -np.deg2rad(mount.yaw))[:3, :3]
+        place = invert_pose(np.asarray(views.camera_from_ego[i], np.float64))[:3, 3]
+        views.camera_from_ego[i, :3, :3] = AHEAD @ turn
+        views.camera_from_ego[i, :3, 3] = -AHEAD @ turn @ place
+    return views

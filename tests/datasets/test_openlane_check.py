@@ -1,16 +1,21 @@
 """Faults and counts that the check of an OpenLane-V2 folder reports."""
 
 import json
+import pickle
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tflane_jax.cli import main
 from tflane_jax.datasets.openlane_check import check_openlane_v2
+from tflane_jax.datasets.openlane_check_cameras import image_size
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.errors import UserError
+
+cv2 = pytest.importorskip("cv2")
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +132,163 @@ def test_missing_and_damaged_files_are_named(folder):
     assert f"{images[1]} is damaged or cut short" in said
     assert "is no JSON file" in said
     assert len(found.faults) == 4
+
+
+def swap(content):
+    left, right = (content["sensor"][f"CAM_FRONT_{side}"] for side in ("LEFT", "RIGHT"))
+    left["extrinsic"], right["extrinsic"] = right["extrinsic"], left["extrinsic"]
+
+
+def invert(content):
+    back = content["sensor"]["CAM_BACK_LEFT"]["extrinsic"]
+    back["rotation"] = [list(row) for row in zip(*back["rotation"], strict=True)]
+
+
+def scale(content):
+    K = content["sensor"]["CAM_BACK"]["intrinsic"]["K"]
+    K[:2] = [[2.0 * value for value in row] for row in K[:2]]
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (
+            swap,
+            r"CAM_FRONT_RIGHT looks to 5\d degrees .*, expected about -5\d, where CAM_FRONT_LEFT should look: .*swap",
+        ),
+        (swap, "CAM_FRONT_LEFT looks to -5. degrees .*, where CAM_FRONT_RIGHT should look"),
+        (invert, "CAM_BACK_LEFT looks to .* from the ego frame to the camera"),
+        (scale, r"CAM_BACK has its principal point at \(48, 32\) .* in images of 48 x 32: .*another size"),
+    ],
+)
+def test_a_calibration_that_cannot_be_is_named(folder, function, said):
+    for suffix in ("", "-ls"):
+        change(frame(folder, suffix=suffix), function)
+    faults = check_openlane_v2(folder, progress=False).faults
+    assert any(re.search(said, fault) for fault in faults), faults
+    assert len(faults) == (2 if function is swap else 1)
+
+
+def test_a_camera_that_frames_lack_is_one_fault(folder):
+    for number in (0, 2):
+        change(frame(folder, number), lambda content: content["sensor"].pop("CAM_BACK"))
+    (fault,) = check_openlane_v2(folder, progress=False).faults
+    assert re.search(r"train/01000: 2 frames have no camera CAM_BACK \(first train/01000/15", fault)
+    assert not check_openlane_v2(folder, cameras="some", progress=False).faults
+
+
+def images_of(folder, camera="CAM_FRONT_LEFT"):
+    return sorted((folder / "train" / "01000" / "image" / camera).iterdir())
+
+
+def test_an_image_of_another_size_is_named(folder):
+    path = images_of(folder)[1]
+    shutil.copy(images_of(folder, "CAM_BACK_RIGHT")[1], path)
+    (fault,) = check_openlane_v2(folder, progress=False).faults
+    assert fault == f"{path} is 48 x 16 pixels, the first image of CAM_FRONT_LEFT is 48 x 32"
+
+
+@pytest.mark.parametrize("damage", [b"\xff\xc1", bytes(5000)], ids=["marker", "hole"])
+def test_damage_within_an_image_is_found_where_it_is_read_as_a_whole(folder, damage):
+    noise = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
+    for path in images_of(folder):
+        assert cv2.imwrite(str(path), noise)
+    path = images_of(folder)[2]
+    assert not any("damaged" in fault for fault in check_openlane_v2(folder, images="whole", progress=False).faults)
+    content = bytearray(path.read_bytes())
+    content[10_000 : 10_000 + len(damage)] = damage
+    path.write_bytes(content)
+    assert not any("damaged" in fault for fault in check_openlane_v2(folder, progress=False).faults)
+    found = [fault for fault in check_openlane_v2(folder, images="whole", progress=False).faults if "damaged" in fault]
+    (fault,) = found
+    assert re.fullmatch(rf"{re.escape(str(path))} is damaged (9999|10000) bytes after its start", fault)
+
+
+def test_the_size_of_an_image_is_in_its_header(tmp_path):
+    for name in ("a.jpg", "a.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((7, 300, 3), np.uint8))
+        assert image_size(tmp_path / name) == (300, 7)
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:20])
+        assert image_size(tmp_path / name) is None
+    assert image_size(tmp_path / "none.jpg") is None
+
+
+def test_both_subsets_in_one_folder(folder, tmp_path):
+    other = export_openlane_v2(
+        {"train": DriveDataset(DriveConfig(scenes=1, cameras=7))}, tmp_path / "a", progress=False
+    )
+    shutil.copytree(other, folder, dirs_exist_ok=True)
+    found = check_openlane_v2(folder, progress=False)
+    assert (found.subset, found.faults) == ("A and B", [])
+    assert [(row["subset"], row["segments"], row["images"]) for row in found.rows] == [("A", 1, 21), ("B", 1, 18)]
+    change(frame(folder), swap)
+    assert [row["faults"] for row in check_openlane_v2(folder, progress=False).rows] == [0, 2]
+
+
+def test_stray_files_are_named_and_skipped(folder, capsys):
+    segment = folder / "train" / "01000"
+    strays = [segment / "info" / name for name in (".DS_Store", "15 (1).json", "notes.json")] + [
+        folder / "train/readme"
+    ]
+    for path in strays:
+        path.write_text("x")
+    (folder / "train" / "empty").mkdir()
+    found = check_openlane_v2(folder, progress=False)
+    assert found.faults == []
+    assert [text.partition(" is no ")[0] for text in found.skipped] == sorted(
+        map(str, [*strays, folder / "train/empty"])
+    )
+    assert main(["data", "check", "--format", "openlane-v2", str(folder)]) == 0
+    said = capsys.readouterr().out
+    assert "5 skipped:" in said
+    assert "readme is no segment" in said
+
+
+def collection(folder):
+    """Return what the devkit's collection of a split holds."""
+    made = {}
+    for number in range(FRAMES):
+        with open(frame(folder, number)) as file:
+            content = json.load(file)
+        content["pose"] = {name: np.array(value) for name, value in content["pose"].items()}
+        made["train", "01000", str(content["timestamp"])] = content
+    return made
+
+
+def other_pose(made):
+    first = next(iter(made.values()))
+    first["pose"]["translation"] = first["pose"]["translation"] + 0.5
+
+
+class Evil:
+    def __reduce__(self):
+        return print, ("run",)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda made: None, None),
+        (lambda made: made.update({("train", "01001", "5"): {}}), r"holds 1 of 4 frames .* \(first train/01001/5\)"),
+        (lambda made: made.pop(next(iter(made))), r"lacks 1 frames of its segments \(first train/01000/15"),
+        (other_pose, "has another pose than .*: the collection was made of other files"),
+        (lambda made: next(iter(made.values())).pop("pose"), "lacks the entry 'pose'"),
+        (lambda made: made.update(x=1), "'x' is no frame"),
+        (lambda made: made.clear(), "holds no frame"),
+        (lambda made: made.update(evil=Evil()), "is refused: .*print"),
+    ],
+)
+def test_collections_beside_the_folders(folder, capsys, damage, said):
+    made = collection(folder)
+    damage(made)
+    (folder / "data_dict_subset_B_train.pkl").write_bytes(pickle.dumps(made))
+    faults = check_openlane_v2(folder, progress=False).faults
+    assert "run" not in capsys.readouterr().out
+    if said is None:
+        assert faults == []
+    else:
+        (fault,) = faults
+        assert re.search(f"data_dict_subset_B_train.pkl.* {said}", fault)
 
 
 def test_a_folder_without_frames_is_refused(tmp_path):

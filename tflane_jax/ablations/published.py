@@ -79,6 +79,8 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         format_table(summary["rows"]),
         "",
     ]
+    if note := summary.get("note"):  # earlier summaries have none
+        lines += [*_wrapped(note), ""]
     for finding in summary["findings"]:
         lines += _wrapped(f"{finding}.", first="- ", rest="  ")
     quoted = summary["quoted"]

@@ -155,6 +155,9 @@ def _save_scores(table: PaperTable, results: Results, folder: Path, *, quick: bo
     meta = {"table": table.name, "protocol": results.protocol, "seeds": list(results.seeds), "quick": quick}
     path, _ = save_table(folder / "table", rows, meta | {"quoted": asdict(table.quoted)}, title=title)
     text, tex = path.read_text(encoding="utf-8"), latex_table(rows, caption=title)
+    if table.note:
+        text += f"\n{table.note}\n"
+        tex += f"\n{table.note}\n"
     if table.quoted.rows:
         paper = f"The paper's own numbers, not comparable with these: {table.quoted.source}"
         text += "\n" + format_table(table.quoted.rows, title=paper) + "\n"
@@ -201,6 +204,7 @@ def _save_summary(
             "quick": quick,
             "protocol": results.protocol,
             "declared": declared.sentence(),
+            "note": table.note,
             "seeds": list(results.seeds),
             "steps": sorted({job.config.training.steps for jobs in trained.values() for job in jobs}),
             "cores of a run": sorted({setting["cores"] for setting in threads}),

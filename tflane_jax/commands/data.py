@@ -80,15 +80,23 @@ def check(options: argparse.Namespace) -> int:
     if source.check is None:
         names = ", ".join(one.name for one in sources.SOURCES if one.check is not None)
         raise UserError(f"--format {source.name} is not read from a folder: choose one of {names}")
-    tracks = {} if options.tracks is None else {"tracks": options.tracks}
-    if tracks and not source.tracks:
+    wanted: dict[str, Any] = {} if options.tracks is None else {"tracks": options.tracks}
+    if wanted and not source.tracks:
         raise UserError("--tracks belongs to --format openlane-v2: other datasets hold their tracks themselves")
-    found = source.check(Path(options.root), **tracks)
+    if options.whole_images:
+        if not source.tracks:
+            raise UserError("--whole-images belongs to --format openlane-v2")
+        wanted["images"] = "whole"
+    found = source.check(Path(options.root), **wanted)
     print(format_table(found.rows, title=f"{options.root}: {found.format}"))
     if found.faults:
         print(f"\n{len(found.faults)} faults:", *(f"  - {fault}" for fault in found.faults[:_PRINTED_FAULTS]), sep="\n")
     if len(found.faults) > _PRINTED_FAULTS:
         print(f"  ... and {len(found.faults) - _PRINTED_FAULTS} more")
+    if found.skipped:
+        print(
+            f"\n{len(found.skipped)} skipped:", *(f"  - {text}" for text in found.skipped[:_PRINTED_FAULTS]), sep="\n"
+        )
     return 2 if found.faults else 0
 
 

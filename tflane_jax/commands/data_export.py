@@ -15,9 +15,11 @@ from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.base import DrivenDataset, Split
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_export import export_openlane_v2, time_offset
+from tflane_jax.datasets.openlane_sd_map import sd_records
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
 from tflane_jax.scene.logs import Log
+from tflane_jax.world.roads.sd_map import sd_lines
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
@@ -27,14 +29,24 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     tracks: Path | None = options.tracks
     driven = {} if tracks is None else _driven(chosen)
     datasets = {split: sources.open_dataset(source) for split, source in chosen.items()}
-    out = export_openlane_v2(datasets, options.out, images=options.images)
+    out = export_openlane_v2(datasets, options.out, images=options.images, sd_maps=_sd_maps(chosen))
     if tracks is not None:
         export_tracks(_drives(driven), tracks, partial(time_offset, "A"))
-    found = check_openlane_v2(out, tracks, progress=False)
+    found = check_openlane_v2(out, tracks, cameras="some", progress=False)
     print(format_table(found.rows, title=f"{out}: OpenLane-V2, subset {found.subset}"))
     if found.faults:
         raise UserError(f"what was written to {out} has faults: {found.faults[0]}")
     return 0
+
+
+def _sd_maps(chosen: Mapping[Split, Any]) -> dict[Split, dict[str, Any]]:
+    """Return the SD maps of the scenes of each split whose examples have one, where the source has logs."""
+    maps: dict[Split, dict[str, Any]] = {}
+    for split, source in chosen.items():
+        dataset, wanted = sources.make_dataset(source), getattr(source.example, "sd_map", None)
+        if wanted is not None and isinstance(dataset, DrivenDataset):
+            maps[split] = {log.name: sd_records(*sd_lines(log, wanted)) for log in dataset.drives()}
+    return maps
 
 
 def _driven(chosen: Mapping[Split, Any]) -> dict[Split, DrivenDataset]:

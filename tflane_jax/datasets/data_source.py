@@ -64,11 +64,13 @@ class FolderCheck:
         format: name of the format, for the table's title.
         rows: counts, for a table.
         faults: sentences, each naming a file or folder; empty for a sound folder.
+        skipped: files that were left out of the check, with the reason; no faults.
     """
 
     format: str
     rows: list[dict[str, Any]]
     faults: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,9 @@ import datetime
 import warnings
 import weakref
 
+import numpy as np
+from jaxtyping import Float
+
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.errors import UserError
@@ -104,22 +107,45 @@ def marker_observations(
             return simulate_detections(log, then, markers, simulation)
         return _detected(log, then, markers, config.pixels.native(cameras), config.pixels)
 
-    observed = observe(
+    return observations(
         detected(moment),
+        store,
+        config,
+        range_,
+        previous=None if before is None else detected(before),
+        now_from_previous=None if before is None else relative_pose(moment.global_from_ego, before.global_from_ego),
+    )
+
+
+def observations(
+    detected: Detected,
+    store: MarkerStore,
+    config: MarkerConfig,
+    range_: PerceptionRange,
+    *,
+    previous: Detected | None,
+    now_from_previous: Float[np.ndarray, "4 4"] | None,
+) -> MarkerObservations:
+    """Return detections with their lanes from the store, at the capacities of a configuration; see `observe`.
+
+    Warns (`TruncationWarning`) if more markers or lanes are in range than a capacity.
+    """
+    observed = observe(
+        detected,
         store,
         range_,
         markers=config.markers,
         lanes=config.lanes,
         points=config.points,
-        first_residual=simulation.first_residual,
-        previous=None if before is None else detected(before),
-        now_from_previous=None if before is None else relative_pose(moment.global_from_ego, before.global_from_ego),
+        first_residual=config.simulation.first_residual,
+        previous=previous,
+        now_from_previous=now_from_previous,
     )
     for name, dropped in (("markers", observed.markers_dropped), ("lanes", observed.lanes_dropped)):
         if dropped:
             warnings.warn(
                 f"more {name} in range than MarkerConfig.{name} = {getattr(config, name)}: the farthest are left out",
                 TruncationWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
     return observed.markers

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items
+from tflane_jax.files.fields import items, member
 from tflane_jax.files.openlane import (
     SEGMENT,
     FieldNames,
@@ -89,6 +89,15 @@ def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
         areas=areas,
         area_category=area_category,
     )
+
+
+def lane_ids(record: Any, names: FieldNames, where: str) -> list[str]:
+    """Return the ids of the lanes of an annotation; they are constant over a segment.
+
+    Raises UserError for a lane without one.
+    """
+    lanes = items(record, names.lanes, where)
+    return [str(member(lane, "id", f"{where}: {names.lanes}[{i}]")) for i, lane in enumerate(lanes)]
 
 
 def _binary(record: Any, field: str, shape: tuple[int, int], where: str) -> Bool[np.ndarray, "n m"]:

@@ -1,41 +1,44 @@
 """Check a folder of OpenLane-V2: counts of each split, and one sentence for each fault.
 
-Every frame's files are read as for training. Of images only existence, first and last bytes are checked; they are not
-decoded, so a whole subset takes minutes.
+Every frame's files are read as for training. Of images only header and last bytes are read unless they are wanted as a
+whole, so a subset takes minutes. Both subsets may share the folder: every segment is checked by its own.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
+from tflane_jax.datasets.openlane_check_cameras import CameraChecks, Images
+from tflane_jax.datasets.openlane_check_collections import check_collections
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
     FrameFile,
     SubsetName,
     frames_of,
     info_path,
-    list_frames,
     read_frame,
     source_logs,
 )
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json
+from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
 
 # Metres per second; a higher speed between two frames means damaged poses.
 _FASTEST = 70.0
-# First and last bytes of intact images.
-_MARKS = {".jpg": (b"\xff\xd8", b"\xff\xd9"), ".png": (b"\x89PNG", b"IEND\xaeB`\x82")}
+# Frames of a segment that are read to find its subset.
+_TRIED = 3
+_FRAME_FILE = re.compile(r"(\d+)(-ls)?\.json")
 _WITH_LOG, _WITH_TRAFFIC = "with log", "with traffic"
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas")
 
@@ -45,60 +48,102 @@ class OpenLaneCheck:
     """Result of a check.
 
     Attributes:
-        subset: A or B, by the cameras of the first frame.
-        rows: counts of each split, for a table.
+        subset: "A", "B" or "A and B", by the cameras of each segment's first frame.
+        rows: counts of each split, and of each subset where there are both, for a table.
         faults: sentences, each naming a file.
+        skipped: files that are none of the dataset's, and what was not read.
     """
 
-    subset: SubsetName
+    subset: str
     rows: list[dict[str, Any]]
     faults: list[str]
+    skipped: list[str]
 
 
-def check_openlane_v2(root: Path, tracks: Path | None = None, *, progress: bool = True) -> OpenLaneCheck:
-    """Check every split that split files or folders contain.
+def check_openlane_v2(
+    root: Path,
+    tracks: Path | None = None,
+    *,
+    images: Images = "ends",
+    cameras: Literal["all", "some"] = "all",
+    progress: bool = True,
+) -> OpenLaneCheck:
+    """Check every split that split files or folders contain, and the collections beside them.
 
     Args:
         root: of the dataset.
         tracks: folder of the logs of which the segments are parts. With it, the rows say how many frames have such a
             log, and in how many of them there is any road user; a log that does not fit its frames is a fault.
+        images: how far images are read, see `openlane_check_cameras.Images`.
+        cameras: whether a frame without one of its subset's cameras is a fault.
         progress: show a bar.
 
     Raises UserError where there is no frame at all, or `tracks` holds no log.
     """
-    root, faults = Path(root), []
-    named, on_disk = _named_frames(root, faults), _frames_on_disk(root)
+    root, faults, skipped = Path(root), [], []
+    named, on_disk = _named_frames(root, faults), _frames_on_disk(root, skipped)
     if not any(on_disk.values()):
         raise UserError(f"{root} holds no <split>/<segment>/info/<timestamp>.json: is it OpenLane-V2's folder?")
-    subset = _subset(root, next(keys[0] for keys in on_disk.values() if keys))
+    subsets = _subsets(root, on_disk)
+    present: list[SubsetName] = sorted(set(subsets.values()))
     rows = []
     for split in SPLITS:
-        keys = sorted({*named[split], *on_disk[split]}, key=lambda key: (key.segment, int(key.timestamp)))
-        if not keys:
+        every = sorted({*named[split], *on_disk[split]}, key=lambda key: (key.segment, int(key.timestamp)))
+        for subset in present:
+            keys = [key for key in every if subsets.get((key.split, key.segment), present[0]) == subset]
+            if not keys:
+                continue
+            found = len(faults)
+            absent = set(named[split]).intersection(keys) - set(on_disk[split])
+            if absent:
+                faults.append(
+                    f"{root}: {len(absent)} of {len(keys)} {split} frames that split files name are missing (first "
+                    f"{min(absent)})"
+                )
+            there = [key for key in keys if key not in absent]
+            logs = None if tracks is None else _logs(root, there, subset, tracks, alone=len(present) == 1)
+            counts = _check_frames(root, there, subset, logs, CameraChecks(images), cameras, faults, progress)
+            counts["segments"] = len({key.segment for key in keys})
+            content = counts if tracks is None else _with_share(counts)
+            both = {"subset": subset} if len(present) > 1 else {}
+            rows.append({"split": split, **both, **content, "faults": len(faults) - found})
+    of_collections, not_read = check_collections(root, [key for keys in on_disk.values() for key in keys])
+    return OpenLaneCheck(" and ".join(present), rows, [*faults, *of_collections], [*skipped, *not_read])
+
+
+def _check_frames(
+    root: Path,
+    keys: list[FrameKey],
+    subset: SubsetName,
+    logs: SourceTracks | None,
+    images: CameraChecks,
+    cameras: Literal["all", "some"],
+    faults: list[str],
+    progress: bool,
+) -> Counter[str]:
+    """Check frames that are there, in the order of time, and return what they hold."""
+    counts: Counter[str] = Counter(dict.fromkeys((*_COUNTS, _WITH_LOG, _WITH_TRAFFIC), 0))
+    if logs is None:
+        del counts[_WITH_LOG], counts[_WITH_TRAFFIC]
+    before = None
+    lacking: dict[tuple[str, str], list[FrameKey]] = {}
+    for key in tqdm(keys, f"checking {keys[0].split if keys else ''}", unit="frame", disable=not progress):
+        frame = _check_frame(root, key, subset, counts, faults, images)
+        faults += _check_motion(before, key, frame, subset)
+        if frame is None:
             continue
-        absent = set(named[split]) - set(on_disk[split])
-        if absent:
-            faults.append(
-                f"{root}: {len(absent)} of {len(keys)} {split} frames that split files name are missing (first "
-                f"{min(absent)})"
-            )
-        before, found = None, len(faults)
-        counts: Counter[str] = Counter(dict.fromkeys(_COUNTS, 0))
-        if tracks is not None:
-            counts |= {_WITH_LOG: 0, _WITH_TRAFFIC: 0}
-        logs = None if tracks is None else _logs(root, [key for key in keys if key not in absent], subset, tracks)
-        for key in tqdm(keys, f"checking {split}", unit="frame", disable=not progress):
-            if key not in absent:
-                frame = _check_frame(root, key, subset, counts, faults)
-                faults += _check_motion(before, key, frame, subset)
-                if logs is not None and frame is not None:
-                    # A log that cannot be read is one fault, not one of each of its frames.
-                    faults += [fault for fault in _check_tracks(logs, key, frame, counts) if fault not in faults]
-                before = (key, frame) if frame is not None else before
-        counts["segments"] = len({key.segment for key in keys})
-        content = counts if logs is None else _with_share(counts)
-        rows.append({"split": split, **content, "faults": len(faults) - found + bool(absent)})
-    return OpenLaneCheck(subset, rows, faults)
+        if logs is not None:
+            # A log that cannot be read is one fault, not one of each of its frames.
+            faults += [fault for fault in _check_tracks(logs, key, frame, counts) if fault not in faults]
+        for name, camera in zip(SUBSETS[subset].cameras, frame.cameras, strict=True):
+            if camera is None and cameras == "all":
+                lacking.setdefault((key.scene, name), []).append(key)
+        before = (key, frame)
+    faults += [
+        f"{root / scene}: {len(of)} frames have no camera {name} (first {of[0]})"
+        for (scene, name), of in lacking.items()
+    ]
+    return counts
 
 
 def _named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
@@ -122,25 +167,57 @@ def _named_frames(root: Path, faults: list[str]) -> dict[Split, list[FrameKey]]:
     return named
 
 
-def _frames_on_disk(root: Path) -> dict[Split, list[FrameKey]]:
-    present = [split for split in SPLITS if any((root / split).glob("*/info/*.json"))]
-    return {split: list_frames(root, split, "A", "folders") if split in present else [] for split in SPLITS}
+def _frames_on_disk(root: Path, skipped: list[str]) -> dict[Split, list[FrameKey]]:
+    """Return the frames in the folders; files that are no frames are skipped and named."""
+    found: dict[Split, list[FrameKey]] = {}
+    for split in SPLITS:
+        keys = set()
+        for path in (root / split).glob("*/info/*"):
+            name = _FRAME_FILE.fullmatch(path.name)
+            if name is None:
+                skipped.append(f"{path} is no frame's file (<timestamp>.json or <timestamp>-ls.json)")
+            else:
+                keys.add(FrameKey(split, path.parent.parent.name, name[1]))
+        segments = (root / split).glob("*")
+        skipped += [f"{path} is no segment: it has no info folder" for path in segments if not (path / "info").is_dir()]
+        found[split] = sorted(keys, key=lambda key: (key.segment, int(key.timestamp)))
+    skipped.sort()
+    return found
 
 
-def _subset(root: Path, key: FrameKey) -> SubsetName:
-    """Return the subset whose cameras the frame has; A if it has none."""
-    for name in SUBSETS:
-        for suffix in (CENTERLINE.suffix, SEGMENT.suffix):
-            try:
-                if any(read_frame(root, key, name, suffix).cameras):
-                    return name
-            except UserError:
-                continue
-    return "A"
+def _subsets(root: Path, on_disk: Mapping[Split, list[FrameKey]]) -> dict[tuple[str, str], SubsetName]:
+    """Return the subset of each (split, segment), by the cameras of its first readable frames; else that of others."""
+    found: dict[tuple[str, str], SubsetName | None] = {}
+    tried: Counter[tuple[str, str]] = Counter()
+    for key in (key for keys in on_disk.values() for key in keys):
+        segment = key.split, key.segment
+        if found.get(segment) is None and tried[segment] < _TRIED:
+            tried[segment] += 1
+            found[segment] = _subset(root, key)
+    known: list[SubsetName] = [subset for subset in found.values() if subset is not None]
+    other = known[0] if known else "A"
+    return {segment: other if subset is None else subset for segment, subset in found.items()}
+
+
+def _subset(root: Path, key: FrameKey) -> SubsetName | None:
+    """Return the subset most of whose cameras the frame has; None if it can be read as neither."""
+    for suffix in (CENTERLINE.suffix, SEGMENT.suffix):
+        try:
+            sensors = member(load_json(info_path(root, key, suffix)), "sensor", "")
+        except UserError:
+            continue
+        if isinstance(sensors, Mapping):
+            shared: dict[SubsetName, int] = {
+                name: len({*subset.cameras} & {*map(str, sensors)}) for name, subset in SUBSETS.items()
+            }
+            best: SubsetName = "A" if shared["A"] >= shared["B"] else "B"
+            if shared[best]:
+                return best
+    return None
 
 
 def _check_frame(
-    root: Path, key: FrameKey, subset: SubsetName, counts: Counter[str], faults: list[str]
+    root: Path, key: FrameKey, subset: SubsetName, counts: Counter[str], faults: list[str], images: CameraChecks
 ) -> FrameFile | None:
     """Check the files of one frame and return the first readable one."""
     first: FrameFile | None = None
@@ -170,9 +247,9 @@ def _check_frame(
             elements = len(found.boxes)
         if first is None:
             first = frame
-            images = list(_check_cameras(frame))
-            counts["images"] += sum(camera is not None for camera in frame.cameras) - len(images)
-            faults += images
+            intact, of_cameras = images.check(frame)
+            counts["images"] += intact
+            faults += of_cameras
         elif not np.allclose(first.global_from_ego, frame.global_from_ego):
             faults.append(f"{path} has another pose than its centerline twin")
     return first
@@ -184,35 +261,6 @@ def _check_annotation(found: Annotation) -> Iterator[str]:
     lights = np.isin(found.attribute, (1, 2, 3))
     if (lights & (found.element_category != 1)).any() or ((found.attribute > 3) & (found.element_category != 2)).any():
         yield "a traffic element's attribute does not fit its category (1 to 3 are of lights, 4 to 12 of signs)"
-
-
-def _check_cameras(frame: FrameFile) -> Iterator[str]:
-    front = frame.cameras[0]
-    # The third column is the optical axis in the ego frame.
-    if front is not None and front.ego_from_camera[0, 2] < 0.5:
-        yield (
-            f"{frame.path}: {front.name} does not look ahead: is its extrinsic from the ego frame to the camera, "
-            "instead of from the camera to the ego frame?"
-        )
-    for camera in frame.cameras:
-        if camera is not None and (fault := _check_image(camera.image)) is not None:
-            yield f"{camera.image} {fault}"
-
-
-def _check_image(path: Path) -> str | None:
-    """Return the fault of an image file, or None."""
-    try:
-        with open(path, "rb") as file:
-            start = file.read(4)
-            size = file.seek(0, 2)
-            file.seek(max(size - 64, 0))
-            end = file.read()
-    except OSError as error:
-        return f"cannot be read ({error.strerror})"
-    head, tail = _MARKS.get(path.suffix.lower(), (b"", b""))
-    if not start.startswith(head) or tail not in end:
-        return "is damaged or cut short"
-    return None
 
 
 def _check_motion(
@@ -230,8 +278,11 @@ def _check_motion(
         )
 
 
-def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path) -> SourceTracks:
-    """Return the logs of a split; the files of a segment that do not name theirs have none."""
+def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path, *, alone: bool) -> SourceTracks | None:
+    """Return the logs of a split; the files of a segment that do not name theirs have none.
+
+    `tracks` may hold those of one subset; None for the other, unless the subset stands alone.
+    """
     named: dict[tuple[str, str], str] = {}
     for key in keys:
         suffix = CENTERLINE.suffix if info_path(root, key, CENTERLINE.suffix).is_file() else SEGMENT.suffix
@@ -240,7 +291,12 @@ def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path) ->
                 named |= source_logs(root, [key], suffix)
             except UserError:  # a fault of the file, which its own check reports
                 named[key.split, key.segment] = ""
-    return SourceTracks(tracks, subset, named)
+    try:
+        return SourceTracks(tracks, subset, named)
+    except UserError:
+        if alone:
+            raise
+        return None
 
 
 def _check_tracks(logs: SourceTracks, key: FrameKey, frame: FrameFile, counts: Counter[str]) -> Iterator[str]:

@@ -19,7 +19,16 @@ from tflane_jax.files.images import read_image
 from tflane_jax.files.openlane import DENSE_POINTS
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample_lines
-from tflane_jax.scene import Areas, CameraViews, Example, LaneGraph, TrafficElements, TrafficFlow
+from tflane_jax.scene import (
+    Areas,
+    CameraViews,
+    Example,
+    LaneGraph,
+    MarkerObservations,
+    SdMap,
+    TrafficElements,
+    TrafficFlow,
+)
 
 
 def blank(
@@ -40,8 +49,10 @@ def blank(
         bev=None,
         hidden=None,
         traffic_flow=TrafficFlow.empty(config.tracks, config.history) if traffic else None,
-        markers=None,
-        sd_map=None,
+        markers=None
+        if config.markers is None
+        else MarkerObservations.empty(config.markers.markers, config.markers.lanes, config.markers.points),
+        sd_map=None if config.sd_map is None else SdMap.empty(config.sd_map.lines, config.sd_map.points),
         lanes=lanes,
         segments=segments,
         areas=Areas.empty(config.areas, config.area_points),

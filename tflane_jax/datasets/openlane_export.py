@@ -18,6 +18,7 @@ from tqdm import tqdm
 from tflane_jax.datasets.base import Dataset, FrameInfo, Split
 from tflane_jax.datasets.identities import Identities, line_distances
 from tflane_jax.datasets.openlane_frames import SUBSETS, SubsetName, info_path
+from tflane_jax.datasets.openlane_sd_map import FILE as SD_MAP_FILE
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import replacing
 from tflane_jax.files.images import opencv
@@ -37,7 +38,12 @@ _ON_LANE = 0.5
 
 
 def export_openlane_v2(
-    datasets: Mapping[Split, Dataset], out: Path, *, images: ImageFormat = "jpg", progress: bool = True
+    datasets: Mapping[Split, Dataset],
+    out: Path,
+    *,
+    images: ImageFormat = "jpg",
+    sd_maps: Mapping[Split, Mapping[str, Any]] | None = None,
+    progress: bool = True,
 ) -> Path:
     """Write one dataset per split as a folder of OpenLane-V2, which appears whole or not at all.
 
@@ -48,6 +54,7 @@ def export_openlane_v2(
         datasets: their examples have cameras; frames are sorted by scene and time.
         out: folder that does not exist yet or is empty.
         images: "jpg" as official, "png" without loss.
+        sd_maps: the content of each scene's `sdmap.json`, by split and name of the scene, see `openlane_sd_map`.
         progress: show a bar with rate and time left.
 
     Raises:
@@ -61,7 +68,9 @@ def export_openlane_v2(
         subset, content = None, {}
         for split, dataset in datasets.items():
             subset = _subset_of(dataset, subset)
-            content[split] = _export_split(dataset, writing, split, subset, images, progress)
+            content[split] = _export_split(
+                dataset, writing, split, subset, images, (sd_maps or {}).get(split, {}), progress
+            )
         if subset is None:
             raise UserError("nothing to export: name at least one split")
         _write_json(writing / SUBSETS[subset].data_dict, content)
@@ -91,7 +100,13 @@ def _subset_of(dataset: Dataset, before: SubsetName | None) -> SubsetName:
 
 
 def _export_split(
-    dataset: Dataset, root: Path, split: Split, subset: SubsetName, images: ImageFormat, progress: bool
+    dataset: Dataset,
+    root: Path,
+    split: Split,
+    subset: SubsetName,
+    images: ImageFormat,
+    sd_maps: Mapping[str, Any],
+    progress: bool,
 ) -> dict[str, list[str]]:
     """Write the frames of a split and return its part of the split file."""
     segments: dict[str, list[str]] = {}
@@ -102,6 +117,8 @@ def _export_split(
         if info.scene not in names:
             names[info.scene] = f"{SUBSETS[subset].first_segment[split] + len(names):05d}"
             ids = Identities()
+            if info.scene in sd_maps:
+                _write_json(root / split / names[info.scene] / SD_MAP_FILE, sd_maps[info.scene])
         offset = time_offset(subset, info.timestamp_ns)
         time = (info.timestamp_ns + offset) // SUBSETS[subset].tick_ns
         key = FrameKey(split, names[info.scene], str(time))

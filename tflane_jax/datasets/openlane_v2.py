@@ -2,7 +2,8 @@
 
 Not in the files: the visibility of lanes (set to 1), the 3-D position of traffic elements (set to 0) and the
 boundaries of merged centerlines (left and right are the centerline itself). Examples have no bird's-eye-view evidence.
-Of the priors they have traffic flow, where the logs are at hand of which the segments are parts (`openlane_tracks`).
+Of the priors they have traffic flow, where the logs are at hand of which the segments are parts (`openlane_tracks`),
+virtual markers (`openlane_markers`) and the official SD map (`openlane_sd_map`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +23,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_check import check_openlane_v2
+from tflane_jax.datasets.openlane_check_cameras import Images
 from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
 from tflane_jax.datasets.openlane_frames import (
     SUBSETS,
@@ -33,6 +36,8 @@ from tflane_jax.datasets.openlane_frames import (
     subset_of,
     without_map_changes,
 )
+from tflane_jax.datasets.openlane_markers import BoardsConfig, DriveFrame, SegmentBoards, drive_frame
+from tflane_jax.datasets.openlane_sd_map import SegmentSdMaps
 from tflane_jax.datasets.openlane_tracks import SourceTracks, WithoutTracks
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
@@ -70,6 +75,8 @@ class OpenLaneV2Config:
             the traffic flow, as many frames and at the rate that `example.history` and `example.history_hz` say. None:
             no traffic flow.
         without_tracks: what becomes of frames whose log is not there, see `openlane_tracks.WithoutTracks`.
+        boards: virtual markers, where `example.markers` asks for the prior; the official test split, which has no
+            lanes, gets none. `example.sd_map` asks for the official SD map.
     """
 
     root: Path
@@ -83,6 +90,7 @@ class OpenLaneV2Config:
     map_changes: Literal["keep", "drop"] = "keep"
     tracks: Path | None = None
     without_tracks: WithoutTracks = "refuse"
+    boards: BoardsConfig = BoardsConfig()
 
 
 class OpenLaneV2Dataset:
@@ -112,6 +120,14 @@ class OpenLaneV2Dataset:
             self._tracks = SourceTracks(config.tracks, config.subset, logs)
             self.keys = self._tracks.known(self.keys, config.without_tracks)
         self._poses: dict[int, np.ndarray] = {}
+        self._sd_maps = SegmentSdMaps(self.root)
+        self._first: dict[str, int] = {}
+        for index, key in enumerate(self.keys):
+            self._first.setdefault(key.scene, index)
+        wanted = config.example.markers
+        self._boards = (
+            None if wanted is None else SegmentBoards(config.boards, wanted, config.example.range, self._segment)
+        )
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -140,6 +156,10 @@ class OpenLaneV2Dataset:
         return replace(
             example,
             traffic_flow=None if self._tracks is None else self._tracks.flow(key, pose, config),
+            markers=None
+            if self._boards is None
+            else self._boards.observations(key.scene, index - self._first[key.scene]),
+            sd_map=None if config.sd_map is None else self._sd_maps.around(key, pose, config.sd_map),
             lanes=lanes,
             segments=segments,
             areas=areas,
@@ -154,8 +174,14 @@ class OpenLaneV2Dataset:
     def info(self, index: int) -> FrameInfo:
         """Return segment, time and pose of one frame."""
         key = self.keys[self._checked(index)]
-        time = int(key.timestamp) * SUBSETS[self.config.subset].tick_ns
-        return FrameInfo("openlane_v2", key.scene, time, self._pose(index))
+        return FrameInfo("openlane_v2", key.scene, self._time(index), self._pose(index))
+
+    def scene(self, index: int) -> str:
+        """Return the segment of one frame; reads no file."""
+        return self.keys[self._checked(index)].scene
+
+    def _time(self, index: int) -> int:
+        return int(self.keys[index].timestamp) * SUBSETS[self.config.subset].tick_ns
 
     @property
     def _names(self):
@@ -181,21 +207,42 @@ class OpenLaneV2Dataset:
         return self._poses[index] if index in self._poses else self._files(index)[0].global_from_ego
 
     @cached_property
-    def _fits(self) -> tuple[ImageFit | None, ...]:
-        """Scaling and cropping of each camera's images, from the image size in the first frame that has the camera."""
-        if self.config.image is None:
-            return (None,) * len(SUBSETS[self.config.subset].cameras)
-        fits: list[ImageFit | None] = [None] * len(SUBSETS[self.config.subset].cameras)
+    def _sizes(self) -> tuple[tuple[int, int] | None, ...]:
+        """Width and height of each camera's images, from the first frame that has the camera.
+
+        Where images are not read, they may be missing and are taken to have the official sizes.
+        """
+        official = SUBSETS[self.config.subset].sizes
+        sizes: list[tuple[int, int] | None] = [None] * len(official)
         for index in range(len(self)):
             for place, camera in enumerate(self._files(index)[0].cameras):
-                if camera is not None and fits[place] is None:
-                    height, width = read_image(camera.image).shape[:2]
-                    fits[place] = fit_image(width, height, self.config.image, front=place == 0)
-            if None not in fits:
+                if camera is not None and sizes[place] is None:
+                    there = self.config.image is not None or camera.image.is_file()
+                    height, width = read_image(camera.image).shape[:2] if there else official[place][::-1]
+                    sizes[place] = width, height
+            if None not in sizes:
                 break
-        if not any(fits):
+        if not any(sizes):
             raise UserError(f"{self.root}: no frame of {self.name} has a camera")
-        return tuple(fits)
+        return tuple(sizes)
+
+    @cached_property
+    def _fits(self) -> tuple[ImageFit | None, ...]:
+        """Scaling and cropping of each camera's images."""
+        image = self.config.image
+        if image is None:
+            return (None,) * len(SUBSETS[self.config.subset].cameras)
+        return tuple(
+            None if size is None else fit_image(*size, image, front=place == 0)
+            for place, size in enumerate(self._sizes)
+        )
+
+    def _segment(self, scene: str) -> list[DriveFrame]:
+        """Return the frames of a segment as boards need them."""
+        rows = range(self._first[scene], len(self))
+        frames = takewhile(lambda index: self.scene(index) == scene, rows)
+        names = self._names[0]
+        return [drive_frame(self._files(index)[0], names, self._time(index), self._sizes) for index in frames]
 
 
 def nominal_example(config: OpenLaneV2Config) -> Example:
@@ -225,6 +272,7 @@ class OpenLaneV2Data:
         map_changes: whether the training split keeps or drops logs whose streets differ from their map, as
             `OpenLaneV2Config.map_changes`.
         tracks, without_tracks: traffic flow, see `OpenLaneV2Config`.
+        boards: virtual markers, see `OpenLaneV2Config`.
     """
 
     root: Path
@@ -241,6 +289,7 @@ class OpenLaneV2Data:
     map_changes: Literal["keep", "drop"] = "keep"
     tracks: Path | None = None
     without_tracks: WithoutTracks = "refuse"
+    boards: BoardsConfig = BoardsConfig()
 
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""
@@ -256,6 +305,7 @@ class OpenLaneV2Data:
             self.map_changes if split == "train" else "keep",
             self.tracks,
             self.without_tracks,
+            self.boards,
         )
 
 
@@ -276,9 +326,9 @@ def _choose(choice: Choice) -> OpenLaneV2Config:
     return OpenLaneV2Config(choice.root, choice.split, subset, image=image, example=choice.configured.example)
 
 
-def _check(root: Path, tracks: Path | None = None) -> FolderCheck:
-    found = check_openlane_v2(root, tracks)
-    return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults)
+def _check(root: Path, tracks: Path | None = None, images: Images = "ends") -> FolderCheck:
+    found = check_openlane_v2(root, tracks, images=images)
+    return FolderCheck(f"OpenLane-V2, subset {found.subset}", found.rows, found.faults, found.skipped)
 
 
 SOURCE = DataSource(

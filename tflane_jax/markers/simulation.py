@@ -6,6 +6,7 @@ separate random stream for each log, moment and marker, so they do not depend on
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -16,11 +17,12 @@ from tflane_jax.geometry import pose_matrix, pose_yaw, relative_pose, transform_
 from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, PositiveOrZero, at_least, within
 from tflane_jax.markers.observe import frame_before
 from tflane_jax.markers.pixels import PixelConfig
-from tflane_jax.markers.visibility import seen_fraction
+from tflane_jax.markers.visibility import in_images, seen_fraction
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraMount
 from tflane_jax.world.cameras.stage import static_boxes
+from tflane_jax.world.render.camera import FrontCamera
 
 ROOT = 20_251_123
 
@@ -133,14 +135,25 @@ class SimulatedMarkers(NamedTuple):
 
 
 def simulate_detections(
-    log: Log, moment: KeyFrame, markers: PlacedMarkers, config: MarkerSimulationConfig
+    log: Log,
+    moment: KeyFrame,
+    markers: PlacedMarkers,
+    config: MarkerSimulationConfig,
+    *,
+    cameras: Sequence[FrontCamera] | None = None,
 ) -> SimulatedMarkers:
     """Return which markers are detected at a moment of a log, and their noisy poses.
 
     The same log seed, track frame and marker id give the same bits, whatever else is simulated.
+
+    Args:
+        log, moment, markers, config: see above.
+        cameras: calibrated cameras of a real frame, one of which must see the whole square; None: `config.cameras`.
     """
     true = relative_pose(moment.global_from_ego, markers.pose)
     seen = visible(true, config)
+    if cameras is not None:
+        seen[seen] = in_images(true[seen], markers.size, cameras)
     if config.cameras is not None or config.occlusion == "bodies":
         mounts = config.cameras or ARGOVERSE2_RING
         bodies = static_boxes(log) if config.occlusion == "bodies" else None

@@ -66,6 +66,14 @@ def in_image(ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, camera: F
     return inside
 
 
+def in_images(
+    ego_from_marker: Float[np.ndarray, "m 4 4"], size: float, cameras: Sequence[FrontCamera]
+) -> Bool[np.ndarray, " m"]:
+    """Return which squares lie as a whole in an image of one of the cameras."""
+    nowhere = np.zeros(len(ego_from_marker), bool)
+    return np.any([nowhere, *(in_image(ego_from_marker, size, camera) for camera in cameras)], axis=0)
+
+
 def hidden_from(
     eye: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 3"], boxes: Float[np.ndarray, "b 7"]
 ) -> Bool[np.ndarray, " n"]:

@@ -74,6 +74,11 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         """Whether the gradient of the loss has loops around the model, see `training.loop_convolutions`."""
         return False
 
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """Paths of modules that are never trained, and so need weights to start from."""
+        return ()
+
     def init(self, key: jax.Array, example: ExampleT) -> Params:
         """Return initial parameters; only the shapes of `example` are used."""
         raise NotImplementedError

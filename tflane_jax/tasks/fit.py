@@ -61,6 +61,15 @@ def _check_elements(model: HostConfig, example: Example) -> None:
         )
 
 
+def frozen_modules(model: HostConfig) -> tuple[str, ...]:
+    """Return the paths of the parts of the backbone that are not trained: the stem, then stages (their first block)."""
+    encoder = model.encoder
+    if not isinstance(encoder, CameraEncoderConfig):
+        return ()
+    parts = ("conv1", *(f"layer{stage + 1}_0" for stage in range(len(encoder.images.backbone.blocks))))
+    return tuple(f"encoder/images/backbone/{part}" for part in parts[: encoder.images.frozen_stages])
+
+
 def reads_traffic(model: HostConfig) -> bool:
     """Return whether the host reads traffic flow; the matched control, which reads no instances, does not."""
     traffic = model.priors.traffic_flow

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 import jax
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -34,10 +35,10 @@ from tflane_jax.models.host import HostConfig, HostMemory
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.models.priors import ByPrior, observe, observe_clip
 from tflane_jax.models.toponet import TopoNetConfig
-from tflane_jax.scene import Example, Prediction, shapes_of
+from tflane_jax.scene import Example, Prediction, shapes_of, stack_examples
 from tflane_jax.tasks import score_names
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
-from tflane_jax.tasks.fit import check_fit, check_settings_fit, reads_traffic
+from tflane_jax.tasks.fit import check_fit, check_settings_fit, frozen_modules, reads_traffic
 from tflane_jax.tasks.lane_pictures import draw_differences, draw_examples, draw_hidden_lanes
 
 T = TypeVar("T")
@@ -81,6 +82,11 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def loops(self) -> bool:
         """Whether the frames of a clip pass through the model in a loop."""
         return self.clip > 1 and self.time == "scan" and self.start().bev is not None
+
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """Frozen stages of the image encoder's backbone."""
+        return frozen_modules(self.model)
 
     def init(self, key: jax.Array, example: Example) -> Params:
         """Return initial parameters; only the shapes of `example`, or of a clip, are used."""
@@ -262,7 +268,10 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
 
 
 def _augmented(config: PhotometricConfig, example: Example, key: tuple[int, int, int]) -> Example:
-    return augment_example(example, config, key)
+    if np.ndim(example.has_previous) == 0:
+        return augment_example(example, config, key)
+    frames = [jax.tree.map(lambda leaf, i=i: leaf[i], example) for i in range(len(example.has_previous))]
+    return stack_examples([augment_example(frame, config, (*key, i)) for i, frame in enumerate(frames)])
 
 
 def _frames(clips: T) -> T:

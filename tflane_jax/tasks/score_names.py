@@ -91,6 +91,8 @@ def score_names(model: HostConfig, example: ExampleConfig, config: EvaluationCon
         names |= {f"{group}/{name}" for group in metrics.compute() for name in ("AE_type", "AE_dist")}
     if example.map_lines is not None and example.map_lines.centerlines == "include":
         names |= {name.replace("/AP_boundary", "/AP_centerline") for name in names if name.startswith("lines")}
+    if "centerlines" in model.predicts:  # without lanes, v1.0 is not defined
+        names |= {f"{group}/TOP_ll_{version}" for group in ("all", *groups) for version in config.versions[1:]}
     if model.elements is not None:
         attributes = ["DET_t", *(f"DET_t@{i}" for i in range(ATTRIBUTES))]
         if "centerlines" in model.predicts:

@@ -20,7 +20,7 @@ from tflane_jax.training.state import TrainState, per_seed
 
 
 def starting_params(
-    reference: str, states: Sequence[TrainState], seeds: Sequence[int], *, partly: bool
+    reference: str, states: Sequence[TrainState], seeds: Sequence[int], *, partly: bool, frozen: Sequence[str] = ()
 ) -> list[Params]:
     """Return the parameters that each seed starts from: the averaged ones of a run's best checkpoint.
 
@@ -31,13 +31,14 @@ def starting_params(
         states: fresh, of each seed.
         seeds: of the run.
         partly: keep fresh parameters where the run's model has none, and ignore those that only that model has.
+        frozen: paths of modules that are not trained, which the run's model must have.
 
     Raises:
         UserError: no such run, or a run of another model; with `partly`, a model without common parameters or with
-            a parameter of another shape.
+            a parameter of another shape, or without a frozen module.
     """
     return [
-        _params_of_run(folder, fresh.params, partly=partly)
+        _params_of_run(folder, fresh.params, partly=partly, frozen=frozen)
         for folder, fresh in zip(_folders(reference, seeds), states, strict=True)
     ]
 
@@ -72,7 +73,7 @@ def _starting_checkpoint(folder: Path) -> tuple[Checkpoints, int, list[int]]:
     return checkpoints, checkpoints.find("last") if step is None else step, settings["seeds"]
 
 
-def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
+def _params_of_run(folder: Path, fresh: Params, *, partly: bool, frozen: Sequence[str]) -> Params:
     checkpoints, step, seeds = _starting_checkpoint(folder)
     params = checkpoints.params(step)
     saved, wanted = (_flat(tree) for tree in (per_seed(params, seeds)[0], fresh))
@@ -91,6 +92,11 @@ def _params_of_run(folder: Path, fresh: Params, *, partly: bool) -> Params:
         )
     if len(added) == len(wanted):
         raise UserError(f"training.init_from: {folder} holds another model, with no parameter of this one")
+    for module in frozen:
+        if any(name.startswith(f"{module}/") for name in added):
+            raise UserError(
+                f"training.init_from: {folder} has no {module}, which this configuration freezes: it would stay random"
+            )
     for names, what in ((added, "start afresh"), (dropped, "are left out")):
         if names:
             tqdm.write(f"from {folder}: {_modules(names)} {what}", file=sys.stderr)

@@ -131,6 +131,7 @@ def train(
     prepare: Prepare | None = None,
     evaluate: Evaluate | None = None,
     draw: Draw | None = None,
+    frozen: Sequence[str] = (),
     progress: bool = True,
 ) -> TrainingResult:
     """Train a task and leave everything about the run in `folder`.
@@ -147,6 +148,7 @@ def train(
         start: see `run_folder.claimed`.
         prepare: augments every example, see `datasets.batches`.
         evaluate, draw: called at every evaluation.
+        frozen: paths of modules that `init_from` must have, see `starting_params`.
         progress: show a bar with rate and time left.
 
     Raises:
@@ -197,7 +199,7 @@ def train(
         elif (origin := config.init_from) is not None:
             fresh = states
             given = arrays_from_first(
-                lambda: starting_params(origin, fresh, config.seeds, partly=config.init_partly),
+                lambda: starting_params(origin, fresh, config.seeds, partly=config.init_partly, frozen=frozen),
                 [state.params for state in fresh],
             )
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]

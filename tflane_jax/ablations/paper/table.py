@@ -58,6 +58,7 @@ class PaperTable:
         steps: updates of every run; None for those of the configurations.
         hosts: models that rows start from. They are trained first and are no rows.
         minutes: what a run takes on one core of the machine of docs/benchmarks.md, for estimates.
+        note: a sentence of the table's text, such as why a column of the paper is missing.
     """
 
     name: str
@@ -73,6 +74,7 @@ class PaperTable:
     steps: int | None = None
     hosts: tuple[TableRow, ...] = ()
     minutes: float = 6.0
+    note: str = ""
 
     @property
     def declaration(self) -> Declaration:

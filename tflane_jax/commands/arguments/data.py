@@ -58,6 +58,11 @@ def data(commands) -> None:
         type=Path,
         help="folder of the logs of which OpenLane-V2's segments are parts: count and check the traffic flow, too",
     )
+    check.add_argument(
+        "--whole-images",
+        action="store_true",
+        help="read OpenLane-V2's images as a whole, not only header and end: finds damage within a file, takes hours",
+    )
     export = command(
         inner,
         "export",

@@ -64,21 +64,12 @@ def make_sd_map(log: Log, keyframe: int, config: SdMapConfig) -> tuple[SdMap, in
     Raises:
         UserError: the log's map has no roads.
     """
-    if not log.map.roads:
-        raise UserError(
-            f"{log.source} {log.name} knows lanes but no roads, of which an SD map could be made: leave sd_map of "
-            "ExampleConfig None, or read an SD map with tflane_jax.datasets.geojson"
-        )
     # A map of roads is flat; so is where the vehicle believes it is.
     moment = (log if log.relief is None else log.relief.level).keyframes[keyframe]
     seconds = (moment.timestamp_ns - int(log.timestamps_ns[0])) * 1e-9
-    rings = log.map.crossings if config.crossings == "include" else ()
-    lines = [simplify(road[:, :2], config.tolerance) for road in log.map.roads]
-    lines += [crossing_line(ring[:, :2]) for ring in rings]
-    sizes = np.cumsum([len(line) for line in lines])[:-1]
-    points = np.concatenate(lines)
-    points = points + config.survey * survey_error(points, log.seed)
-    category = [SdCategory.ROAD] * len(log.map.roads) + [SdCategory.CROSSWALK] * len(rings)
+    surveyed, category = sd_lines(log, config)
+    sizes = np.cumsum([len(line) for line in surveyed])[:-1]
+    points = np.concatenate(surveyed)
     error = gnss_error(log.seed, seconds, config)
     zero = np.zeros(())
     believed = moment.global_from_ego @ yaw_pose(zero, zero, error[2])
@@ -87,6 +78,27 @@ def make_sd_map(log: Log, keyframe: int, config: SdMapConfig) -> tuple[SdMap, in
     return pack_lines(
         np.split(points, sizes), category, capacity=config.lines, points=config.points, range_=config.range
     )
+
+
+def sd_lines(log: Log, config: SdMapConfig) -> tuple[list[Float[np.ndarray, "_ 2"]], list[SdCategory]]:
+    """Return the lines of a log's SD map in global metres, with the survey's error, and their categories.
+
+    Raises:
+        UserError: the log's map has no roads.
+    """
+    if not log.map.roads:
+        raise UserError(
+            f"{log.source} {log.name} knows lanes but no roads, of which an SD map could be made: leave sd_map of "
+            "ExampleConfig None, or read an SD map with tflane_jax.datasets.geojson"
+        )
+    rings = log.map.crossings if config.crossings == "include" else ()
+    lines = [simplify(road[:, :2], config.tolerance) for road in log.map.roads]
+    lines += [crossing_line(ring[:, :2]) for ring in rings]
+    sizes = np.cumsum([len(line) for line in lines])[:-1]
+    points = np.concatenate(lines)
+    points = points + config.survey * survey_error(points, log.seed)
+    category = [SdCategory.ROAD] * len(log.map.roads) + [SdCategory.CROSSWALK] * len(rings)
+    return np.split(points, sizes), category
 
 
 def pack_lines(

@@ -1,0 +1,62 @@
+"""The marker paper's Tables I to IV from camera images: rows that start from the hosts of `camera_host.py`.
+
+    tflane tables markers.1_cameras markers.2_cameras markers.3_cameras markers.4_cameras --jobs 2 --out runs/tables
+
+Every row starts from the host of its own seed and makes the same number of updates on clips half a second apart, with
+or without a prior; "toponet" and "bevformer_detr" are the hosts, tuned as long. Not trained yet.
+"""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, load_ablations, load_config
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+
+HERE = Path(__file__)
+HOSTS = "runs/markers/camera_hosts"
+# Rows of the paper's tables, and Eq. (3) to the letter.
+ROWS = (
+    *("toponet", "toponet_smerf", "uniform", "ungated", "hard", "no_memory", "no_decay", "mlp", "transformer"),
+    "as_written",
+)
+
+
+def get_config() -> RunConfig:
+    """Return the paper's system: gated fusion, full memory, transformer with positional encoding."""
+    return _tuned(load_config(str(HERE.with_name("toponet_markers.py"))))
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the other rows."""
+    rows = load_ablations(str(HERE.with_name("toponet_markers.py")))
+    return {name: _tuned(rows[name]) for name in ROWS} | {"bevformer_detr": _tuned(rows["toponet"], "bevformer_detr")}
+
+
+def _tuned(row: RunConfig, host: str = "camera_host") -> RunConfig:
+    """Return the fine-tuning of a camera host with the priors of a row of `toponet_markers.py`."""
+    config = _host(host)
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(row.task, LaneGraphTask)
+    priors: PriorsConfig = row.task.model.priors
+    # Denoising speeds up training from random weights; this decoder is trained already.
+    model = replace(config.task.model, denoising=None, priors=priors)
+    return replace(
+        config,
+        task=replace(config.task, model=model),
+        optim=replace(config.optim, ema_decay=0.99),
+        training=replace(
+            config.training,
+            steps=400,
+            eval_every=400,
+            init_from=f"{HOSTS}/{host}/seed_{{seed}}",
+            init_partly=True,
+        ),
+    )
+
+
+@functools.cache
+def _host(name: str) -> RunConfig:
+    path = str(HERE.with_name("camera_host.py"))
+    return load_config(path if name == "camera_host" else f"{path}:{name}")

@@ -1,0 +1,58 @@
+"""Small camera hosts trained on clips half a second apart: what every model of `camera_clips.py` starts from.
+
+    tflane compare markers/camera_host markers/camera_host:bevformer_detr --seeds 0 1 2 3 4 --jobs 2 \\
+        --out runs/markers/camera_hosts
+
+Models and cameras are those of `camera/toponet.py` and `camera/bevformer_detr.py`. Their hosts see single frames; these
+learn with the memory of BEV features that the rows use, at the frame rate of the paper. One host for each seed. The
+examples hold markers and an SD map, which the hosts ignore, so that all rows use the same cached data. Not trained yet.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
+from tflane_jax.world.simulate import WorldConfig
+
+CAMERA = Path(__file__).parents[1] / "camera"
+# Eight frames half a second apart, two clips.
+WORLD = WorldConfig(duration_s=5.6, keyframes=8, markers=PlacementConfig(side="both", site="clear"))
+CLIP = 4
+
+
+def get_config() -> RunConfig:
+    """Return TopoNet."""
+    return _on_clips("toponet")
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return BEVFormer-DETR."""
+    return {"bevformer_detr": _on_clips("bevformer_detr")}
+
+
+def _on_clips(name: str) -> RunConfig:
+    """Return the training of a small camera model on clips: as many frames as its own on single ones."""
+    config = load_config(str(CAMERA / f"{name}.py"))
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.data, WorldData)
+    cameras = config.data.example.cameras
+    assert cameras is not None
+    example = replace(
+        config.data.example,
+        cameras=replace(cameras, markers=True),
+        markers=MarkerConfig(simulation=MarkerSimulationConfig(cameras=cameras.cameras, occlusion="bodies")),
+        # GNSS receiver: 2 m and 1 degree (standard deviations), on top of the map's own error of 1.5 m.
+        sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0),
+    )
+    return replace(
+        config,
+        task=replace(config.task, clip=CLIP),
+        data=replace(config.data, world=WORLD, example=example),
+        training=replace(config.training, steps=1500, batch_size=2, eval_every=1500),
+        evaluation=EvaluationConfig(versions=("v2.1", "v1.0")),
+    )

@@ -1,0 +1,87 @@
+"""TopoNet with markers at the paper's size, on OpenLane-V2 subset A, and the rows of the paper's Tables I to IV.
+
+    tflane summary --config markers/toponet_r50 --no-compile         # needs no data
+    tflane convert --config markers/toponet_r50 --weights resnet50.pth --out runs/imagenet
+    tflane train --config markers/toponet_r50 --data.root PATH
+
+Section IV-C: ResNet-50 from ImageNet, 2048 x 1550 pixels, 200 x 100 BEV cells, AdamW, a cosine of 24 epochs from 1e-4,
+one frame at a time. The encoder is that of OpenLane-V2's large baseline, six layers, with Eq. (3) as written in each. A
+scene has one board. Ours: one clip of four frames for an update, and the clear place of a board. Not trained.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
+from tflane_jax.datasets.openlane_markers import BoardsConfig
+from tflane_jax.datasets.view_images import BASELINE_LARGE
+from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
+from tflane_jax.models.host import HostConfig
+from tflane_jax.models.marker_fusion import MarkerFusionConfig, as_written, uniform_fusion
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
+
+CAMERA = Path(__file__).parents[1] / "camera"
+CLIP = 4
+EPOCH = 22_477 // CLIP
+MARKERS = as_written(MarkerFusionConfig())
+
+
+def get_config() -> RunConfig:
+    """Return the paper's system."""
+    return _row(PriorsConfig(markers=MARKERS))
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the other rows of each table."""
+    memory = MARKERS.memory
+    assert memory is not None
+    changed = {
+        "uniform": uniform_fusion(MARKERS),
+        "hard": replace(MARKERS, fusion="hard"),
+        "no_memory": replace(MARKERS, memory=None),
+        "no_decay": replace(MARKERS, memory=replace(memory, decay=1.0)),
+        "mlp": replace(MARKERS, encoding="mlp"),
+        "transformer": replace(MARKERS, encoding="transformer"),
+    }
+    return {
+        "bevformer_detr": _row(PriorsConfig(), "bevformer_detr_r50"),
+        "toponet": _row(PriorsConfig()),
+        "toponet_smerf": _row(PriorsConfig(sd_map=SdMapModuleConfig())),
+        **{name: _row(PriorsConfig(markers=markers)) for name, markers in changed.items()},
+    }
+
+
+def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
+    """Return the training of a paper-size host with priors."""
+    config = load_config(str(CAMERA / f"{host}.py"))
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.data, OpenLaneV2Data)
+    example = replace(config.data.example, markers=MarkerConfig(), sd_map=SdMapConfig())
+    boards = BoardsConfig(placement=PlacementConfig(per="scene", site="clear"))
+    return replace(
+        config,
+        task=replace(config.task, model=replace(_six_layers(config.task.model), priors=priors), clip=CLIP),
+        data=replace(config.data, image=BASELINE_LARGE, example=example, boards=boards),
+        optim=replace(config.optim, lr=1e-4, epoch_steps=EPOCH),
+        training=replace(
+            config.training,
+            steps=24 * EPOCH,
+            batch_size=1,
+            eval_every=EPOCH,
+            checkpoint_every=EPOCH,
+            init_from="runs/imagenet",
+            init_partly=True,
+        ),
+        evaluation=EvaluationConfig(versions=("v2.1", "v1.0")),
+    )
+
+
+def _six_layers(model: HostConfig) -> HostConfig:
+    assert isinstance(model.encoder, CameraEncoderConfig)
+    return replace(model, encoder=replace(model.encoder, bev=replace(model.encoder.bev, layers=6)))

@@ -1,0 +1,112 @@
+"""A world exported as OpenLane-V2 gives clips with virtual markers and the SD map, and trains with both and memory."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.models.cases import CAMERA, CAMERA_TOPONET
+from tests.models.test_marker_fusion import CONFIG as MARKERS
+from tests.parameters import random_params
+from tflane_jax.cli import main
+from tflane_jax.config import OpenLaneV2Data
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.batches import batches, count, first_example
+from tflane_jax.datasets.openlane_sd_map import read_sd_lines
+from tflane_jax.datasets.streaming import StreamingConfig
+from tflane_jax.datasets.view_images import ImageConfig
+from tflane_jax.errors import UserError
+from tflane_jax.evaluation.predict import predictions
+from tflane_jax.markers.simulation import PERFECT, MarkerConfig
+from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.roads.sd_map import SdMapConfig
+
+SCENES, FRAMES, CLIP = 5, 4, 2
+EXPORTED = """
+from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.roads.sd_map import SdMapConfig
+
+def get_config():
+    cameras = CameraRigConfig(cameras=ARGOVERSE2_RING, scale=0.05)
+    example = ExampleConfig(sensor=None, cameras=cameras, sd_map=SdMapConfig())
+    return RunConfig(data=WorldData(train=5, val=0, test=0, example=example))
+"""
+EXAMPLE = ExampleConfig(
+    lanes=8,
+    elements=3,
+    markers=MarkerConfig(lanes=6, points=5, simulation=PERFECT),
+    sd_map=SdMapConfig(lines=6, points=5),
+)
+TASK = LaneGraphTask(
+    replace(
+        CAMERA_TOPONET,
+        priors=PriorsConfig(markers=MARKERS, sd_map=SdMapModuleConfig()),
+        encoder=replace(CAMERA, bev=replace(CAMERA.bev, cameras=7)),
+    ),
+    clip=CLIP,
+)
+
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::tflane_jax.datasets.base.TruncationWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> OpenLaneV2Data:
+    folder = tmp_path_factory.mktemp("world")
+    (folder / "config.py").write_text(EXPORTED)
+    command = ["data", "export", "--config", str(folder / "config.py"), "--splits", "train"]
+    assert main([*command, "--out", str(folder / "made")]) == 0
+    return OpenLaneV2Data(
+        folder / "made",
+        val="train",
+        image=ImageConfig(divisor=16),
+        example=EXAMPLE,
+        loading=StreamingConfig(threads=2, ahead=2),
+    )
+
+
+def test_clips_have_markers_and_the_sd_map(data):
+    assert read_sd_lines(data.root / "train/00000/sdmap.json").lines
+    frames = TASK.load(data.source("train"), progress=False)
+    clips = TASK.examples(frames)
+    assert count(clips) == SCENES * FRAMES // CLIP
+    plain, coloured = (next(batches(clips, (0,), range(1), 10, prepare))[0] for prepare in (None, TASK.prepare(data)))
+    assert plain.markers.valid.shape == (10, CLIP, 2)
+    assert np.asarray(plain.markers.valid).any(-1).sum() >= FRAMES
+    assert plain.sd_map.valid.any(-1).all()
+    changed = np.asarray(plain.cameras.image != coloured.cameras.image).any((2, 3, 4, 5))
+    assert changed.all()
+    assert jax.tree.map(jnp.shape, first_example(frames)) == jax.tree.map(jnp.shape, TASK.shapes(data))
+
+
+def test_a_model_learns_from_markers_and_the_sd_map_with_memory(data):
+    frames = TASK.load(data.source("train"), progress=False)
+    clips = TASK.examples(frames)
+    batch = stack_examples([clips.example(i) for i in (8, 9)])  # a scene that shows a board in every frame
+    assert batch.markers.valid.any(-1).all()
+    params = random_params(TASK.init, first_example(clips))
+    (loss, _), gradient = jax.jit(jax.value_and_grad(TASK.loss, has_aux=True))(params, batch, jax.random.key(0))
+    assert np.isfinite(loss)
+    for name in ("marker_tokens", "sd_map_tokens"):
+        assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient[name])) > 0
+    found = [answer.centerlines.points for _, answer in predictions(TASK, params, frames, FRAMES)]
+    assert np.isfinite(found).all()
+
+
+def test_a_missing_sd_map_is_named(data):
+    (data.root / "train/00000/sdmap.json").rename(data.root / "sdmap.json")
+    try:
+        with pytest.raises(UserError, match=r"train/00000/sdmap.json is missing: unpack the SD maps"):
+            TASK.shapes(data)
+    finally:
+        (data.root / "sdmap.json").rename(data.root / "train/00000/sdmap.json")

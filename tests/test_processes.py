@@ -68,6 +68,7 @@ def test_a_folder_in_use_is_refused_by_all(trained):
     assert arrays(folder) == before
 
 
+@pytest.mark.slow
 def test_all_stop_when_one_is_told_to_and_one_alone_goes_on(trained, tmp_path):
     folder = tmp_path / "run"
     said = together(folder, ["new", "stopped"])

@@ -240,7 +240,7 @@ def test_builders_at_the_same_time_build_once(tmp_path):
     assert sorted((tmp_path / "made").read_text().split()) == ["0", "0", "1", "2", "3", "4", "5"]
 
 
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("kind", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL])
 def test_a_killed_build_leaves_no_entry_and_its_remains_are_cleared(tmp_path, kind):
     builder = start(tmp_path, 1.0)
     for _ in range(600):

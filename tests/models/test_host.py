@@ -138,7 +138,7 @@ def test_batch_is_a_vmap(fitted, name):
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=2e-4, atol=2e-4), alone, together)
 
 
-@pytest.mark.parametrize("name", with_slow(MODELS, quick=("traffic", "segments, traffic", "lines, traffic")))
+@pytest.mark.parametrize("name", with_slow(MODELS, quick=("traffic",)))
 def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
     task, params, _ = fitted[name]
     chex.clear_trace_counter()

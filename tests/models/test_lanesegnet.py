@@ -174,6 +174,7 @@ def test_the_published_fault_of_the_areas_changes_their_points_alone():
     np.testing.assert_allclose(logit[1] - logit[0], change[1], rtol=1e-2, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_areas_train_and_all_their_parameters_learn():
     task = LaneGraphTask(BUCKET, LaneSegNetLossConfig())
     example = make_segment_example()

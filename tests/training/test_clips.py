@@ -66,6 +66,7 @@ def test_the_loss_of_clips_equals_that_of_their_frames_with_memory(params):
     assert abs(float(of_clips(params, as_clips(seen, 3), key)[0] - of_frames(params, seen, key)[0])) > 1e-4
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_encoder_through_memory(params):
     # Nothing but the memory shows the last two frames a marker; the first frame's loss is taken away.
     examples = scenes(count=1)

@@ -172,8 +172,8 @@ def test_a_split_that_logs_do_not_have_is_refused(logs):
             "no lane graphs: this model takes procedural, .* or recorded",
         ),
         (["--data", "procedural"], IMAGES, "are no images: this model takes front-views or tusimple"),
-        ([], replace(IMAGES, data=WorldData()), "data are lane graphs .*, but its task takes images"),
-        ([], replace(RunConfig(), data=FrontViewData()), "data are images .*, but its task takes lane graphs"),
+        ([], replace(IMAGES, data=WorldData()), r"data are lane graphs .*, but its task takes images"),
+        ([], replace(RunConfig(), data=FrontViewData()), r"data are images .*, but its task takes lane graphs"),
     ],
 )
 def test_unsuitable_data_sources_are_refused(arguments, config, message):

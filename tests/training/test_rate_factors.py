@@ -50,7 +50,7 @@ def test_a_pattern_that_decides_nothing_is_an_error(factors, message):
 
 @pytest.mark.parametrize("factor", [-0.1, float("nan"), float("inf")])
 def test_a_factor_out_of_range_is_an_error(factor):
-    with pytest.raises(UserError, match="lr_factors is .*a finite number of at least 0"):
+    with pytest.raises(UserError, match=r"lr_factors is .*a finite number of at least 0"):
         make_optimizer(OptimConfig(lr_factors=(("*", factor),)), 1000)
 
 

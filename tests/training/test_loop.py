@@ -82,6 +82,19 @@ def test_a_signal_finishes_the_step_and_saves_it(whole, tmp_path, number):
     assert arrays(tmp_path / "run") == arrays(whole)
 
 
+def test_a_signal_in_the_last_step_is_told_of_a_complete_run(tmp_path):
+    evaluated = []
+
+    def signal_in_the_last_evaluation(params):
+        evaluated.append(params)
+        if len(evaluated) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return score(params)
+
+    result = run(tmp_path / "run", evaluate=signal_in_the_last_evaluation)
+    assert (result.step, result.stopped_by, result.asked_by) == (30, None, signal.SIGTERM)
+
+
 def test_streamed_data_give_the_same_bits_and_resume_at_their_position(whole, tmp_path):
     """The checkpoint's step is the position in the data: a resumed run starts with the next batch."""
 

@@ -87,8 +87,8 @@ def _train_here(queue: Queue) -> list[Failure]:
             time.sleep(_POLL_SECONDS)
             continue
         with noted(job, failures):
-            if train_run(job.config, job.folder, start=job.start()).stopped_by is not None:
-                raise KeyboardInterrupt  # the same command resumes what was written
+            if train_run(job.config, job.folder, start=job.start()).asked_by is not None:
+                raise KeyboardInterrupt  # all of it; the same command resumes what was written
         queue.done(job)
         _tell([failure for failure in failures if failure.job is job])
     return failures

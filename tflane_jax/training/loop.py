@@ -107,13 +107,15 @@ class TrainingResult:
         metrics: of the last evaluation, mean over seeds.
         compile_seconds: tracing and compiling the update step.
         steps_per_second: of this process, evaluations and checkpoints not counted.
-        stopped_by: number of the signal that stopped it before its end, else None.
+        asked_by: number of the signal that asked it to stop, also where that came with the last step; None for none.
+        stopped_by: the same, but None if the run is complete.
     """
 
     step: int
     metrics: dict[str, float]
     compile_seconds: float
     steps_per_second: float
+    asked_by: int | None
     stopped_by: int | None
 
 
@@ -292,7 +294,8 @@ def train(
             if step > saved_step:
                 save({})
         rate = (step - first) / stepping if stepping else 0.0
-        return TrainingResult(step, metrics, compile_seconds, rate, stopped if step < config.steps else None)
+        unfinished = stopped if step < config.steps else None
+        return TrainingResult(step, metrics, compile_seconds, rate, asked_by=stopped, stopped_by=unfinished)
 
 
 def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:

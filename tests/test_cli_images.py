@@ -71,6 +71,7 @@ def test_evaluation_prints_a_table(trained, capsys):
     assert "are no images" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_resume_is_bit_identical(trained, config, tmp_path):
     from tflane_jax.runs import open_run
 

@@ -5,6 +5,7 @@ import re
 import pytest
 
 from tests.shared import ROOT
+from tests.slow import with_slow
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 600_000
@@ -40,6 +41,10 @@ def notebook(request):
     return request.param.stem, nbformat.read(request.param, as_version=4)
 
 
+QUICK = [ROOT / "notebooks" / "traffic_flow.ipynb"]
+
+
+@pytest.mark.parametrize("notebook", with_slow(NOTEBOOKS, QUICK), ids=lambda path: path.stem, indirect=True)
 @pytest.mark.filterwarnings("default")
 def test_notebook_runs(notebook, tmp_path, monkeypatch):
     (name, notebook), client = notebook, pytest.importorskip("nbclient")

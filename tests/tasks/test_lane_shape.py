@@ -166,9 +166,8 @@ def test_anchored_heads_predict_where_the_straight_part_crosses_two_rows():
         np.testing.assert_allclose(b * row - offset, spread * plain.curves[..., 6 + i], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "encoder", [None, pytest.param(GtnEncoderConfig(layers=1, hidden=16), marks=pytest.mark.slow)], ids=["none", "gtn"]
-)
+@pytest.mark.parametrize("encoder", [None, GtnEncoderConfig(layers=1, hidden=16)], ids=["none", "gtn"])
+@pytest.mark.slow
 def test_cells_are_learned_beside_the_curves(encoder):
     task = LaneShapeTask(tiny_model(encoder, cells=True))
     silent = dataclasses.replace(task, losses=LaneShapeLossConfig(cell_weight=0.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +57,18 @@ def page(folder: Path) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _between(numbers: Collection[float]) -> str:
+    least, most = round(min(numbers)), round(max(numbers))
+    return str(least) if least == most else f"{least} to {most}"
+
+
 def _section(summary: Mapping[str, Any]) -> list[str]:
     minutes = summary["core minutes of a run"]
     cores = _listed(summary["cores of a run"])
     facts = (
         f"{len(summary['seeds'])} seeds, {_listed(summary['steps'])} updates a run, each on {cores} "
-        f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}) in {min(minutes.values()):.0f} to "
-        f"{max(minutes.values()):.0f} minutes, other work beside it; code {_listed(summary['commits'])}. "
+        f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}) in "
+        f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
         f"{summary['declared']}"
     )

@@ -291,6 +291,7 @@ def test_ctrl_c_prints_the_command_to_resume(config, tmp_path, capsys, monkeypat
     assert f"stopped by SIGINT after step 2; go on with: tflane train --resume --out {folder}" in said
 
 
+@pytest.mark.slow  # tests/ablations/test_tables.py follows a table from training to page
 def test_a_comparison_trains_and_tests_and_does_not_repeat_finished_runs(config, tmp_path, capsys):
     out = tmp_path / "comparison"
     command = ["compare", f"baseline={config}:baseline", f"+TFM={config}", "--seeds", "0", "1", "--out", str(out)]

@@ -41,6 +41,7 @@ def test_data_stats_needs_lane_graphs(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_data_show_draws_world_cameras(tmp_path, capsys):
     assert main(["data", "show", "--data", "world-cameras", "--count", "1", "--out", str(tmp_path / "world.png")]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"world.png", "world-cameras.png"}

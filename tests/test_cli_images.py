@@ -95,6 +95,7 @@ def test_predictions_are_written_in_tusimple_format(trained, tmp_path):
     assert (out / "pictures.png").is_file()
 
 
+@pytest.mark.slow
 def test_photos_of_any_size(trained, tmp_path, capsys):
     import cv2
 
@@ -136,6 +137,7 @@ def test_photos_of_any_size(trained, tmp_path, capsys):
     assert "nothing.jpg" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_export_writes_a_program_and_its_latencies(trained, tmp_path, capsys):
     assert main(["export", str(trained), "--out", str(tmp_path / "m.stablehlo")]) == 0
     assert "the model's numbers" in capsys.readouterr().out

@@ -15,7 +15,7 @@ from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
 
 
-@pytest.fixture(scope="module", params=with_slow([2, 8], quick=[8]))
+@pytest.fixture(scope="module", params=with_slow([2, 8], quick=[2]))
 def forced(request, tmp_path_factory):
     """Return the folder of a process with so many devices, and what it says."""
     folder = tmp_path_factory.mktemp("devices")

@@ -125,6 +125,7 @@ def test_parts_that_do_not_fit_are_named(change, message):
         replace(LINES, **change).build()
 
 
+@pytest.mark.slow  # tests/models/test_maptrv2.py trains with more parts
 def test_it_trains_with_denoising_and_all_its_parameters_learn():
     model = replace(SMALL_LINES, denoising=DenoisingConfig(copies=1))
     task = LaneGraphTask(model, MapTrLossConfig(class_target="quality", rings="both"))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.fakes import FakeConfig, FakeDataset, empty_example, fake_example, fake_prediction
+from tests.plots.pictures import count_colours
 from tflane_jax.errors import UserError
 from tflane_jax.plots.figure import new_figure, save_figure
 from tflane_jax.plots.gallery import save_examples, show_dataset
@@ -18,16 +19,12 @@ EXAMPLES = stack_examples([fake_example(0, padding=np.nan), empty_example()])
 PREDICTIONS = stack_examples([fake_prediction(0), fake_prediction(1)])
 
 
-def colours(path) -> int:
-    return len(np.unique((imread(path)[..., :3] * 255).astype(np.uint8).reshape(-1, 3), axis=0))
-
-
 def test_one_row_for_each_example_and_one_column_for_each_model(tmp_path):
     alone = save_examples(tmp_path / "new" / "alone.png", EXAMPLES)
     both = save_examples(
         tmp_path / "both.png", EXAMPLES, {"baseline": PREDICTIONS, "+TFM": PREDICTIONS}, titles=["a", "b"]
     )
-    assert colours(alone) > 100
+    assert count_colours(alone) > 100
     assert imread(both).shape[1] == 2 * imread(alone).shape[1]
     assert imread(both).shape[0] == imread(alone).shape[0]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["both.png", "new"]
@@ -52,7 +49,7 @@ def test_many_models_take_further_lines(tmp_path):
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (1, 4), (5, 3)])
 def test_contact_sheet_is_limited_to_the_available_examples(tmp_path, size, count):
     out = show_dataset(FakeDataset(FakeConfig(size=size)), count, tmp_path / "sheet.png")
-    assert colours(out) > 100
+    assert count_colours(out) > 100
 
 
 @pytest.mark.parametrize(("size", "count"), [(0, 3), (3, 0)])

@@ -54,7 +54,7 @@ def fit(name):
     return Fitted(tiny_task(ENCODERS[name]))
 
 
-@pytest.fixture(params=with_slow(ENCODERS, quick=("transformer", "gtn")))
+@pytest.fixture(params=with_slow(ENCODERS, quick=("gtn",)))
 def fitted(request):
     return fit(request.param)
 

@@ -1,11 +1,12 @@
-"""Every notebook runs from top to bottom and draws, and its outputs are stored; the example of the README runs."""
+"""Notebooks run from top to bottom and draw, their outputs are stored; the example of the README runs."""
 
+import ast
+import inspect
 import re
 
 import pytest
 
 from tests.shared import ROOT
-from tests.slow import with_slow
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 600_000
@@ -41,10 +42,7 @@ def notebook(request):
     return request.param.stem, nbformat.read(request.param, as_version=4)
 
 
-QUICK = [ROOT / "notebooks" / "traffic_flow.ipynb"]
-
-
-@pytest.mark.parametrize("notebook", with_slow(NOTEBOOKS, QUICK), ids=lambda path: path.stem, indirect=True)
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_notebook_runs(notebook, tmp_path, monkeypatch):
     (name, notebook), client = notebook, pytest.importorskip("nbclient")
@@ -59,6 +57,24 @@ def test_notebook_runs(notebook, tmp_path, monkeypatch):
     client.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
     assert pictures(notebook) >= PICTURES[name]
     assert "8 validation frames of 2 scenes" in printed(notebook)
+
+
+def test_functions_that_notebooks_call_exist_and_take_their_arguments(notebook):
+    """A name that has gone is found without running a notebook."""
+    nodes = list(ast.walk(ast.parse("\n".join(c.source for c in notebook[1].cells if c.cell_type == "code"))))
+    imported: dict = {}
+    for node in nodes:
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            exec(ast.unparse(node), imported)
+    calls = [node for node in nodes if isinstance(node, ast.Call)]
+    known = [
+        call for call in calls if {n.id for n in ast.walk(call.func) if isinstance(n, ast.Name)} <= imported.keys()
+    ]
+    assert len(known) > 20
+    for call in known:
+        function = eval(ast.unparse(call.func), imported)
+        if inspect.isfunction(function):
+            inspect.signature(function).bind_partial(**{each.arg: None for each in call.keywords if each.arg})
 
 
 def test_outputs_are_stored(notebook):

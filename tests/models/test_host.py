@@ -1,7 +1,7 @@
 """Hosts with and without the TFM: padding, order and absent inputs change no bit."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 
 import chex
 import jax
@@ -44,6 +44,7 @@ MODELS = {
     "lines": LINES,
     "lines, traffic": SMALL_LINES,
 }
+WITH_PRIOR = [name for name, config in MODELS.items() if config.priors.traffic_flow is not None]
 LOSSES = {LaneSegNetConfig: LaneSegNetLossConfig(), MapTrConfig: MapTrLossConfig()}
 
 
@@ -57,24 +58,25 @@ def predicted(task, params, example):
     return next(part for part in (answer.centerlines, answer.segments, answer.lines) if part is not None)
 
 
-@pytest.fixture(scope="module")
-def fitted():
-    """Parameters and a jitted predictor of each model."""
-    out = {}
-    for name, config in MODELS.items():
-        task = make_task(config)
-        params = random_params(task.init, make_line_example(), spread=0.2)
-        out[name] = task, params, jax.jit(partial(predicted, task))
-    return out
+# The other models differ from these in one setting of the traffic, or are these without it.
+QUICK = ("baseline", "traffic", "segments, traffic", "lines, traffic")
+
+
+@cache
+def fit(name):
+    """Return the task, parameters and a jitted predictor of a model."""
+    task = make_task(MODELS[name])
+    params = random_params(task.init, make_line_example(), spread=0.2)
+    return task, params, jax.jit(partial(predicted, task))
 
 
 def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_shapes_and_range(fitted, name):
-    _, params, predict = fitted[name]
+@pytest.mark.parametrize("name", with_slow(MODELS, QUICK))
+def test_shapes_and_range(name):
+    _, params, predict = fit(name)
     lanes = predict(params, make_line_example())
     if name.startswith("lines"):
         chex.assert_shape(lanes.points, (6, 5, 2))
@@ -86,9 +88,9 @@ def test_shapes_and_range(fitted, name):
     assert np.abs(np.asarray(lanes.points)[..., 0]).max() <= 51.2
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_padding_may_hold_nan(fitted, name):
-    _, params, predict = fitted[name]
+@pytest.mark.parametrize("name", with_slow(MODELS, QUICK))
+def test_padding_may_hold_nan(name):
+    _, params, predict = fit(name)
     example = make_line_example(3, instances=6)
     flow = example.traffic_flow
     dirty = flow.replace(
@@ -100,9 +102,9 @@ def test_padding_may_hold_nan(fitted, name):
     same(predict(params, example), predict(params, example.replace(traffic_flow=dirty)))
 
 
-@pytest.mark.parametrize("name", ["traffic", "every layer", "fixed", "segments, traffic", "lines, traffic"])
-def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
-    _, params, predict = fitted[name]
+@pytest.mark.parametrize("name", with_slow(WITH_PRIOR, QUICK))
+def test_an_empty_scene_equals_no_traffic_flow(name):
+    _, params, predict = fit(name)
     example = make_line_example(4)
     absent = predict(params, example.replace(traffic_flow=None))
     same(absent, predict(params, example.replace(traffic_flow=TrafficFlow.empty(16, 20))))
@@ -113,23 +115,23 @@ def test_an_empty_scene_equals_no_traffic_flow(fitted, name):
 
 
 @pytest.mark.parametrize("name", ["baseline", "segments", "lines"])
-def test_baseline_does_not_depend_on_traffic(fitted, name):
-    _, params, predict = fitted[name]
+def test_baseline_does_not_depend_on_traffic(name):
+    _, params, predict = fit(name)
     same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))
 
 
 @pytest.mark.parametrize("name", ["traffic", "segments, traffic", "lines, traffic"])
-def test_lanes_do_not_depend_on_the_order_of_instances(fitted, name):
-    _, params, predict = fitted[name]
+def test_lanes_do_not_depend_on_the_order_of_instances(name):
+    _, params, predict = fit(name)
     example = make_line_example(6)
     order = np.random.default_rng(0).permutation(16)
     shuffled = example.replace(traffic_flow=jax.tree.map(lambda x: x[order], example.traffic_flow))
     same(predict(params, example), predict(params, shuffled))
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_batch_is_a_vmap(fitted, name):
-    task, params, predict = fitted[name]
+@pytest.mark.parametrize("name", with_slow(MODELS, QUICK))
+def test_batch_is_a_vmap(name):
+    task, params, predict = fit(name)
     examples = [make_line_example(s, instances=s) for s in (0, 3, 9)]
     batch = jax.tree.map(lambda *x: np.stack(x), *examples)
     together = jax.jit(jax.vmap(partial(predicted, task), in_axes=(None, 0)))(params, batch)
@@ -139,8 +141,8 @@ def test_batch_is_a_vmap(fitted, name):
 
 
 @pytest.mark.parametrize("name", with_slow(MODELS, quick=("traffic",)))
-def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
-    task, params, _ = fitted[name]
+def test_loss_is_traced_once_and_its_gradient_is_finite(name):
+    task, params, _ = fit(name)
     chex.clear_trace_counter()
 
     @jax.jit
@@ -159,20 +161,23 @@ def test_loss_is_traced_once_and_its_gradient_is_finite(fitted, name):
         assert all(not np.asarray(g).any() for g in jax.tree.leaves(silent))
 
 
-@pytest.mark.parametrize(
-    "name", with_slow(("traffic", "segments, traffic", "lines, traffic"), quick=("lines, traffic",))
-)
+@pytest.mark.parametrize("name", QUICK)
 def test_same_key_same_parameters(name):
-    task = make_task(MODELS[name])
-    a, b = (jax.jit(task.init).lower(jax.random.key(7), make_line_example()) for _ in range(2))
-    assert a.as_text() == b.as_text()
-    params = a.compile()(jax.random.key(7), make_line_example())
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
-    names = {"/".join(str(k.key) for k in path) for path, _ in jax.tree_util.tree_leaves_with_path(params)}
+    init = jax.jit(make_task(MODELS[name]).init)
+    first, again = (init.lower(jax.random.key(7), make_line_example()) for _ in range(2))
+    assert first.as_text() == again.as_text()
+    names = {"/".join(str(k.key) for k in path) for path, _ in jax.tree_util.tree_leaves_with_path(first.out_info)}
     assert not [n for n in names if "Dense_" in n or "Conv_" in n or "Norm_" in n]
 
 
-def test_no_bev_is_an_error(fitted):
-    task, params, _ = fitted["baseline"]
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
+def test_initial_parameters_are_finite(name):
+    params = jax.jit(make_task(MODELS[name]).init)(jax.random.key(7), make_line_example())
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+def test_no_bev_is_an_error():
+    task, params, _ = fit("baseline")
     with pytest.raises(UserError, match="bev is None"):
         task.predict(params, make_line_example().replace(bev=None))

@@ -57,7 +57,7 @@ def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, a, b)
 
 
-@pytest.mark.parametrize("name", with_slow(HOSTS, quick=[name for name in HOSTS if not name.startswith("camera")]))
+@pytest.mark.parametrize("name", with_slow(HOSTS, quick=("toponet", "detr")))
 def test_a_new_prior_plugs_into_every_host_by_both_hooks(name):
     host, make = HOSTS[name]
     task = LaneGraphTask(replace(host, priors=WithToy(traffic_flow=FLOW, crossings=CrossingsConfig())))

@@ -67,14 +67,16 @@ def test_functions_that_notebooks_call_exist_and_take_their_arguments(notebook):
         if isinstance(node, ast.Import | ast.ImportFrom):
             exec(ast.unparse(node), imported)
     calls = [node for node in nodes if isinstance(node, ast.Call)]
-    known = [
-        call for call in calls if {n.id for n in ast.walk(call.func) if isinstance(n, ast.Name)} <= imported.keys()
-    ]
+    known = [call for call in calls if names(call.func) <= imported.keys()]
     assert len(known) > 20
     for call in known:
         function = eval(ast.unparse(call.func), imported)
         if inspect.isfunction(function):
             inspect.signature(function).bind_partial(**{each.arg: None for each in call.keywords if each.arg})
+
+
+def names(expression: ast.AST) -> set[str]:
+    return {node.id for node in ast.walk(expression) if isinstance(node, ast.Name)}
 
 
 def test_outputs_are_stored(notebook):

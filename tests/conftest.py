@@ -6,13 +6,9 @@ import os
 import shutil
 import tempfile
 
-# Tests compile many programs and run each a few times: unoptimised code halves the session, and XLA's older code
-# generator for fusions halves what is left, because it gives LLVM less to do.
-_FAST_COMPILE = (
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-)
-os.environ["XLA_FLAGS"] = f"{_FAST_COMPILE} {os.environ.get('XLA_FLAGS', '')}".strip()
+from tests.fast_compile import compile_fast
+
+compile_fast()
 
 import jax  # noqa: E402
 

@@ -1,0 +1,22 @@
+"""Unoptimised programs for the tests, and the environment of those that need optimised ones."""
+
+import os
+
+# Tests compile many programs and run each a few times: unoptimised code halves the session, and XLA's older code
+# generator for fusions halves what is left, because it gives LLVM less to do.
+FAST_COMPILE = (
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+
+
+def compile_fast() -> None:
+    """Choose unoptimised programs in this process and those that it starts; to be called before JAX is imported."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if FAST_COMPILE not in flags:  # a worker inherits them
+        os.environ["XLA_FLAGS"] = f"{FAST_COMPILE} {flags}".strip()
+
+
+def optimised() -> dict[str, str]:
+    """Return the environment for a process that runs its programs often, such as a training."""
+    return os.environ | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "").replace(FAST_COMPILE, "")}

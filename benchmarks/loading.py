@@ -84,7 +84,7 @@ def photos(folder: Path, *, tiny: bool = False) -> Case:
     (folder / "label_data_0313.json").write_text("".join(json.dumps(record) + "\n" for record in records))
     config = load_config("gtn_lane/gtn_tusimple")
     data: Any = config.data
-    return Case(replace(config, data=replace(data, root=folder, train="all")), 2 if tiny else 16, 2)
+    return Case(replace(config, data=replace(data, root=folder, train="all")), 2 if tiny else 4, 4)
 
 
 def cameras(folder: Path, *, tiny: bool = False) -> Case:

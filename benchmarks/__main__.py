@@ -5,11 +5,21 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from benchmarks import attention_masks, camera_world, deformable, host, lstr, markers, masking_variants, metrics
+from benchmarks import (
+    attention_masks,
+    camera_world,
+    deformable,
+    host,
+    loading,
+    lstr,
+    markers,
+    masking_variants,
+    metrics,
+)
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder for JSON and tables")
 options = parser.parse_args()
-for benchmark in (host, attention_masks, masking_variants, metrics, lstr, deformable, markers, camera_world):
+for benchmark in (host, attention_masks, masking_variants, metrics, lstr, deformable, markers, camera_world, loading):
     print(f"\n== {benchmark.__name__}\n", flush=True)
     benchmark.run(options.out)

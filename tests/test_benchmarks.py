@@ -1,9 +1,12 @@
 """The arithmetic of the benchmarks; no test asserts a time."""
 
+from types import SimpleNamespace
+
+import jax
 import numpy as np
 import pytest
 
-from benchmarks import marker_occlusion, metrics, paper_sizes
+from benchmarks import loading, marker_occlusion, metrics, paper_sizes
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 from tflane_jax.config import apply_overrides, load_config
@@ -105,3 +108,30 @@ def test_a_paper_size_is_trained_briefly_on_data_that_are_there(name, tmp_path):
     assert (short.training.steps, short.training.batch_size) == (paper_sizes.UPDATES, 1)
     make_optimizer(short.optim, short.training.steps)  # raises where the schedule does not fit
     assert short.task == config.task
+
+
+def test_loading_is_compared_with_the_update_for_each_example(monkeypatch):
+    """Batches of 4: loading takes 2 s for two of them, the update 3 s for one."""
+    task = SimpleNamespace(prepare=lambda data: None)
+    case = loading.Case(SimpleNamespace(task=task, data=None), batch=4, batches=2)
+    monkeypatch.setattr(loading, "forms", lambda case: {("memory", 0): np.arange(8.0)})
+    monkeypatch.setattr(loading, "updates", lambda case, batch: (None, 5.0))
+    monkeypatch.setattr(loading, "interleave", lambda *_: {"memory 0": np.full(3, 2.0), "update": np.full(3, 3.0)})
+    (memory, update), found = (result := loading.measured(case, 0.0))["rows"], result["compile_s"]
+    assert memory == {"examples": "memory", "workers": "0", "examples_per_s": 4.0, "ratio": 3.0}
+    assert (update["examples_per_s"], update["ratio"], found) == (pytest.approx(4 / 3), 1.0, 5.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(loading.CASES))
+def test_rates_of_loading_are_those_of_equal_batches(name, tmp_path, monkeypatch):
+    rows = loading.run(tmp_path, [name], seconds=0.0, with_updates=False, tiny=True)["results"][name]["rows"]
+    found = [(row["examples"], row["workers"]) for row in rows]
+    in_memory = loading.WORKERS[:1] if name == "cameras" else loading.WORKERS  # nothing to augment
+    assert found == [("memory", str(n)) for n in in_memory] + [("disk", str(n)) for n in loading.WORKERS]
+    assert all(row["examples_per_s"] > 0 for row in rows)
+    assert f"| {name}, disk" in (tmp_path / "loading.md").read_text()
+    other_order = lambda arrays, config: jax.tree.map(lambda leaf: leaf[::-1], arrays)  # noqa: E731
+    monkeypatch.setattr(loading, "in_workers", other_order)
+    with pytest.raises(AssertionError, match="not equal"):
+        loading.run(tmp_path, [name], seconds=0.0, with_updates=False, tiny=True)

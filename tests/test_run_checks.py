@@ -161,6 +161,7 @@ WRONG = {
         "data.image.scale": (0.0, 2.0),
         "data.augmentation.contrast": ((1.5, 0.5),),
         "data.loading.ahead": (0,),
+        "data.loading.where": ("ram",),
     },
     "tf_lane/argoverse2": {"data.train": (Path("no/such/folder"),), "data.val": (None,)},
     "real_maps": {"data.maps": (Path("no/such/folder"),), "data.generated": (1.1,)},

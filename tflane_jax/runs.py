@@ -19,6 +19,8 @@ import numpy as np
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.batches import in_workers
+from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
@@ -72,7 +74,9 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         check_origins(config.training.init_from, config.training.seeds)
     data: Any = task.load(config.data.source("train"), progress=progress)
     task.check(config.data, data)
-    arrays = task.examples(data)
+    arrays, prepare = task.examples(data), task.prepare(config.data)
+    if prepare is not None:
+        arrays = in_workers(arrays, loading_of(config.data))
     validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:
@@ -88,7 +92,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
         resolved_text=to_text(config),
         current_form=current_form,
         start=start,
-        prepare=task.prepare(config.data),
+        prepare=prepare,
         evaluate=evaluate,
         draw=_drawing(config),
         frozen=task.frozen,

@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 
-from tflane_jax.datasets import cache
+from tflane_jax.datasets import cache, sources
 from tflane_jax.datasets.front_views import FrontViewConfig, FrontViewDataset, load_road_images
 from tflane_jax.datasets.leaves import IMAGE_PARTS, example_leaves, image_from_leaves
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.world.front_view.views import FrontWorldConfig
 
@@ -77,6 +78,17 @@ def test_other_processes_make_the_same_bits():
     loaded, dataset = load_road_images(config, progress=False, workers=2), FrontViewDataset(config)
     for index in (0, 11, 25):
         assert_same(jax.tree.map(lambda leaf: leaf[index], loaded), dataset.example(index))  # noqa: B023
+
+
+def test_images_are_mapped_or_kept_in_memory():
+    config = FrontViewConfig(split="test", images=2, world=_tiny())
+    mapped, kept = (
+        sources.load(replace(config, loading=StreamingConfig(where=where)), progress=False)
+        for where in ("auto", "memory")
+    )
+    assert isinstance(mapped.images.image.base, np.memmap)
+    assert kept.images.image.flags.owndata
+    assert_same(mapped.images, kept.images)
 
 
 def _tiny() -> FrontWorldConfig:

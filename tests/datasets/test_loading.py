@@ -1,12 +1,16 @@
 """Loading a dataset into memory: stacking, parts of examples, errors."""
 
+import pickle
+
 import jax
 import numpy as np
 import pytest
 
 from tests.fakes import FakeConfig, FakeDataset, UnevenDataset
+from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
-from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays
+from tflane_jax.datasets.loading import TRAINING_PARTS, keep, load_arrays, load_or_stream
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example, stack_examples
 
@@ -54,6 +58,41 @@ def test_training_keeps_what_a_model_sees_and_the_lanes(dataset):
         jax.tree.map(lambda leaf, i=index: leaf[i], arrays).validate()
 
 
+def test_memory_and_disk_give_the_same_batches(dataset):
+    parts = ("lanes", "bev")
+    kept, read, chosen = (
+        load_or_stream(dataset, False, parts, StreamingConfig(where=where)) for where in ("memory", "disk", "auto")
+    )
+    assert isinstance(read, Streamed)
+    assert not isinstance(kept, Streamed)
+    assert_same(kept, chosen)
+    for one, other in zip(*(batches(data, (3,), range(4), 2) for data in (kept, read)), strict=True):
+        assert_same(one, other)
+
+
+def test_cached_examples_are_read_by_part_and_opened_by_other_processes(tmp_path):
+    whole = cached(FakeDataset(FakeConfig(size=5)), root=tmp_path, workers=1, progress=False)
+    few = whole.only(("lanes", "has_previous"))
+    assert few.example(3).bev is None
+    assert whole.example(3).bev is not None
+    assert few.scene(3) == few.info(3).scene
+    sent = pickle.dumps(few)
+    assert len(sent) < 1000  # not the arrays
+    assert_same(pickle.loads(sent).example(3), few.example(3))
+    next(tmp_path.glob("fake-*/lanes.points.npy")).unlink()
+    with pytest.raises(UserError, match=r"changed while they were used .*lanes\.points\.npy"):
+        pickle.loads(sent)
+
+
+def test_corrupt_examples_are_not_streamed(tmp_path):
+    whole = cached(FakeDataset(FakeConfig(size=5)), root=tmp_path, workers=1, progress=False)
+    path = next(tmp_path.glob("fake-*/lanes.points.npy"))
+    path.write_bytes(path.read_bytes()[:-1] + b"\x55")
+    with pytest.raises(UserError, match=r"lanes\.points\.npy is corrupt"):
+        load_or_stream(whole, False, ("lanes",), StreamingConfig(where="disk"))
+    load_or_stream(whole, False, ("bev",), StreamingConfig(where="disk"))  # reads other files
+
+
 def test_an_unknown_part_is_named(dataset):
     with pytest.raises(ValueError, match="no field of Example: lane"):
         load(dataset, parts=("lane",))
@@ -62,5 +101,7 @@ def test_an_unknown_part_is_named(dataset):
 def test_an_empty_dataset_and_uneven_examples_are_refused():
     with pytest.raises(UserError, match="no examples"):
         load(FakeDataset(FakeConfig(size=0)))
+    with pytest.raises(UserError, match="no examples"):
+        load_or_stream(FakeDataset(FakeConfig(size=0)), False, ("lanes",), StreamingConfig(where="disk"))
     with pytest.raises(ValueError, match="bev is"):
         load(UnevenDataset(FakeConfig()))

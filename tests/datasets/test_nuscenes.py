@@ -4,6 +4,7 @@ import json
 import pickle
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -22,12 +23,14 @@ from tflane_jax.cli import main
 from tflane_jax.config import RunConfig, SceneFileData, apply_overrides
 from tflane_jax.config_io import from_json, to_json
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesData, NuScenesDataset
 from tflane_jax.datasets.nuscenes_log import road_user, scene_frames, scene_tracks
 from tflane_jax.datasets.nuscenes_tables import read_tables
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.sources import load, named_source
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange, project
@@ -251,6 +254,16 @@ def test_splits_of_a_run(root):
     file = root / "splits.json"
     file.write_text(json.dumps({"test": ["scene-0061", "scene-0103"]}))
     assert len(opened(root, split="test", splits=file)) == 6
+
+
+def test_frames_from_disk_are_those_in_memory(root):
+    kept, read = (
+        load(NuScenesConfig(root, example=SIZES, loading=StreamingConfig(where=where, threads=2)), progress=False)
+        for where in ("memory", "disk")
+    )
+    assert isinstance(read, Streamed)
+    for one, other in zip(*(batches(data, (1,), range(3), 3) for data in (kept, read)), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def test_a_configuration_is_saved_and_changed(root):

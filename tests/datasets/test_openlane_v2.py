@@ -259,6 +259,8 @@ def test_streamed_frames_can_be_trained_on(whole):
     plain, coloured = (
         next(batches(loaded, (0,), range(1), 2, prepare))[0] for prepare in (None, task.prepare(config.data))
     )
+    kept = task.load(replace(data, loading=StreamingConfig(where="memory", threads=2)).source("train"), progress=False)
+    jax.tree.map(np.testing.assert_array_equal, plain, next(batches(kept, (0,), range(1), 2))[0])
     assert plain.cameras.image.shape == (2, *shapes.cameras.image.shape)
     assert plain.segments.valid.shape == (2, 0)  # not a training part
     assert (plain.cameras.image != coloured.cameras.image).any()

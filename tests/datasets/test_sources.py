@@ -4,7 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
 import pytest
@@ -25,10 +25,12 @@ from tflane_jax.config import (
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2 import Argoverse2Config
 from tflane_jax.datasets.base import SPLITS
+from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.nuscenes import NuScenesConfig
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.errors import UserError
@@ -97,6 +99,20 @@ def test_data_of_a_run_lead_to_their_source(data, kind, names):
     for config in splits:
         source = sources.source_of(config)
         assert (source.data, source.config, source.example) == (type(data), type(config), kind)
+
+
+@pytest.mark.parametrize("source", sources.SOURCES, ids=lambda source: source.name)
+def test_every_dataset_has_the_setting_of_loading(source):
+    """It reaches the config of each split, and no cached example depends on it."""
+    loading, paths = StreamingConfig(where="disk", threads=1), ("root", "train", "val", "test")
+    required = [f.name for f in fields(source.data) if f.default is MISSING and f.default_factory is MISSING]
+    data = source.data(**{name: Path("x") for name in required if name in paths}, loading=loading)
+    for split in SPLITS:
+        config = data.source(split)
+        assert loading_of(config) == loading
+        if source.build is not None:
+            assert repr(config) == repr(replace(config, loading=StreamingConfig()))
+    assert loading_of(object()) == StreamingConfig()
 
 
 def test_root_does_not_override_the_split(tmp_path, logs):

@@ -9,10 +9,17 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fakes import BrokenDataset, FakeConfig, FakeDataset
-from tflane_jax.datasets.batches import batches, first_example, ordered_batches
+from tests.fakes import BrokenDataset, DeadlyDataset, FakeConfig, FakeDataset
+from tflane_jax.datasets.batches import (
+    batch_indices,
+    batches,
+    chosen_examples,
+    first_example,
+    in_workers,
+    ordered_batches,
+)
 from tflane_jax.datasets.loading import keep, load_arrays
-from tflane_jax.datasets.streaming import Request, Streamed, StreamingConfig
+from tflane_jax.datasets.streaming import InOrder, Request, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 
 PARTS = ("lanes", "traffic_elements")
@@ -69,6 +76,51 @@ def test_processes_of_a_run_share_every_batch(make):
         rows((0, 3))
 
 
+@pytest.mark.parametrize("make", [streamed, lambda: in_workers(in_memory(), StreamingConfig(threads=2))])
+def test_an_epoch_goes_on_where_it_was_left(make):
+    """Steps of 3 of 7 examples: the third step ends an epoch and begins the next."""
+    whole = list(batches(in_memory(), (4,), range(6), BATCH, shifted))
+    for first in (1, 2, 5):
+        for batch, expected in zip(batches(make(), (4,), range(first, 6), BATCH, shifted), whole[first:], strict=True):
+            assert_same(batch, expected)
+
+
+def test_workers_augment_examples_in_memory():
+    arrays, threads = in_memory(), set()
+
+    def watched(example, key):
+        threads.add(threading.current_thread().name)
+        return shifted(example, key)
+
+    fed = list(batches(in_workers(arrays, StreamingConfig(threads=2, processes=3)), (4,), range(4), BATCH, watched))
+    assert not [name for name in threads if name.startswith(("MainThread", "batches"))]
+    for batch, expected in zip(fed, batches(arrays, (4,), range(4), BATCH, shifted), strict=True):
+        assert_same(batch, expected)
+    assert in_workers(arrays, StreamingConfig(threads=0)) is arrays
+
+
+class Counting(FakeDataset):
+    """Notes which examples are asked for."""
+
+    def __init__(self, size: int = SIZE):
+        super().__init__(FakeConfig(size))
+        self.asked = []
+
+    def example(self, index):
+        self.asked.append(index)
+        return super().example(index)
+
+
+def test_a_process_loads_its_own_rows_only():
+    datasets = [Counting(12) for _ in range(3)]
+    for index, dataset in enumerate(datasets):
+        list(batches(streamed(dataset=dataset), (4,), range(2), 6, share=(index, 3)))
+    of_epoch = [index for dataset in datasets for index in dataset.asked]
+    assert sorted(of_epoch) == list(range(12))
+    assert [len(dataset.asked) for dataset in datasets] == [4, 4, 4]
+    assert set(datasets[0].asked) == {*batch_indices(4, 0, 12, 6)[:2], *batch_indices(4, 1, 12, 6)[:2]}
+
+
 def test_an_evaluation_goes_through_all_examples_in_order():
     ours, expected = (list(ordered_batches(arrays, BATCH)) for arrays in (streamed(), in_memory()))
     assert [indices for indices, _ in ours] == [range(0, 3), range(3, 6), range(6, 7)]
@@ -78,6 +130,7 @@ def test_an_evaluation_goes_through_all_examples_in_order():
 
 def test_one_example_gives_the_shapes():
     assert_same(first_example(streamed()), first_example(in_memory()))
+    assert_same(chosen_examples(streamed(), [5, 0]), chosen_examples(in_memory(), [5, 0]))
 
 
 @pytest.mark.parametrize("threads", [0, 2])
@@ -87,18 +140,30 @@ def test_an_error_in_a_worker_reaches_the_caller(threads):
         list(broken.stream(lambda number: Request(number, (0, 0, number)), 4))
 
 
-def test_unneeded_parts_are_not_loaded():
-    loaded = []
-
-    class Counting(FakeDataset):
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_file_that_a_worker_cannot_read_is_named(threads, tmp_path):
+    class Lost(FakeDataset):
         def example(self, index):
-            loaded.append(index)
-            return super().example(index)
+            return super().example(index) if index < 2 else (tmp_path / "lost.bin").read_bytes()
 
-    feed = streamed(dataset=Counting(FakeConfig(SIZE)), ahead=4).stream(lambda n: Request(n % SIZE, (0, 0, n)), 1000)
+    lost = Streamed(Lost(FakeConfig(4)), StreamingConfig(threads=threads))
+    with pytest.raises(UserError, match=r"fake: cannot read example 2: .*lost\.bin"):
+        list(lost.stream(lambda number: Request(number, (0, 0, number)), 4))
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_reported():
+    source = Streamed(DeadlyDataset(FakeConfig(4)), StreamingConfig(threads=1, processes=1))
+    with pytest.raises(UserError, match=r"fake: a process that loads examples died: .*data\.loading\.processes"):
+        list(source.stream(InOrder(4), 4))
+
+
+def test_unneeded_parts_are_not_loaded():
+    dataset = Counting()
+    feed = streamed(dataset=dataset, ahead=4).stream(lambda n: Request(n % SIZE, (0, 0, n)), 1000)
     next(feed)
     feed.close()
-    assert len(loaded) <= 4 + 3
+    assert len(dataset.asked) <= 4 + 3
     deadline = time.monotonic() + 5.0
     while any("grain" in thread.name for thread in threading.enumerate()) and time.monotonic() < deadline:
         time.sleep(0.01)

@@ -6,16 +6,23 @@ from dataclasses import replace
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.shared import shared_path
+from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.lane_rows import ROWS, lane_lines, row_lanes
-from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleDataset, load_road_images
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleData, TuSimpleDataset, load_road_images
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
+from tflane_jax.scene import CurvePrediction, Prediction
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 
 ROWS_48 = ROWS[8:]
 
@@ -60,6 +67,63 @@ def test_labels_of_48_heights_stand_in_the_56_rows(root):
         left = 100 + np.arange(56 - first)
         np.testing.assert_allclose(lines.points[0, first:, 0] * 1280, left, rtol=1e-6)  # sorted from left to right
         np.testing.assert_allclose(lines.points[1, first:, 0] * 1280, left + 500, rtol=1e-6)
+
+
+def loaded(root, where, **workers):
+    config = TuSimpleConfig(str(root), loading=StreamingConfig(where=where, **workers))
+    return sources.load(config, progress=False)
+
+
+def test_streamed_images_are_those_in_memory(root, monkeypatch):
+    """Batches, augmentation in workers, labels; "auto" goes by size."""
+    task = LaneShapeTask()
+    prepare = task.prepare(TuSimpleData(root))
+    kept = loaded(root, "memory")
+    expected = list(batches(task.examples(kept), (2,), range(3), 3, prepare))
+    for threads in (0, 2):
+        read = loaded(root, "disk", threads=threads)
+        assert isinstance(task.examples(read), Streamed)
+        assert [truth.x.tolist() for truth in read.truth] == [truth.x.tolist() for truth in kept.truth]
+        for one, other in zip(batches(task.examples(read), (2,), range(3), 3, prepare), expected, strict=True):
+            jax.tree.map(np.testing.assert_array_equal, one, other)
+    assert not isinstance(loaded(root, "auto").images, Streamed)
+    monkeypatch.setattr("tflane_jax.datasets.tusimple.IN_MEMORY", 1000)
+    assert isinstance(loaded(root, "auto").images, Streamed)
+
+
+@pytest.mark.parametrize(("damage", "said"), [("cut", "is empty: copy"), ("lost", "No such file")])
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_an_image_that_a_worker_cannot_read_is_named(root, where, damage, said):
+    dataset = sources.open_dataset(TuSimpleConfig(str(root), loading=StreamingConfig(where=where, threads=1)))
+    image = root / "clips/1/0/20.jpg"
+    image.write_bytes(b"") if damage == "cut" else image.unlink()
+
+    def read():
+        data = sources.source_of(dataset.config).load(dataset, False, (), dataset.config.loading)
+        list(batches(data.images, (2,), range(4), 2))
+
+    with pytest.raises(UserError, match=f"{image}.*{said}"):
+        read()
+
+
+class Straight(LaneShapeTask):
+    """Sees one lane in every image."""
+
+    def predict(self, params, example):
+        logits, curves = (
+            jnp.array([[0.0, 3.0], [3.0, 0.0]]),
+            jnp.tile(jnp.array([0.9, 0.4, 0, 0, 0, 0.5, 0, 0.1]), (2, 1)),
+        )
+        return Prediction(curves=CurvePrediction(logits, curves + 0 * jnp.mean(example.image)))
+
+
+def test_streamed_images_are_evaluated_as_those_in_memory(root, monkeypatch):
+    monkeypatch.setattr("tflane_jax.tasks.lane_shape._loss", lambda task, curves, lines: lines.points.sum())
+    kept, read = (
+        Straight().evaluate({}, loaded(root, where), EvaluationConfig(batch_size=3)) for where in ("memory", "disk")
+    )
+    assert kept == read
+    assert kept.scores()["all/loss"] > 0
 
 
 def test_truth_is_what_the_file_says(root):

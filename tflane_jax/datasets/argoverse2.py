@@ -11,6 +11,7 @@ from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.overlap import frame_drives
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
@@ -24,12 +25,14 @@ class Argoverse2Config:
         root: a dataset root (sensor/<split>/<log id>/), a split, a folder of logs, or one log; all logs below it.
         keyframes, openlane: see `load_log`.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     root: Path
     keyframes: Keyframes = "openlane_v2"
     openlane: Path | None = None
     example: ExampleConfig = field(default_factory=ExampleConfig)
+    loading: StreamingConfig = StreamingConfig()
 
 
 class Argoverse2Dataset:
@@ -75,6 +78,7 @@ class LogData:
         keyframes: which frames become examples, see `load_log`.
         openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     train: Path
@@ -83,10 +87,11 @@ class LogData:
     keyframes: Keyframes = "openlane_v2"
     openlane: Path | None = None
     example: ExampleConfig = ExampleConfig()
+    loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> Argoverse2Config:
         """Return the dataset of a split."""
-        return Argoverse2Config(getattr(self, split), self.keyframes, self.openlane, self.example)
+        return Argoverse2Config(getattr(self, split), self.keyframes, self.openlane, self.example, self.loading)
 
 
 def split_folder(root: Path, split: Split, *, required: bool) -> Path:

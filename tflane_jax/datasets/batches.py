@@ -1,7 +1,7 @@
 """Batches: which examples each step uses, gathered while the step before runs.
 
 Examples are arrays in memory (stacked, numpy leaves with a leading axis) or a `datasets.streaming.Streamed`. Both give
-the same batches.
+the same batches. `in_workers` lets the workers of a `Streamed` augment examples that are in memory.
 """
 
 from __future__ import annotations
@@ -10,17 +10,28 @@ import contextlib
 import functools
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
-from tflane_jax.datasets.streaming import Prepare, Request, Streamed
+from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.streaming import InOrder, Prepare, Request, Streamed, StreamingConfig
 from tflane_jax.scene import stack_examples
 
-__all__ = ["Prepare", "batch_indices", "batches", "count", "first_example", "ordered_batches", "prepared"]
+__all__ = [
+    "Prepare",
+    "batch_indices",
+    "batches",
+    "chosen_examples",
+    "count",
+    "first_example",
+    "in_workers",
+    "ordered_batches",
+    "prepared",
+]
 
 
 def batch_indices(seed: int, step: int, examples: int, batch_size: int) -> Int[np.ndarray, " b"]:
@@ -53,6 +64,20 @@ def first_example(arrays: Any) -> Any:
     return arrays.example(0) if isinstance(arrays, Streamed) else _row(arrays, 0)
 
 
+def chosen_examples(arrays: Any, indices: Sequence[int]) -> Any:
+    """Return some examples, stacked."""
+    if isinstance(arrays, Streamed):
+        return stack_examples([arrays.example(index) for index in indices])
+    return jax.tree.map(lambda leaf: leaf[list(indices)], arrays)
+
+
+def in_workers(arrays: Any, config: StreamingConfig) -> Any:
+    """Return examples so that the threads of `config` augment them; no-op without threads, or if streamed anyway."""
+    if isinstance(arrays, Streamed) or not config.threads:
+        return arrays
+    return Streamed(_Rows(arrays), replace(config, processes=0))
+
+
 def prepared(batch: Any, prepare: Prepare, seed: int, step: int) -> Any:
     """Return stacked examples, augmented as in the given step."""
     size = len(jax.tree.leaves(batch)[0])
@@ -76,7 +101,8 @@ def batches(
         seeds: of the run; each has its own order.
         steps: the steps to yield batches for.
         batch_size: examples of a step (and seed).
-        prepare: augments each example; called in that thread, or in the workers of a `Streamed`.
+        prepare: augments each example with the key (seed, step, place in the batch of all processes); called in the
+            workers of a `Streamed`, or in that thread.
         share: (index, count) of this process among those that divide every batch (`jax.process_index()`,
             `jax.process_count()`); it gets its part of the rows.
         place: puts these rows on the device, or on several (`devices.divided`).
@@ -130,7 +156,7 @@ def ordered_batches(arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]
     starts = range(0, examples, batch_size)
     stream: Generator[Any] = _nothing()
     if isinstance(arrays, Streamed):
-        stream = arrays.stream(_InOrder(examples), len(starts) * batch_size)
+        stream = arrays.stream(InOrder(examples), len(starts) * batch_size)
     with contextlib.closing(stream):
         for start in starts:
             if isinstance(arrays, Streamed):
@@ -167,11 +193,19 @@ class _Order:
         return Request(int(index), (seed, step, place))
 
 
-@dataclass(frozen=True)
-class _InOrder:
-    """Requests of an evaluation, in order; beyond the end the last example is repeated."""
+class _Rows:
+    """Examples in memory as a dataset."""
 
-    examples: int
+    name = "examples in memory"
 
-    def __call__(self, number: int) -> Request:
-        return Request(min(number, self.examples - 1), (0, 0, number))
+    def __init__(self, arrays: Any):
+        self.arrays = arrays
+
+    def __len__(self) -> int:
+        return count(self.arrays)
+
+    def example(self, index: int) -> Any:
+        return _row(self.arrays, index)
+
+    def info(self, index: int) -> FrameInfo:
+        return FrameInfo(self.name, f"example {index}", 0, np.eye(4))

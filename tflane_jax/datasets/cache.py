@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import copy
 import errno
 import functools
 import hashlib
@@ -166,6 +167,18 @@ class CachedDataset:
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, RecursionError) as error:
             raise DamagedEntry(f"{folder}: {error}") from error
 
+        self._parts: frozenset[str] | None = None
+
+    def __reduce__(self):
+        # Pickled maps would be whole arrays: another process opens the files itself.
+        return _reopened, (self.folder, self._parts)
+
+    def only(self, parts: Collection[str]) -> CachedDataset:
+        """Return the same entry with only these fields of its examples."""
+        chosen = copy.copy(self)
+        chosen._parts = frozenset(parts)
+        return chosen
+
     def _map(self, name: str) -> np.ndarray:
         path, expected = leaf_path(self.folder, name), self._index["leaves"][name]["bytes"]
         if path.stat().st_size != expected:
@@ -178,6 +191,10 @@ class CachedDataset:
     def example(self, index: int) -> Example:
         """Return one example, read from disk."""
         return example_from_leaves({name: np.array(array[index]) for name, array in self._leaves().items()})
+
+    def scene(self, index: int) -> str:
+        """Return the scene of one example."""
+        return self._scenes[index]
 
     def info(self, index: int) -> FrameInfo:
         """Return where one example comes from."""
@@ -201,16 +218,34 @@ class CachedDataset:
         for name, array in self._leaves().items():
             if parts is None or name.split(".")[0] in parts:
                 read[name] = array.view(np.ndarray) if mapped else np.array(array)
-                if zlib.crc32(read[name].reshape(-1).view(np.uint8)) != self._index["leaves"][name]["crc32"]:
-                    raise UserError(f"{leaf_path(self.folder, name)} is corrupt: delete {self.folder} and run again")
+                self._check(name, read[name])
         return read
+
+    def check(self) -> None:
+        """Compare the files with their checksums, for examples that are read one by one; raises UserError."""
+        for name, array in self._leaves().items():
+            self._check(name, array.view(np.ndarray))
+
+    def _check(self, name: str, array: Any) -> None:
+        if zlib.crc32(array.reshape(-1).view(np.uint8)) != self._index["leaves"][name]["crc32"]:
+            raise UserError(f"{leaf_path(self.folder, name)} is corrupt: delete {self.folder} and run again")
 
     def nbytes(self, parts: Collection[str]) -> int:
         """Return the bytes that these fields of all examples take in memory."""
         return sum(array.nbytes for name, array in self._leaves().items() if name.split(".")[0] in parts)
 
     def _leaves(self) -> dict[str, np.ndarray]:
-        return {name: array for name, array in self._arrays.items() if not name.startswith("info.")}
+        part = {name: name.split(".")[0] for name in self._arrays}
+        wanted = set(part.values()) - {"info"} if self._parts is None else self._parts
+        return {name: array for name, array in self._arrays.items() if part[name] in wanted}
+
+
+def _reopened(folder: Path, parts: frozenset[str] | None) -> CachedDataset:
+    try:
+        entry = CachedDataset(folder)
+    except (DamagedEntry, FileNotFoundError) as error:
+        raise UserError(f"the examples in {folder} changed while they were used ({error}): run again") from error
+    return entry if parts is None else entry.only(parts)
 
 
 def _is_whole(index: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bool:

@@ -68,7 +68,8 @@ def as_clips(data: Example | Streamed, length: int) -> Example | Streamed:
     inner = np.arange(frames) % length > 0
     if frames % length or (begins & inner).any():
         raise UserError(
-            f"scenes do not split into clips of {length} frames: set data.world.keyframes to a multiple of task.clip"
+            f"scenes do not split into clips of {length} frames: set data.world.keyframes to a multiple of task.clip, "
+            "or data.loading.where=disk, which leaves out the last frames of a scene that fill no clip"
         )
     return jax.tree.map(lambda leaf: leaf.reshape(frames // length, length, *leaf.shape[1:]), data)
 

@@ -15,6 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
 from tflane_jax.datasets.overlap import Drive
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import Example, RoadImage
 
 ConfigT = TypeVar("ConfigT")
@@ -87,7 +88,8 @@ class DataSource(Generic[ConfigT]):
         title: name of a config, for titles and files.
         root: what the folder of --root is, for messages; None for a source that takes no --root.
         open: (config, progress) -> the dataset as training reads it, for example from a cache; None is `dataset`.
-        load: (opened dataset, progress, fields of `Example` to read) -> what training and evaluation take.
+        load: (opened dataset, progress, fields of `Example` to read, loading) -> what training and evaluation take.
+        streams: config -> whether `loading.where="auto"` reads its examples from disk; None leaves that to `load`.
         sample: config -> one example with the shapes and types of all, made as fast as possible; None is the first.
         build: (config, progress) -> number of examples, after making them ahead of training; None where nothing is
             made.
@@ -105,9 +107,15 @@ class DataSource(Generic[ConfigT]):
     title: Callable[[ConfigT], str]
     root: str | None = None
     open: Callable[[ConfigT, bool], Any] | None = None
-    load: Callable[[Any, bool, Collection[str]], Any] = load_or_stream
+    load: Callable[[Any, bool, Collection[str], StreamingConfig], Any] = load_or_stream
+    streams: Callable[[ConfigT], bool] | None = None
     sample: Callable[[ConfigT], Any] | None = None
     build: Callable[[ConfigT, bool], int] | None = None
     check: Callable[..., FolderCheck] | None = None
     drives: Callable[[ConfigT], list[Drive]] | None = None
     tracks: bool = False
+
+
+def loading_of(config: Any) -> StreamingConfig:
+    """Return the setting `loading` of a split's config or of a run's data; the default for a dataset without it."""
+    return getattr(config, "loading", StreamingConfig())

@@ -7,7 +7,7 @@ images are disjoint by construction.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
@@ -19,6 +19,7 @@ from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.lane_rows import LabelledImages, row_lanes
 from tflane_jax.datasets.leaves import image_from_leaves
 from tflane_jax.datasets.procedural import FIRST_SCENE, SCENES_PER_SPLIT
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.limits import Count
@@ -36,12 +37,14 @@ class FrontViewConfig:
         images: number of images, one per scene.
         first: number of scenes to skip at the start of the split's range.
         world: camera, road, traffic, weather, and one `severity` of them all (0 to 1).
+        loading: memory or disk, and workers. It is no part of the repr, because cached images do not depend on it.
     """
 
     split: Split = "train"
     images: int = 4000
     first: int = 0
     world: FrontWorldConfig = FrontWorldConfig()
+    loading: StreamingConfig = field(default=StreamingConfig(), repr=False)
 
 
 class FrontViewDataset:
@@ -123,20 +126,26 @@ class FrontViewData:
     Attributes:
         train, val, test: number of images of each split.
         augmentation: of training images, or None.
+        loading: memory or disk, and workers; "auto" leaves the images on disk, mapped into memory.
     """
 
     train: Count = 4000
     val: Count = 100
     test: Count = 400
     augmentation: AugmentationConfig | None = AugmentationConfig()
+    loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> FrontViewConfig:
         """Return the dataset of a split."""
-        return FrontViewConfig(split, images=getattr(self, split))
+        return FrontViewConfig(split, images=getattr(self, split), loading=self.loading)
 
 
-def _load(dataset: FrontViewDataset, progress: bool, parts: Collection[str]) -> LabelledImages:
+def _load(
+    dataset: FrontViewDataset, progress: bool, parts: Collection[str], loading: StreamingConfig
+) -> LabelledImages:
     images = load_road_images(dataset.config, progress=progress)
+    if loading.where == "memory":
+        images = replace(images, image=np.array(images.image))
     lines = (jax.tree.map(lambda leaf, i=i: leaf[i], images.lines) for i in range(len(images.image)))
     return LabelledImages(images, tuple(row_lanes(each) for each in lines))
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.datasets.streaming import Streamed
 from tflane_jax.files.tusimple import NO_POINT, RowLanes
 from tflane_jax.scene import LaneLines, RoadImage
 
@@ -22,14 +23,14 @@ ROWS_HEIGHT = 720
 
 @dataclass(frozen=True)
 class LabelledImages:
-    """A split of road images in memory.
+    """A split of road images.
 
     Attributes:
-        images: stacked along a new first axis.
+        images: stacked along a new first axis, or read by workers while they are used.
         truth: labels of each image for TuSimple's metric.
     """
 
-    images: RoadImage
+    images: RoadImage | Streamed
     truth: tuple[RowLanes, ...]
 
 

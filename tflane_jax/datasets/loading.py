@@ -1,7 +1,7 @@
-"""Datasets of lane graphs as arrays in memory: one stacked `Example` with a leading axis.
+"""Datasets of lane graphs as training takes them: arrays in memory, or a `Streamed` that workers read.
 
-The arrays are numpy and stay on the host; `datasets.batches` gathers from them. Parts that the model does not read are
-left out.
+Arrays are one stacked `Example` with a leading axis. They are numpy and stay on the host; `datasets.batches` gathers
+from them. Parts that the model does not read are left out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tqdm import tqdm
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.cache import CachedDataset
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
-from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.streaming import InOrder, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Areas, Example, LaneGraph
 
@@ -36,33 +36,49 @@ TRAINING_PARTS = (
 # Fields of `Example` that are never dropped.
 _ALWAYS = ("previous_from_ego", "has_previous")
 IN_MEMORY = 6 * 2**30
-"""Bytes of training examples that are held in memory; a larger dataset is read from disk while training."""
+"""Bytes of examples that `loading.where="auto"` keeps in memory, where their size is known before they are read."""
 
 
 def load_or_stream(
-    dataset: Dataset, progress: bool = True, parts: Collection[str] = TRAINING_PARTS
+    dataset: Dataset, progress: bool, parts: Collection[str], loading: StreamingConfig
 ) -> Example | Streamed:
-    """Return some parts of all examples: stacked in memory, or streamed where they exceed `IN_MEMORY`.
+    """Return some parts of all examples, stacked in memory or streamed, as `loading.where` says.
 
-    Only a `CachedDataset` is streamed, because its size is known before it is read.
+    "auto" streams a `CachedDataset` that exceeds `IN_MEMORY`, and keeps all others in memory.
     """
-    if isinstance(dataset, CachedDataset) and dataset.nbytes(parts) > IN_MEMORY:
-        return stream(dataset, StreamingConfig(), parts)
-    return load_arrays(dataset, parts=parts, progress=progress)
+    large = isinstance(dataset, CachedDataset) and dataset.nbytes(parts) > IN_MEMORY
+    if loading.where == "disk" or (loading.where == "auto" and large):
+        return stream(dataset, loading, parts)
+    workers = loading if loading.where == "memory" else None
+    return load_arrays(dataset, parts=parts, progress=progress, workers=workers)
 
 
 def stream(dataset: Dataset, config: StreamingConfig, parts: Collection[str] = TRAINING_PARTS) -> Streamed:
-    """Return some parts of all examples, read by workers while they are used."""
+    """Return some parts of all examples, read by workers while they are used.
+
+    Raises UserError if the dataset is empty, or a cache file is corrupt.
+    """
+    _refuse_empty(dataset)
+    if isinstance(dataset, CachedDataset):
+        dataset = dataset.only(_checked(parts))
+        dataset.check()
     return Streamed(dataset, config, partial(keep, parts=parts))
 
 
-def load_arrays(dataset: Dataset, *, parts: Collection[str] | None = None, progress: bool = True) -> Example:
+def load_arrays(
+    dataset: Dataset,
+    *,
+    parts: Collection[str] | None = None,
+    progress: bool = True,
+    workers: StreamingConfig | None = None,
+) -> Example:
     """Read a whole dataset into memory.
 
     Args:
         dataset: a `CachedDataset` is read at the speed of the disk, any other dataset example by example.
         parts: fields of `Example` to keep, default all; see `keep`.
         progress: show a bar with rate and time left where examples are made one by one.
+        workers: make the examples of a dataset that is not cached; None makes them in this thread.
 
     Returns:
         The examples stacked along a new first axis.
@@ -71,22 +87,31 @@ def load_arrays(dataset: Dataset, *, parts: Collection[str] | None = None, progr
         UserError: the dataset is empty, or a cache file is corrupt.
         ValueError: a name in `parts` is no field of `Example`, or examples differ in shape.
     """
-    if len(dataset) == 0:
-        raise UserError(f"dataset {dataset.name} has no examples")
+    _refuse_empty(dataset)
     wanted = None if parts is None else _checked(parts)
     if isinstance(dataset, CachedDataset):
         leaves = dataset.arrays(wanted)
     else:
-        leaves = _stacked(dataset, wanted, progress)
+        leaves = _stacked(dataset, wanted, progress, workers)
     return _completed(example_from_leaves(leaves), len(dataset))
 
 
-def _stacked(dataset: Dataset, parts: Collection[str] | None, progress: bool) -> Mapping[str, np.ndarray]:
+def _refuse_empty(dataset: Dataset) -> None:
+    if len(dataset) == 0:
+        raise UserError(f"dataset {dataset.name} has no examples")
+
+
+def _stacked(
+    dataset: Dataset, parts: Collection[str] | None, progress: bool, workers: StreamingConfig | None
+) -> Mapping[str, np.ndarray]:
     """Make every example and write it straight into the stacked arrays, so that memory holds the data only once."""
     leaves: dict[str, np.ndarray] = {}
-    bar = tqdm(range(len(dataset)), desc=f"loading {dataset.name}", unit="example", disable=not progress)
-    for index in bar:
-        for name, leaf in example_leaves(dataset.example(index)).items():
+    count, examples = len(dataset), map(dataset.example, range(len(dataset)))
+    if workers is not None:
+        examples = Streamed(dataset, workers).stream(InOrder(count), count)
+    bar = tqdm(examples, f"loading {dataset.name}", count, unit="example", disable=not progress)
+    for index, example in enumerate(bar):
+        for name, leaf in example_leaves(example).items():
             if parts is not None and name.split(".")[0] not in parts:
                 continue
             if index == 0:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +18,6 @@ import numpy as np
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
-from tflane_jax.datasets.loading import load_or_stream, stream
 from tflane_jax.datasets.nuscenes_cameras import (
     CameraPoses,
     CanBus,
@@ -45,7 +43,7 @@ from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.prepared_map import prepare_map
-from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
@@ -74,7 +72,7 @@ class NuScenesConfig:
             (`nuscenes_can_bus.can_bus`), for published weights that read them (`BevFormerConfig.motion`).
         image: scaling and cropping of the camera images; None does not read them.
         example: what is in an example, and its capacities. `example.cameras` must be None: cameras are real here.
-        loading: workers that read images; they change no example.
+        loading: memory or disk, and workers; no example depends on it.
     """
 
     root: Path
@@ -297,19 +295,13 @@ def _choose(choice: Choice) -> NuScenesConfig:
     return NuScenesConfig(choice.root, split, image=image, example=replace(example, cameras=None))
 
 
-def _load(dataset: NuScenesDataset, progress: bool, parts: Collection[str]) -> Example | Streamed:
-    if dataset.config.image is not None:
-        return stream(dataset, dataset.config.loading, parts)
-    return load_or_stream(dataset, progress, parts)
-
-
 SOURCE = DataSource(
     name="nuscenes",
     data=NuScenesData,
     config=NuScenesConfig,
     example=Example,
     dataset=NuScenesDataset,
-    load=_load,
+    streams=lambda config: config.image is not None,
     choose=_choose,
     title=lambda config: f"nuscenes-{config.split}",
     drives=lambda config: frame_drives(NuScenesDataset(config)),

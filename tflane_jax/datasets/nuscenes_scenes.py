@@ -11,6 +11,7 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file
 from tflane_jax.datasets.nuscenes_splits import official_split
 from tflane_jax.datasets.overlap import frame_drives
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example
 
@@ -26,11 +27,13 @@ class SceneFileConfig:
         root: a scene file, or a folder of them.
         scenes: names of the files without .npz; empty takes all.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     root: Path
     scenes: tuple[str, ...] = ()
     example: ExampleConfig = NUSCENES_SIZES
+    loading: StreamingConfig = StreamingConfig()
 
 
 class SceneFileDataset:
@@ -72,6 +75,7 @@ class SceneFileData:
         root: folder of the files.
         train, val, test: names of the scenes of each.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     root: Path
@@ -79,10 +83,11 @@ class SceneFileData:
     val: tuple[str, ...]
     test: tuple[str, ...]
     example: ExampleConfig = NUSCENES_SIZES
+    loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> SceneFileConfig:
         """Return the dataset of a split."""
-        return SceneFileConfig(self.root, getattr(self, split), self.example)
+        return SceneFileConfig(self.root, getattr(self, split), self.example, self.loading)
 
 
 def check_scene_files(root: Path) -> FolderCheck:

@@ -8,7 +8,6 @@ virtual markers (`openlane_markers`) and the official SD map (`openlane_sd_map`)
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
@@ -20,7 +19,6 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
-from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.openlane_annotation import read_annotation
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_check_cameras import Images
@@ -41,7 +39,7 @@ from tflane_jax.datasets.openlane_sd_map import SegmentSdMaps
 from tflane_jax.datasets.openlane_tracks import SourceTracks, WithoutTracks
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
-from tflane_jax.datasets.streaming import Streamed, StreamingConfig
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_A, TOPONET_SUBSET_B, ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image
@@ -69,7 +67,7 @@ class OpenLaneV2Config:
         image: scaling and cropping of the images; None does not read them (`Example.cameras` is None, boxes are in
             pixels of the files).
         example: capacities and points; what does not fit is left out, farthest first, with a `TruncationWarning`.
-        loading: workers; they change no example.
+        loading: memory or disk, and workers; no example depends on it.
         map_changes: "drop" leaves out the logs whose streets differ from their map, see `openlane_frames.MAP_CHANGES`.
         tracks: folder of the Argoverse 2 logs from which subset A was made, or of nuScenes for B; their boxes become
             the traffic flow, as many frames and at the rate that `example.history` and `example.history_hz` say. None:
@@ -309,10 +307,6 @@ class OpenLaneV2Data:
         )
 
 
-def _load(dataset: OpenLaneV2Dataset, progress: bool, parts: Collection[str]) -> Streamed:
-    return stream(dataset, dataset.config.loading, parts)
-
-
 def _sample(config: OpenLaneV2Config) -> Example:
     return OpenLaneV2Dataset(config).example(0) if Path(config.root).is_dir() else nominal_example(config)
 
@@ -337,7 +331,7 @@ SOURCE = DataSource(
     config=OpenLaneV2Config,
     example=Example,
     dataset=OpenLaneV2Dataset,
-    load=_load,
+    streams=lambda config: True,
     sample=_sample,
     choose=_choose,
     title=lambda config: f"openlane-v2-{config.subset}-{config.split}",

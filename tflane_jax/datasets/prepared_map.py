@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import weakref
 from dataclasses import dataclass
 from functools import cached_property
@@ -85,20 +86,22 @@ class PreparedMap:
 
 
 _PREPARED: dict[tuple[int, bool], PreparedMap] = {}
+_LOCK = threading.Lock()
 
 
 def prepare_map(vector_map: VectorMap, *, bike_lanes: bool) -> PreparedMap:
-    """Merge, pack and sample a map; the result is cached for the lifetime of the map object.
+    """Merge, pack and sample a map; the result is cached for the lifetime of the map object. Threads may call it.
 
     Args:
         vector_map: global frame.
         bike_lanes: whether to keep bicycle lanes. Whether the official ground truth does is unknown; MapTRv2 does.
     """
     key = (id(vector_map), bike_lanes)
-    if key not in _PREPARED:
-        _PREPARED[key] = _prepare(vector_map, bike_lanes)
-        weakref.finalize(vector_map, _PREPARED.pop, key)
-    return _PREPARED[key]
+    with _LOCK:
+        if key not in _PREPARED:
+            _PREPARED[key] = _prepare(vector_map, bike_lanes)
+            weakref.finalize(vector_map, _PREPARED.pop, key)
+        return _PREPARED[key]
 
 
 def _prepare(vector_map: VectorMap, bike_lanes: bool) -> PreparedMap:

@@ -15,6 +15,7 @@ from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.cache import CachedDataset, cached
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -41,6 +42,7 @@ class ProceduralConfig:
         first: number of scenes to skip at the start of the split's range.
         world: roads, traffic, tracker.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers. It is no part of the repr, because cached examples do not depend on it.
     """
 
     split: Split = "train"
@@ -48,6 +50,7 @@ class ProceduralConfig:
     first: int = 0
     world: WorldConfig = field(default_factory=WorldConfig)
     example: ExampleConfig = field(default_factory=ExampleConfig)
+    loading: StreamingConfig = field(default=StreamingConfig(), repr=False)
 
 
 class SimulatedDataset:
@@ -153,6 +156,7 @@ class WorldData:
         train, val, test: number of scenes of each split.
         world: roads, traffic, tracker.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     train: Count = 2000
@@ -160,6 +164,7 @@ class WorldData:
     test: Count = 200
     world: WorldConfig = WorldConfig()
     example: ExampleConfig = ExampleConfig()
+    loading: StreamingConfig = StreamingConfig()
 
     def limits(self) -> Rules:
         """Scenes are long enough for their key frames."""
@@ -167,7 +172,8 @@ class WorldData:
 
     def source(self, split: Split) -> ProceduralConfig:
         """Return the dataset of a split."""
-        return ProceduralConfig(split, scenes=getattr(self, split), world=self.world, example=self.example)
+        scenes = getattr(self, split)
+        return ProceduralConfig(split, scenes, world=self.world, example=self.example, loading=self.loading)
 
     @classmethod
     def city(cls, train: int = 3000, val: int = 25, test: int = 300) -> WorldData:

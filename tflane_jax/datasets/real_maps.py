@@ -21,6 +21,7 @@ from tflane_jax.datasets.overlap import Drive
 from tflane_jax.datasets.procedural import SimulatedDataset, scene_limits
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig
 from tflane_jax.datasets.road_maps import MapFile, chosen_maps, find_maps
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.limits import Count, Fraction, Rules
 from tflane_jax.scene import Example
@@ -50,6 +51,7 @@ class RealMapConfig:
         generated_world: all of the scenes on generated roads.
         example: what is in an example, and its capacities.
         content: hashes of the maps' files, filled in when they are opened: examples of other files are others.
+        loading: as of `ProceduralConfig`.
     """
 
     maps: Path
@@ -63,6 +65,7 @@ class RealMapConfig:
     generated_world: WorldConfig = CITY
     example: ExampleConfig = field(default_factory=lambda: RECORDED_EXAMPLE)
     content: tuple[str, ...] = ()
+    loading: StreamingConfig = field(default=StreamingConfig(), repr=False)
 
 
 class RealMapDataset(SimulatedDataset):
@@ -133,6 +136,7 @@ class RealMapData:
         world: traffic, tracker and key frames of the scenes on maps.
         generated_world: all of the scenes on generated roads.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     maps: Path = Path("data/maps")
@@ -148,6 +152,7 @@ class RealMapData:
     world: WorldConfig = REAL_MAPS
     generated_world: WorldConfig = CITY
     example: ExampleConfig = RECORDED_EXAMPLE
+    loading: StreamingConfig = StreamingConfig()
 
     def limits(self) -> Rules:
         """Scenes are long enough for their key frames."""
@@ -159,7 +164,8 @@ class RealMapData:
         """Return the dataset of a split."""
         if split == "test" and self.test_on == "recordings":
             without = () if self.test_logs else self.without
-            return RecordedConfig(self.maps, self.test_logs, without, self.test_traffic, self.example)
+            logs, traffic = self.test_logs, self.test_traffic
+            return RecordedConfig(self.maps, logs, without, traffic, self.example, self.loading)
         logs = {"train": (), "val": self.val_logs, "test": self.test_logs}[split]
         return RealMapConfig(
             self.maps,
@@ -171,6 +177,7 @@ class RealMapData:
             world=self.world,
             generated_world=self.generated_world,
             example=self.example,
+            loading=self.loading,
         )
 
 

@@ -16,6 +16,7 @@ from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.procedural import CITY_EXAMPLE
 from tflane_jax.datasets.road_maps import chosen_maps
+from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 
@@ -33,6 +34,7 @@ class RecordedConfig:
         without: names of logs to leave out.
         traffic: name of a log of the folder whose traffic flow replaces that of every log; "" for their own.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     root: Path
@@ -40,6 +42,7 @@ class RecordedConfig:
     without: tuple[str, ...] = ()
     traffic: str = ""
     example: ExampleConfig = field(default_factory=lambda: RECORDED_EXAMPLE)
+    loading: StreamingConfig = StreamingConfig()
 
 
 class RecordedDataset:
@@ -89,18 +92,20 @@ class RecordedData:
         val, test: names of the logs of these splits; all others are training logs. A split without names has the
             training logs.
         example: what is in an example, and its capacities.
+        loading: memory or disk, and workers.
     """
 
     root: Path = Path("data/maps")
     val: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
     example: ExampleConfig = RECORDED_EXAMPLE
+    loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> RecordedConfig:
         """Return the dataset of a split."""
         logs = {"train": (), "val": self.val, "test": self.test}[split]
         without = () if logs else tuple(sorted({*self.val, *self.test}))
-        return RecordedConfig(self.root, logs, without, example=self.example)
+        return RecordedConfig(self.root, logs, without, example=self.example, loading=self.loading)
 
 
 def _choose(choice: Choice) -> RecordedConfig:

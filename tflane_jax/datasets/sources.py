@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any, Union
 
 from tflane_jax.datasets import (
@@ -16,7 +17,7 @@ from tflane_jax.datasets import (
     recorded_logs,
     tusimple,
 )
-from tflane_jax.datasets.data_source import DataSource
+from tflane_jax.datasets.data_source import DataSource, loading_of
 from tflane_jax.datasets.loading import TRAINING_PARTS
 from tflane_jax.errors import UserError
 from tflane_jax.scene import Example, RoadImage
@@ -78,10 +79,13 @@ def open_dataset(config: Any, *, progress: bool = True) -> Any:
 def load(config: Any, *, progress: bool = True, parts: Collection[str] = TRAINING_PARTS) -> Any:
     """Return the examples of a config as training and evaluation take them; `parts` are fields of `Example`.
 
-    Lane graphs: a stacked `Example`, or a `Streamed` that is read while it is used (OpenLane-V2, and a built-in world
-    larger than `loading.IN_MEMORY`). Road images: `lane_rows.LabelledImages`.
+    Lane graphs: a stacked `Example`, or a `Streamed` that is read while it is used. Road images:
+    `lane_rows.LabelledImages`, whose images are either. `config.loading` decides.
     """
-    return source_of(config).load(open_dataset(config, progress=progress), progress, parts)
+    source, loading = source_of(config), loading_of(config)
+    if loading.where == "auto" and source.streams is not None and source.streams(config):
+        loading = replace(loading, where="disk")
+    return source.load(open_dataset(config, progress=progress), progress, parts, loading)
 
 
 def sample(config: Any) -> Any:

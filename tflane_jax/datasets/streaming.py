@@ -1,4 +1,4 @@
-"""Datasets too large for memory: workers load examples shortly before they are needed, with grain.
+"""Examples that workers load and augment shortly before they are needed, with grain.
 
 The caller decides the order of examples (`datasets.batches`, from seed and step alone). Neither the number of workers
 nor an interruption changes it, and the position in the data is the step in the checkpoint.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -19,19 +19,27 @@ from tflane_jax.limits import Count, CountOrZero
 
 # Draws in place of an example that is not wanted.
 _MOST_DRAWS = 1000
+# In grain's message about a worker process that ended without an error of its own.
+_DIED = "terminated unexpectedly"
 
 
 @dataclass(frozen=True)
 class StreamingConfig:
-    """Workers; they change only the speed.
+    """Where examples are kept, and the workers that load and augment them.
+
+    Batches do not depend on it, except with `task.empty_frames=skip`: see `empty_frames.without_empty`.
 
     Attributes:
-        threads: threads that load examples, in each process; 0 loads an example on request.
+        where: "memory": all examples of a split are read once and kept; "disk": each is read, decoded and prepared
+            shortly before it is needed; "auto": what suits the dataset (docs/scale.md has the table).
+        threads: threads that load and augment examples, in each process; 0 does so on request.
         ahead: examples loaded ahead of the current one, in each process.
         processes: further processes that load, for datasets whose code holds Python's global lock (decoding images
-            does not). The caller's script must then be guarded by `if __name__ == "__main__":`.
+            does not). The caller's script must then be guarded by `if __name__ == "__main__":`. Not for examples in
+            memory.
     """
 
+    where: Literal["auto", "memory", "disk"] = "auto"
     threads: CountOrZero = 4
     ahead: Count = 16
     processes: CountOrZero = 0
@@ -46,6 +54,20 @@ class Request(NamedTuple):
 
 Prepare = Callable[[Any, tuple[int, int, int]], Any]
 """Augmentation: (example in numpy, (run seed, step, place in the batch)) -> example for the training step."""
+
+
+@dataclass(frozen=True)
+class InOrder:
+    """Requests of all examples in order; beyond the end the last one is repeated.
+
+    Attributes:
+        examples: number of examples.
+    """
+
+    examples: int
+
+    def __call__(self, number: int) -> Request:
+        return Request(min(number, self.examples - 1), (0, 0, number))
 
 
 @dataclass(frozen=True)
@@ -98,8 +120,9 @@ class Streamed:
             prepare: applied to every example, in the worker that loads it.
 
         Raises:
-            UserError: grain is not installed, or the settings are out of range.
-            Exception: what `dataset.example` raises.
+            UserError: grain is not installed, the settings are out of range, a file cannot be read, or a worker process
+                died.
+            Exception: what else `dataset.example` raises.
         """
         if min(self.config.threads, self.config.processes) < 0 or self.config.ahead < 1:
             raise UserError(f"{self.config}: threads and processes must be at least 0, ahead at least 1")
@@ -113,6 +136,14 @@ class Streamed:
         iterator = iter(loaded)
         try:
             yield from iterator
+        except RuntimeError as error:
+            if _DIED not in str(error):
+                raise
+            raise UserError(
+                f"{self.dataset.name}: a process that loads examples died: either memory ran out (set fewer "
+                "data.loading.processes, or 0), or a script started the training outside "
+                '`if __name__ == "__main__":` (these processes import the script)'
+            ) from error
         finally:
             iterator.close()
 
@@ -127,7 +158,10 @@ class _Load:
 
     def __call__(self, number: int) -> Any:
         request = self.requests(int(number))
-        example = self.source.requested(request)
+        try:
+            example = self.source.requested(request)
+        except OSError as error:
+            raise UserError(f"{self.source.dataset.name}: cannot read example {request.index}: {error}") from error
         return example if self.prepare is None else self.prepare(example, request.key)
 
 

@@ -22,9 +22,11 @@ from tqdm import tqdm
 
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import SPLITS, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck, loading_of
 from tflane_jax.datasets.lane_rows import LabelledImages, lane_lines
+from tflane_jax.datasets.loading import IN_MEMORY
 from tflane_jax.datasets.photos import HEIGHT, WIDTH
+from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image, resize
 from tflane_jax.files.tusimple import RowLanes, read_truth
@@ -57,6 +59,7 @@ class TuSimpleConfig:
         label_files: file names in these folders to read instead of the split's files; each must exist.
         height, width: size of an example's image, pixels.
         capacity: lines in an example; of more, those with the fewest points are left out.
+        loading: memory or disk, and workers.
     """
 
     root: str = "data/tusimple/LaneDetection"
@@ -65,6 +68,7 @@ class TuSimpleConfig:
     height: int = HEIGHT
     width: int = WIDTH
     capacity: int = 8
+    loading: StreamingConfig = StreamingConfig()
 
 
 class TuSimpleDataset:
@@ -204,6 +208,7 @@ class TuSimpleData:
         root: folder with clips and label files, see `TuSimpleConfig`.
         train, val, test: which label files each split reads, see `TuSimpleConfig.split`.
         augmentation: of training images, or None.
+        loading: memory or disk, and workers; "auto" keeps up to 6 GiB of decoded images in memory.
     """
 
     root: Path
@@ -211,14 +216,17 @@ class TuSimpleData:
     val: LabelSplit = "val"
     test: LabelSplit = "test"
     augmentation: AugmentationConfig | None = AugmentationConfig()
+    loading: StreamingConfig = StreamingConfig()
 
     def source(self, split: Split) -> TuSimpleConfig:
         """Return the dataset of a split."""
-        return TuSimpleConfig(str(self.root), getattr(self, split))
+        return TuSimpleConfig(str(self.root), getattr(self, split), loading=self.loading)
 
 
-def _load(dataset: TuSimpleDataset, progress: bool, parts: Collection[str]) -> LabelledImages:
-    images = load_road_images(dataset, progress=progress)
+def _load(dataset: TuSimpleDataset, progress: bool, parts: Collection[str], loading: StreamingConfig) -> LabelledImages:
+    large = len(dataset) * dataset.config.height * dataset.config.width * 3 > IN_MEMORY
+    streams = loading.where == "disk" or (loading.where == "auto" and large)
+    images = Streamed(dataset, loading) if streams else load_road_images(dataset, progress=progress)
     return LabelledImages(images, tuple(dataset.truth(index) for index in range(len(dataset))))
 
 
@@ -229,7 +237,7 @@ def _choose(choice: Choice) -> TuSimpleConfig:
     mapping must not turn `--split test --root FOLDER` into an evaluation on the training frames of FOLDER.
     """
     assert choice.root is not None
-    return TuSimpleConfig(str(choice.root), choice.split)
+    return TuSimpleConfig(str(choice.root), choice.split, loading=loading_of(choice.configured))
 
 
 def check_tusimple(root: Path) -> FolderCheck:

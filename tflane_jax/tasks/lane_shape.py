@@ -16,15 +16,16 @@ from jaxtyping import Array, Float
 
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.augmentation import augment
+from tflane_jax.datasets.batches import chosen_examples, count
 from tflane_jax.datasets.data_source import SplitData
 from tflane_jax.datasets.front_views import FrontViewConfig
 from tflane_jax.datasets.lane_rows import LabelledImages
 from tflane_jax.datasets.photos import HEIGHT as INPUT_HEIGHT
 from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
-from tflane_jax.datasets.streaming import Prepare
+from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.evaluation import lane_shapes
-from tflane_jax.evaluation.predict import Predictor, predict_batch, predictions
+from tflane_jax.evaluation.predict import Predictor, predict_batch, predicted_batches, predictions
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
@@ -105,10 +106,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         """Return None: images have no memory."""
 
     def load(self, source: ImageSource, *, progress: bool = True) -> LabelledImages:
-        """Return the images of a source, stacked, with their labels."""
+        """Return the images of a source, in memory or streamed, with their labels."""
         return sources.load(source, progress=progress)
 
-    def examples(self, data: LabelledImages) -> RoadImage:
+    def examples(self, data: LabelledImages) -> RoadImage | Streamed:
         """Return the images with their lane lines."""
         return data.images
 
@@ -134,8 +135,8 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     ) -> Evaluation:
         """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss; without groups."""
         metrics, losses = TuSimpleMetrics(), []
-        for indices, answer in predictions(self, params, data.images, config.batch_size):
-            lines = jax.tree.map(lambda leaf, i=indices: leaf[i.start : i.stop], data.images.lines)
+        for indices, batch, answer in predicted_batches(self, params, data.images, config.batch_size):
+            lines = jax.tree.map(lambda leaf, i=indices: leaf[: len(i)], batch.lines)
             losses += [float(_loss(self, answer.curves, lines))] * len(indices)
             for row, index in enumerate(indices):
                 truth, found = data.truth[index], jax.tree.map(lambda leaf, i=row: leaf[i], answer.curves)
@@ -167,8 +168,7 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         """Draw a few test images, every model beside the ground truth."""
         from tflane_jax.plots.images import save_road_images
 
-        images = data.images
-        examples = jax.tree.map(lambda leaf: leaf[spread(len(images.image), _COMPARED_EXAMPLES)], images)
+        examples = chosen_examples(data.images, spread(count(data.images), _COMPARED_EXAMPLES))
         answers = {name: predict_curves(model.task, model.params, examples) for name, model in models.items()}
         return save_road_images(path, examples, answers)
 

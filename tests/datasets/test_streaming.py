@@ -99,6 +99,12 @@ def test_workers_augment_examples_in_memory():
     assert in_workers(arrays, StreamingConfig(threads=0)) is arrays
 
 
+def test_examples_in_memory_are_augmented_without_grain_too(monkeypatch):
+    arrays = in_memory()
+    monkeypatch.setattr("tflane_jax.datasets.batches.find_spec", lambda name: None)
+    assert in_workers(arrays, StreamingConfig(threads=2)) is arrays
+
+
 class Counting(FakeDataset):
     """Notes which examples are asked for."""
 

@@ -11,6 +11,7 @@ import functools
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import Any
 
 import jax
@@ -72,8 +73,12 @@ def chosen_examples(arrays: Any, indices: Sequence[int]) -> Any:
 
 
 def in_workers(arrays: Any, config: StreamingConfig) -> Any:
-    """Return examples so that the threads of `config` augment them; no-op without threads, or if streamed anyway."""
-    if isinstance(arrays, Streamed) or not config.threads:
+    """Return examples so that the threads of `config` augment them.
+
+    The thread that gathers batches does so, which gives the same ones, without threads or grain. Streamed examples are
+    returned as they are: their workers augment them.
+    """
+    if isinstance(arrays, Streamed) or not config.threads or find_spec("grain") is None:
         return arrays
     return Streamed(_Rows(arrays), replace(config, processes=0))
 

@@ -28,8 +28,9 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import from_first
+from tflane_jax.processes import from_first, is_first
 from tflane_jax.run_checks import check_run
+from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
@@ -63,21 +64,28 @@ class Run:
 def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress: bool = True) -> TrainingResult:
     """Train a configuration into a folder, with data, evaluation on the validation split, curves and pictures.
 
-    Raises UserError like `training.loop.train` and the datasets.
+    Raises UserError like `training.loop.train` and the datasets, and `Interrupted` like that.
     """
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
-    task = config.task
     check_run(config)
     if start != "resume":
         _check_frozen(config)
     if config.training.init_from is not None and start != "resume":
         check_origins(config.training.init_from, config.training.seeds)
-    data: Any = task.load(config.data.source("train"), progress=progress)
-    task.check(config.data, data)
-    arrays, prepare = task.examples(data), task.prepare(config.data)
-    if prepare is not None:
-        arrays = in_workers(arrays, loading_of(config.data))
-    validation: Any = task.load(config.data.source("val"), progress=progress)
+    with showing(progress and is_first()):
+        return _train(config, folder, start=start, progress=progress)
+
+
+def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> TrainingResult:
+    task = config.task
+    with stage("reading the training data"):
+        data: Any = task.load(config.data.source("train"), progress=progress)
+        task.check(config.data, data)
+        arrays, prepare = task.examples(data), task.prepare(config.data)
+        if prepare is not None:
+            arrays = in_workers(arrays, loading_of(config.data))
+    with stage("reading the validation data"):
+        validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:
         return task.evaluate(params, validation, config.evaluation).scores()
@@ -272,7 +280,7 @@ def evaluate_run(
         run: as from `open_run`.
         source: configuration of the examples.
         task: a variant of the run's task, such as from `limit_instances`; None: the run's task.
-        progress: show progress bars while loading data.
+        progress: show progress bars and stages.
         frame_groups: a further group for each example, measured on its own.
 
     Returns:
@@ -280,10 +288,14 @@ def evaluate_run(
         means and standard deviations (n - 1) follow.
     """
     task = run.config.task if task is None else task
-    arrays = task.load(source, progress=progress)
     further = {"frame_groups": frame_groups} if frame_groups else {}
-    every = [task.evaluate(params, arrays, run.config.evaluation, **further) for params in run.params]
-    seeds = run.config.training.seeds
+    seeds, every = run.config.training.seeds, []
+    with showing(progress):
+        with stage("reading the data"):
+            arrays = task.load(source, progress=progress)
+        for seed, params in zip(seeds, run.params, strict=True):
+            with stage("evaluating" if len(seeds) == 1 else f"evaluating seed {seed}"):
+                every.append(task.evaluate(params, arrays, run.config.evaluation, **further))
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:
         values = [one.groups[group] for one in every]

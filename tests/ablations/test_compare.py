@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import re
+import signal
+import time
 
 import pytest
 
@@ -39,6 +41,23 @@ def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
     assert re.search(r"seed_0 failed: its messages are in .*seed_0\.log", str(failure))
     assert "killed by SIGKILL" in str(failure)
     assert "killed by SIGKILL" in job.log.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["tracing the update step", "compiling the update step"])
+def test_workers_tell_their_stage_and_end_at_once(tmp_path, monkeypatch, stage):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    job = Job(CONFIG, tmp_path / "runs" / "seed_0")
+    with Worker(0, 1) as worker:
+        worker.begin(job)
+        while worker.stage != f" ({stage})":
+            assert worker.check() is None
+        asked = time.perf_counter()
+    assert time.perf_counter() - asked < 10  # left with a job, it is told to stop
+    assert worker._process.exitcode == 128 + signal.SIGTERM
+    assert stage in job.log.read_text()
+    assert "Traceback" not in job.log.read_text()
+    assert not (job.folder / "checkpoints").exists()
 
 
 @pytest.mark.parametrize(("available", "parallel", "each"), [(8, 2, 4), (3, 2, 1), (2, 5, 1), (4, 1, 4)])

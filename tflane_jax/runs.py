@@ -5,6 +5,7 @@ The Python interface behind `tflane train`, `eval` and `predict`, also for noteb
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.errors import FlaxError
 
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
@@ -29,7 +31,7 @@ from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import from_first, is_first
-from tflane_jax.run_checks import check_run
+from tflane_jax.run_checks import check_model, check_run
 from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.fine_tuning import check_origins
@@ -69,9 +71,7 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
     check_run(config)
     if start != "resume":
-        _check_frozen(config)
-    if config.training.init_from is not None and start != "resume":
-        check_origins(config.training.init_from, config.training.seeds)
+        check_origin(config)
     with showing(progress and is_first()):
         return _train(config, folder, start=start, progress=progress)
 
@@ -108,8 +108,10 @@ def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> 
     )
 
 
-def _check_frozen(config: RunConfig) -> None:
-    """Raise UserError if modules are frozen that would start from random weights."""
+def check_origin(config: RunConfig) -> None:
+    """Raise UserError if the run to start from is missing, or frozen modules would start from random weights."""
+    if config.training.init_from is not None:
+        check_origins(config.training.init_from, config.training.seeds)
     if config.task.frozen and config.training.init_from is None:
         raise UserError(
             f"{', '.join(config.task.frozen)} would stay random: this configuration freezes them "
@@ -183,8 +185,8 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: the checkpoint is missing, damaged, or of an unreadable version.
     """
     plain = Checkpoints(folder / "checkpoints")
-    step = plain.find("last")
-    config, notices = _read_config(plain.path(step) / "manifest.json", plain.manifest(step).config)
+    last = plain.find("last")
+    config, notices = _read_config(plain.path(last) / "manifest.json", plain.manifest(last).config)
     for notice in notices:
         print(notice, file=sys.stderr)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
@@ -200,7 +202,18 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
     if len(seeds) > 1 and any(leaf.shape[:1] != (len(seeds),) for leaf in jax.tree.leaves(averaged)):
         raise UserError(f"{checkpoints.path(step)} has not the parameters of {len(seeds)} seeds (training.seeds)")
     params = per_seed(averaged, seeds)
+    if _is_edited(plain, last, folder):
+        check_model(config, params[0], str(checkpoints.path(step)))
     return Run(str(folder), config, step, tuple(params))
+
+
+def _is_edited(checkpoints: Checkpoints, step: int, folder: Path) -> bool:
+    """Return whether a checkpoint's configuration was changed; of an older version's, whether config.json differs."""
+    if (edited := checkpoints.is_edited(step)) is not None:
+        return edited
+    with contextlib.suppress(UserError):
+        return read_config(folder) != checkpoints.manifest(step).config
+    return False
 
 
 def open_weights(config: RunConfig) -> Run:
@@ -295,7 +308,11 @@ def evaluate_run(
             arrays = task.load(source, progress=progress)
         for seed, params in zip(seeds, run.params, strict=True):
             with stage("evaluating" if len(seeds) == 1 else f"evaluating seed {seed}"):
-                every.append(task.evaluate(params, arrays, run.config.evaluation, **further))
+                try:
+                    every.append(task.evaluate(params, arrays, run.config.evaluation, **further))
+                except FlaxError:
+                    check_model(run.config, params, run.name)
+                    raise
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:
         values = [one.groups[group] for one in every]

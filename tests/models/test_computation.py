@@ -82,7 +82,7 @@ def program(name, **settings):
     return list(steps(closed.jaxpr)), {leaf.dtype.name for leaf in found}
 
 
-@pytest.mark.parametrize("name", with_slow(PARTS, quick=["marker tokens", "map fusion"]))
+@pytest.mark.parametrize("name", with_slow(PARTS, quick=["map fusion"]))
 def test_half_precision_multiplies_in_it_and_gives_float32(name):
     found, kinds = program(name, precision="bfloat16")
     assert kinds == {"float32"}
@@ -92,7 +92,7 @@ def test_half_precision_multiplies_in_it_and_gives_float32(name):
             assert step.outvars[0].aval.dtype == jnp.float32
 
 
-@pytest.mark.parametrize("name", with_slow(PARTS, quick=["map tokens", "marker fusion"]))
+@pytest.mark.parametrize("name", with_slow(PARTS, quick=["marker fusion"]))
 def test_activations_are_recomputed_where_that_is_asked_for(name):
     *_, parts = PARTS[name]
     found, _ = program(name, remat=True)

@@ -51,9 +51,8 @@ def ablations():
 FEW_PICTURES = ["--training.eval-every", "4", "--evaluation.pictures", "0"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def fakes():
-    """Fake examples, and instead of the model one that moves a fixed prediction: it compiles in no time."""
+def use_fakes(patch):
+    """Give fake examples, and instead of the model one that moves a fixed prediction: it compiles in no time."""
 
     def open_fake(source, *, progress=True):
         return FakeDataset(FakeConfig(5))
@@ -70,10 +69,15 @@ def fakes():
         lanes = prediction.replace(points=prediction.points + params["shift"]["kernel"][None])
         return Prediction(centerlines=lanes, elements=jax.tree.map(jnp.asarray, fake_elements()))
 
+    for function in (init, loss, predict):
+        patch.setattr(LaneGraphTask, function.__name__, function)
+    patch.setattr("tflane_jax.datasets.sources.open_dataset", open_fake)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fakes():
     with pytest.MonkeyPatch.context() as patch:
-        for function in (init, loss, predict):
-            patch.setattr(LaneGraphTask, function.__name__, function)
-        patch.setattr("tflane_jax.datasets.sources.open_dataset", open_fake)
+        use_fakes(patch)
         yield
 
 

@@ -42,7 +42,7 @@ def test_training_gives_the_numbers_of_one_device(forced, tmp_path):
         assert found.keys() == expected.keys()
         for name, value in expected.items():
             if name != "split":
-                np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
+                np.testing.assert_allclose(found[name], value, rtol=1e-6, err_msg=name)
 
 
 def test_a_resume_is_bit_identical(forced):
@@ -58,21 +58,21 @@ def test_each_device_matches_its_own_examples(forced):
 
 def test_devices_share_predictions_or_one_makes_them(forced):
     for found in (forced[1]["predicted"], forced[1]["predicted by one"]):
-        np.testing.assert_allclose(found, predicted(BATCH), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(found, predicted(BATCH), rtol=1e-6, atol=1e-6)
 
 
 def test_parts_of_a_batch_are_spread_over_the_devices(forced):
     kernel, moved = forced[1]["in parts"]
-    np.testing.assert_allclose(kernel, in_parts(1)[0], rtol=1e-5)
+    np.testing.assert_allclose(kernel, in_parts(1)[0], rtol=1e-6)
     assert moved == 0
 
 
 def test_batch_norms_take_the_statistics_of_all_devices(forced):
     for kind, frozen in (("learned", False), ("frozen", True)):
         expected, found = normalised(frozen=frozen), forced[1]["norms"][kind]
-        np.testing.assert_allclose(found["output"], expected["output"], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(found["output"], expected["output"], rtol=1e-6, atol=1e-6)
         for name, value in expected["statistics"].items():
-            np.testing.assert_allclose(found["statistics"][name], value, rtol=1e-5, err_msg=name)
+            np.testing.assert_allclose(found["statistics"][name], value, rtol=1e-6, err_msg=name)
         assert (found["exchanges"] == 0) == frozen
 
 
@@ -81,7 +81,7 @@ def test_a_host_has_the_loss_and_the_gradient_of_one_device(forced):
     if not (found := forced[1]["host"]):
         pytest.skip("compiled for two devices only")
     for name, value in host_terms().items():
-        np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(found[name], value, rtol=1e-6, err_msg=name)
 
 
 def test_a_batch_that_cannot_be_shared_evenly_is_refused(forced):

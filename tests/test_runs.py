@@ -3,8 +3,10 @@
 import json
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.errors import ScopeParamShapeError
 
 from tests.datasets.openlane_scenes import DriveConfig, DriveDataset
 from tests.datasets.test_nuscenes_scenes import content
@@ -18,7 +20,15 @@ from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.models.toponet import paper_config
-from tflane_jax.runs import current_form, open_run, resumable_config, train_run, training_nearness
+from tflane_jax.runs import (
+    current_form,
+    evaluate_run,
+    open_run,
+    resumable_config,
+    save_weights,
+    train_run,
+    training_nearness,
+)
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.adaptive import AdaptiveConfig
@@ -56,6 +66,37 @@ def test_a_run_of_an_older_version_opens_and_resumes(config, tmp_path, capsys):
     other = replace(config, optim=replace(config.optim, lr=1.0))
     with pytest.raises(UserError, match=r"another configuration \(optim\.lr: 0\.01 there, 1\.0 here\)"):
         train_run(other, folder, start="resume", progress=False)
+
+
+def test_a_configuration_that_was_edited_to_another_model_is_named(config, tmp_path, monkeypatch):
+    """Beside the manifest nothing shows it in a run of this version; in an older one, config.json does."""
+    width = lambda task: 3 if task.model.decoder.queries == config.task.model.decoder.queries else 5  # noqa: E731
+    init = lambda task, key, example: {"shift": {"kernel": jnp.zeros((1, width(task)))}}  # noqa: E731
+    monkeypatch.setattr(LaneGraphTask, "init", init)
+    folder = tmp_path / "run"
+    save_weights(config, init(config.task, None, None), folder)
+    (path,) = (folder / "checkpoints").glob("*/manifest.json")
+    content = json.loads(path.read_text())
+    content["config"]["data"]["val"] += 1
+    path.write_text(json.dumps(content))
+    assert open_run(folder).config.data.val == config.data.val + 1  # the same model
+
+    content["config"]["task"]["model"]["decoder"]["queries"] += 1
+    message = r"step_00000000: shift/kernel is float32\[1, 3\] in the checkpoint and float32\[1, 5\] in the model"
+    for progress in (content["progress"], {}):
+        path.write_text(json.dumps(content | {"progress": progress}))
+        with pytest.raises(UserError, match=message):
+            open_run(folder)
+
+    (folder / "config.json").write_text(json.dumps(content["config"]))
+    run = open_run(folder)  # of an older version, with both files edited
+
+    def evaluate(*arguments):
+        raise ScopeParamShapeError("kernel", "/shift", (1, 5), (1, 3))
+
+    monkeypatch.setattr(LaneGraphTask, "evaluate", evaluate)
+    with pytest.raises(UserError, match=r"shift/kernel is float32\[1, 3\] .* undo that \(config\.txt"):
+        evaluate_run(run, config.data.source("test"), progress=False)
 
 
 def test_the_current_form_of_a_configuration_is_itself(config):

@@ -7,15 +7,19 @@ imported when it runs, and nothing slow is imported here, so `tflane --help` is 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 
 from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
-from tflane_jax.errors import UserError
+from tflane_jax.errors import Interrupted, UserError
+from tflane_jax.startup import leave
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -24,18 +28,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options, rest = parser.parse_known_args(arguments)
     if rest and not options.takes_overrides:
         parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
+    with _ending_on_sigterm():
+        code = _called(options, rest)
+    if arguments is None:  # the program itself
+        leave(code)
+    return code
+
+
+def _called(options: argparse.Namespace, rest: Sequence[str]) -> int:
     try:
         command = getattr(importlib.import_module(f"tflane_jax.commands.{options.module}"), options.function)
         return (command(options, rest) if options.takes_overrides else command(options)) or 0
     except UserError as error:
         print(f"tflane: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("tflane: stopped", file=sys.stderr)
-        return 128 + signal.SIGINT
+        return 128 + getattr(error, "number", signal.SIGINT)
     except BrokenPipeError:  # `tflane ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
+
+
+@contextlib.contextmanager
+def _ending_on_sigterm() -> Iterator[None]:
+    """Let SIGTERM end a command like Ctrl-C, so that it leaves no processes and temporary files behind."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        del frame
+        raise Interrupted(number)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""The error that the command line shows to its user."""
+"""The errors that the command line shows to its user."""
 
 
 class UserError(Exception):
@@ -6,3 +6,11 @@ class UserError(Exception):
 
     The command line prints the message without a traceback and exits with code 2.
     """
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal ended a command. The command line exits with code 128 + `number`."""
+
+    def __init__(self, number: int):
+        super().__init__(f"signal {number}")
+        self.number = number

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
+from typing import Any
+
+import jax
 
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import settings
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.limits import SettingError, check_settings
-from tflane_jax.scene import Example, RoadImage
+from tflane_jax.models.parameters import Params, first_misfit
+from tflane_jax.scene import Example, RoadImage, shapes_of
+from tflane_jax.tasks.base import AnyTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
 KINDS = {Example: "lane graphs", RoadImage: "images"}
@@ -38,6 +43,32 @@ def check_kind(config: RunConfig) -> None:
         raise UserError(
             f"this configuration's data are {KINDS[given]} (data is {type(config.data).__name__}), but its task takes "
             f"{KINDS[taken]} (task is {type(config.task).__name__}): change either"
+        )
+
+
+def shapes_of_params(task: AnyTask, example: Any) -> Any:
+    """Return the shapes of a task's parameters; raises what the model raises for an example that does not fit."""
+    return jax.eval_shape(task.init, jax.random.key(0), trained_on(task, example))
+
+
+def trained_on(task: AnyTask, example: Any) -> Any:
+    """Return the shapes of one training input: the example, or a clip of examples."""
+    return example if task.frames == 1 else shapes_of(example, task.frames)
+
+
+def check_model(config: RunConfig, params: Params, place: str) -> None:
+    """Raise UserError, naming the first difference, if parameters are not those of the model of a configuration.
+
+    No-op without the data of the configuration, which the shapes of some parameters depend on.
+    """
+    try:
+        example = config.task.shapes(config.data)
+    except UserError:
+        return
+    if difference := first_misfit(params, shapes_of_params(config.task, example)):
+        raise UserError(
+            f"{place}: {difference}. Its configuration was changed after the training: undo that (config.txt in the "
+            "run folder has the settings that the run was started with), or train the other model"
         )
 
 

@@ -5,6 +5,7 @@ The Python interface behind `tflane train`, `eval` and `predict`, also for noteb
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.errors import FlaxError
 
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import added_settings, from_json, to_json, to_text
@@ -28,8 +30,9 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import from_first
-from tflane_jax.run_checks import check_run
+from tflane_jax.processes import from_first, is_first
+from tflane_jax.run_checks import check_model, check_run
+from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import Draw, TrainingResult, train
@@ -63,21 +66,26 @@ class Run:
 def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress: bool = True) -> TrainingResult:
     """Train a configuration into a folder, with data, evaluation on the validation split, curves and pictures.
 
-    Raises UserError like `training.loop.train` and the datasets.
+    Raises UserError like `training.loop.train` and the datasets, and `Interrupted` like that.
     """
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
-    task = config.task
     check_run(config)
     if start != "resume":
-        _check_frozen(config)
-    if config.training.init_from is not None and start != "resume":
-        check_origins(config.training.init_from, config.training.seeds)
-    data: Any = task.load(config.data.source("train"), progress=progress)
-    task.check(config.data, data)
-    arrays, prepare = task.examples(data), task.prepare(config.data)
-    if prepare is not None:
-        arrays = in_workers(arrays, loading_of(config.data))
-    validation: Any = task.load(config.data.source("val"), progress=progress)
+        check_origin(config)
+    with showing(progress and is_first()):
+        return _train(config, folder, start=start, progress=progress)
+
+
+def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> TrainingResult:
+    task = config.task
+    with stage("reading the training data"):
+        data: Any = task.load(config.data.source("train"), progress=progress)
+        task.check(config.data, data)
+        arrays, prepare = task.examples(data), task.prepare(config.data)
+        if prepare is not None:
+            arrays = in_workers(arrays, loading_of(config.data))
+    with stage("reading the validation data"):
+        validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:
         return task.evaluate(params, validation, config.evaluation).scores()
@@ -100,8 +108,10 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     )
 
 
-def _check_frozen(config: RunConfig) -> None:
-    """Raise UserError if modules are frozen that would start from random weights."""
+def check_origin(config: RunConfig) -> None:
+    """Raise UserError if the run to start from is missing, or frozen modules would start from random weights."""
+    if config.training.init_from is not None:
+        check_origins(config.training.init_from, config.training.seeds)
     if config.task.frozen and config.training.init_from is None:
         raise UserError(
             f"{', '.join(config.task.frozen)} would stay random: this configuration freezes them "
@@ -175,8 +185,8 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
         UserError: the checkpoint is missing, damaged, or of an unreadable version.
     """
     plain = Checkpoints(folder / "checkpoints")
-    step = plain.find("last")
-    config, notices = _read_config(plain.path(step) / "manifest.json", plain.manifest(step).config)
+    last = plain.find("last")
+    config, notices = _read_config(plain.path(last) / "manifest.json", plain.manifest(last).config)
     for notice in notices:
         print(notice, file=sys.stderr)
     checkpoints = Checkpoints(folder / "checkpoints", best_metric=config.training.best_metric)
@@ -192,7 +202,18 @@ def open_run(folder: Path, which: Which | None = None) -> Run:
     if len(seeds) > 1 and any(leaf.shape[:1] != (len(seeds),) for leaf in jax.tree.leaves(averaged)):
         raise UserError(f"{checkpoints.path(step)} has not the parameters of {len(seeds)} seeds (training.seeds)")
     params = per_seed(averaged, seeds)
+    if _is_edited(plain, last, folder):
+        check_model(config, params[0], str(checkpoints.path(step)))
     return Run(str(folder), config, step, tuple(params))
+
+
+def _is_edited(checkpoints: Checkpoints, step: int, folder: Path) -> bool:
+    """Return whether a checkpoint's configuration was changed; of an older version's, whether config.json differs."""
+    if (edited := checkpoints.is_edited(step)) is not None:
+        return edited
+    with contextlib.suppress(UserError):
+        return read_config(folder) != checkpoints.manifest(step).config
+    return False
 
 
 def open_weights(config: RunConfig) -> Run:
@@ -272,7 +293,7 @@ def evaluate_run(
         run: as from `open_run`.
         source: configuration of the examples.
         task: a variant of the run's task, such as from `limit_instances`; None: the run's task.
-        progress: show progress bars while loading data.
+        progress: show progress bars and stages.
         frame_groups: a further group for each example, measured on its own.
 
     Returns:
@@ -280,10 +301,18 @@ def evaluate_run(
         means and standard deviations (n - 1) follow.
     """
     task = run.config.task if task is None else task
-    arrays = task.load(source, progress=progress)
     further = {"frame_groups": frame_groups} if frame_groups else {}
-    every = [task.evaluate(params, arrays, run.config.evaluation, **further) for params in run.params]
-    seeds = run.config.training.seeds
+    seeds, every = run.config.training.seeds, []
+    with showing(progress):
+        with stage("reading the data"):
+            arrays = task.load(source, progress=progress)
+        for seed, params in zip(seeds, run.params, strict=True):
+            with stage("evaluating" if len(seeds) == 1 else f"evaluating seed {seed}"):
+                try:
+                    every.append(task.evaluate(params, arrays, run.config.evaluation, **further))
+                except FlaxError:
+                    check_model(run.config, params, run.name)
+                    raise
     rows: list[dict[str, Any]] = []
     for group in every[0].groups:
         values = [one.groups[group] for one in every]

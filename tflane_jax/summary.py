@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 
+from tflane_jax.run_checks import shapes_of_params, trained_on
 from tflane_jax.scene import shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
@@ -52,16 +53,6 @@ def parameter_counts(params: Any, depth: int = 1) -> dict[str, int]:
     return counts
 
 
-def shapes_of_params(task: AnyTask, example: Any) -> Any:
-    """Return the shapes of a task's parameters; raises what the model raises for an example that does not fit."""
-    return jax.eval_shape(task.init, jax.random.key(0), _trained_on(task, example))
-
-
-def _trained_on(task: AnyTask, example: Any) -> Any:
-    """Return the shapes of one training input: the example, or a clip of examples."""
-    return example if task.frames == 1 else shapes_of(example, task.frames)
-
-
 def prediction_program(task: AnyTask, example: Any, *, compiled: bool = True) -> Program:
     """Return the cost of predicting one example; `example` holds shapes."""
     lowered = jax.jit(task.predict).lower(shapes_of_params(task, example), example)
@@ -72,7 +63,7 @@ def training_program(
     task: AnyTask, example: Any, batch_size: int, optim: OptimConfig, *, compiled: bool = True
 ) -> Program:
     """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
-    example, optim = _trained_on(task, example), scaled_to_batch(optim, batch_size)
+    example, optim = trained_on(task, example), scaled_to_batch(optim, batch_size)
     optimizer, step = make_optimizer(optim, 1000), make_update_step(task, optim, 1000)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
     lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))

@@ -2,13 +2,16 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
 from tests.ablations.test_identity import QUICK
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import scores, workers
+from tflane_jax.ablations.jobs import check_rows, plan_jobs
 from tflane_jax.cli import main
+from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 
 pytestmark = pytest.mark.usefixtures("cheap")
@@ -68,6 +71,33 @@ def test_a_failed_training_stops_no_other_and_is_listed(tiny, tmp_path, monkeypa
     # The same command trains what is missing.
     assert compare(tiny, out, "0123", "--test", "few=--data.test 3") == 0
     assert "two-sided t-test over 4 seeds" in (out / "paired.md").read_text()
+
+
+def test_all_rows_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
+    trained, out = failing(monkeypatch), tmp_path / "out"
+    rows = [
+        f"base={tiny}:baseline",
+        f"tfm={tiny} --training.best_metric all/NONE",
+        f"none={tiny} --training.init-from nowhere",
+    ]
+    assert main(["compare", *rows, "--seeds", "0", "--out", str(out), *QUICK]) == 2
+    said = capsys.readouterr().err
+    assert "2 of 3 rows cannot be trained:" in said
+    assert re.search(r"\n  tfm: .*training\.best_metric", said)
+    assert re.search(r"\n  none: training\.init_from is nowhere", said)
+    assert main(["compare", *rows[:2], "--seeds", "0", "--out", str(out), *QUICK]) == 2
+    assert re.fullmatch(r"tflane: tfm: .*\n", capsys.readouterr().err)
+    assert trained == []
+    assert not out.exists()
+
+
+def test_a_row_may_start_from_another_that_is_not_trained_yet(tmp_path):
+    config = RunConfig()
+    later = replace(config, training=replace(config.training, init_from=str(tmp_path / "base" / "seed_{seed}")))
+    plan = plan_jobs({"base": config, "later": later}, (0, 1), tmp_path, threads={}, tests={})
+    check_rows(plan)
+    with pytest.raises(UserError, match=r"later: training\.init_from"):
+        check_rows({"later": plan["later"]})
 
 
 def test_without_a_control_there_is_a_table_and_no_test(tiny, tmp_path, monkeypatch, capsys):

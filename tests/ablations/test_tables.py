@@ -1,6 +1,7 @@
 """Tables of the papers: their data, and a small one from training to summary."""
 
 import json
+import re
 
 import pytest
 
@@ -101,6 +102,15 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert "tflane tables paper.9 --seeds 2 --jobs 2" in written
     assert max(map(len, (line for line in written.splitlines() if not line.startswith("|")))) <= 120
     assert written == page(tmp_path / "results")
+
+
+def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
+    wrong = TableRow("tfm", str(tiny), ("--training.best_metric", "all/NONE"))
+    tables = {"paper.9": small(tiny), "paper.10": small(tiny, name="paper.10", rows=(*small(tiny).rows[:1], wrong))}
+    monkeypatch.setattr("tflane_jax.commands.tables.find_table", tables.get)
+    assert main(["tables", *tables, "--seeds", "1", "--out", str(tmp_path / "out")]) == 2
+    assert re.search(r"tfm: .*training\.best_metric", capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_table_that_was_stopped_ends_with_the_same_bytes(tiny, tmp_path, monkeypatch):

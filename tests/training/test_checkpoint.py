@@ -1,5 +1,7 @@
 """Checkpoints: bit-identical round trips, and a clear message for every fault of a folder."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,7 +66,18 @@ def test_the_last_and_best_checkpoints_are_kept(tmp_path, state):
     assert checkpoints.steps() == [2, 5, 6]
     assert (checkpoints.find("best"), checkpoints.find("last"), checkpoints.find(5)) == (2, 6, 5)
     assert checkpoints.manifest(2).config == CONFIG
-    assert checkpoints.manifest(2).progress == {"seconds": 0.1}
+    assert checkpoints.manifest(2).progress["seconds"] == 0.1
+
+
+def test_an_edited_configuration_is_noticed(tmp_path, state):
+    checkpoints = saved(tmp_path, state, [(1, None)])
+    assert checkpoints.is_edited(1) is False
+    path = checkpoints.path(1) / "manifest.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content | {"config": {"other": 1}}))
+    assert checkpoints.is_edited(1) is True
+    path.write_text(json.dumps(content | {"progress": {}}))  # of an older version
+    assert checkpoints.is_edited(1) is None
 
 
 def test_saving_a_step_again_replaces_it(tmp_path, state):

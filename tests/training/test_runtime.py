@@ -44,6 +44,14 @@ def test_the_second_process_finds_the_programs_of_the_first(tmp_path):
     assert list((tmp_path / "cache" / "programs").glob("jit*"))
 
 
+@pytest.mark.slow
+def test_a_program_that_another_job_has_half_written_is_compiled_anew(tmp_path):
+    start(tmp_path / "cache")
+    for file in (tmp_path / "cache" / "programs").glob("jit*"):
+        file.write_bytes(file.read_bytes()[:100])
+    assert start(tmp_path / "cache") == 0
+
+
 def test_the_environment_chooses_the_folder_and_none(tmp_path):
     start(tmp_path / "cache", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "other"))
     assert list((tmp_path / "other").glob("jit*"))

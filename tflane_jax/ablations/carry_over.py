@@ -25,7 +25,7 @@ from tqdm import tqdm
 from tflane_jax.ablations.compare import draw_models, summary_of
 from tflane_jax.ablations.comparison import Scores, Variant, compact
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
-from tflane_jax.ablations.jobs import Failure, Job
+from tflane_jax.ablations.jobs import Failure, Job, check_rows
 from tflane_jax.ablations.paper.table import shortened
 from tflane_jax.ablations.scores import measure
 from tflane_jax.ablations.statistics import holm, paired_difference
@@ -127,6 +127,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     check(declaration, configs)
     plan = _planned(settings, configs, out)
     by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
+    check_rows(by_row)
     declared = declare(declaration, by_row, settings.seeds, out)
     complete = sum(job.is_complete() for job in plan.flat())
     seconds, guesses = remaining_seconds(by_row, _MINUTES)

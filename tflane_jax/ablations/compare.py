@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from tflane_jax.ablations.declaration import Declaration, check, declare
 from tflane_jax.ablations.effects import save_effects
-from tflane_jax.ablations.jobs import Failure, Job, Tests, plan_jobs
+from tflane_jax.ablations.jobs import Failure, Job, Tests, check_rows, plan_jobs
 from tflane_jax.ablations.report import save_report, suffixes
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure, with_test_set
@@ -64,13 +64,15 @@ def compare(
 
     Raises:
         UserError: the configurations do not test on the same examples; a folder holds a run of another configuration,
-            or another declaration; or trainings failed, after the tables of the others were written.
+            or another declaration; a row's settings must fail, before any is trained; or trainings failed, after the
+            tables of the others were written.
     """
     tests = dict(tests or {})
     _check_tests(configs, tests)
     if declaration is not None:
         check(declaration, configs)
     plan = plan_jobs(configs, seeds, out, threads=worker_threads(jobs), tests=tests, retrain=retrain)
+    check_rows(plan)
     declared = None if declaration is None else declare(declaration, plan, seeds, out)
     # Seed by seed, so that a comparison stopped early has pairs.
     every = [plan[name][i] for i in range(len(seeds)) for name in plan]

@@ -19,9 +19,10 @@ from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
-from tflane_jax.runs import current_form
+from tflane_jax.run_checks import check_run
+from tflane_jax.runs import check_origin, current_form
 from tflane_jax.training.checkpoint import Checkpoints
-from tflane_jax.training.fine_tuning import origins
+from tflane_jax.training.fine_tuning import origin_folders, origins
 from tflane_jax.training.provenance import read_provenance, thread_setting
 from tflane_jax.training.run_folder import Start, read_config
 
@@ -123,6 +124,28 @@ class Failure:
 
     def __str__(self) -> str:
         return f"training {self.job.folder} failed: its messages are in {self.job.log} ({self.reason})"
+
+
+def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
+    """Raise UserError, naming the rows, where a training that is not complete must fail; call it before the first one.
+
+    A row may start from the runs of another one, which do not exist yet.
+    """
+    wrong, folders = [], {job.folder for jobs in plan.values() for job in jobs}
+    for name, jobs in plan.items():
+        if (job := next((job for job in jobs if not job.is_complete()), None)) is not None:
+            try:
+                check_run(job.config)
+                training = job.config.training
+                starts = folders & set(origin_folders(training.init_from or "", training.seeds))
+                if job.start() != "resume" and not starts:
+                    check_origin(job.config)
+            except UserError as error:
+                wrong.append(f"{name}: {error}")
+    if len(wrong) == 1:
+        raise UserError(wrong[0])
+    if wrong:
+        raise UserError("\n  ".join([f"{len(wrong)} of {len(plan)} rows cannot be trained:", *wrong]))
 
 
 def plan_jobs(

@@ -31,7 +31,7 @@ from tflane_jax.ablations.compare import (
 from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.ablations.declaration import Declared, check, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects
-from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.jobs import Job, check_rows
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
@@ -68,15 +68,11 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
         UserError: trainings failed, after the files of the others were written.
     """
     began, root = time.monotonic(), out / "quick" if quick else out
-    configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
-    check(table.declaration, configs)
-    threads, store, folder = worker_threads(jobs), root / "runs", root / table.name
-    host_plan = stored_jobs(hosts, seeds, store, threads=threads)
-    origins = {row.name: host_plan[row.start] for row in table.rows if row.start}
-    plan = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
+    folder, (host_plan, plan) = root / table.name, plan_table(table, seeds, out, jobs=jobs, quick=quick)
+    configs = table.configs(table.rows, quick=quick)
     # Fewer seeds than the table has are an interim look at it.
     declared = declare(table.declaration, plan, range(max(len(seeds), 0 if quick else table.seeds)), folder)
-    _tell_work({**host_plan, **plan} if hosts else plan, table, jobs)
+    _tell_work({**host_plan, **plan}, table, jobs)
 
     failures = train_all(_by_seed(host_plan), jobs)
     failures += train_all(_by_seed(plan), jobs)
@@ -97,6 +93,23 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
     if failures:
         raise UserError(summary_of(failures, len(_by_seed(plan))))
     return path
+
+
+def plan_table(
+    table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False
+) -> tuple[dict[str, list[Job]], dict[str, list[Job]]]:
+    """Return the trainings of the hosts that rows start from, and of the rows.
+
+    Raises UserError where one of them must fail. The arguments are those of `run_table`.
+    """
+    configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
+    check(table.declaration, configs)
+    threads, store = worker_threads(jobs), (out / "quick" if quick else out) / "runs"
+    host_plan = stored_jobs(hosts, seeds, store, threads=threads)
+    origins = {row.name: host_plan[row.start] for row in table.rows if row.start}
+    plan = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
+    check_rows({f"host {name}": jobs for name, jobs in host_plan.items()} | plan)
+    return host_plan, plan
 
 
 def _by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:

@@ -21,9 +21,10 @@ from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
-from tflane_jax.errors import UserError
+from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
+from tflane_jax.startup import leave, showing, write
 from tflane_jax.training.provenance import thread_setting
 from tflane_jax.training.runtime import configure_jax
 
@@ -87,8 +88,9 @@ def _train_here(queue: Queue) -> list[Failure]:
             time.sleep(_POLL_SECONDS)
             continue
         with noted(job, failures):
-            if train_run(job.config, job.folder, start=job.start()).asked_by is not None:
-                raise KeyboardInterrupt  # all of it; the same command resumes what was written
+            write(f"train {job.label or job.folder}")
+            if (number := train_run(job.config, job.folder, start=job.start()).asked_by) is not None:
+                raise Interrupted(number)  # all of it; the same command resumes what was written
         queue.done(job)
         _tell([failure for failure in failures if failure.job is job])
     return failures
@@ -128,7 +130,7 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int) -> list[
 
 def _running(workers: Sequence[Worker], queue: Queue) -> str:
     """Return what is being trained, for the progress bar."""
-    names = [worker.job.label for worker in workers if worker.job is not None]
+    names = [f"{worker.job.label}{worker.stage}" for worker in workers if worker.job is not None]
     if queue.elsewhere:
         names.append(f"{len(queue.elsewhere)} by other processes")
     return "; ".join(names)
@@ -154,6 +156,7 @@ class Worker:
         self._cores = _cores(slot, parallel)
         self.job: Job | None = None
         self.tasks: set[Any] = set()
+        self.stage = ""
 
     def __enter__(self) -> Worker:
         self._begin_process()
@@ -173,13 +176,14 @@ class Worker:
                 self._pipe.send(None)
         else:  # an error ends the comparison: the same command resumes what was written
             self._process.terminate()
+        self._pipe.close()  # so that a process that has stopped waits for no further job
         self._process.join()
 
     def begin(self, job: Job) -> None:
         """Let the process train a job."""
         if self._process.exitcode is not None:
             self._begin_process()
-        self.job = job
+        self.job, self.stage = job, ""
         self.tasks.add(job.config.task)
         job.log.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(OSError):  # a process that is gone is found by `check`
@@ -187,16 +191,18 @@ class Worker:
 
     def check(self) -> Failure | None:
         """Return why the current job failed, if it did; a process that is gone is replaced when the next job begins."""
-        if self.job is None or not self._pipe.poll():
-            return None
-        job, self.job = self.job, None
-        try:
-            reason = self._pipe.recv()
-        except (EOFError, OSError):
-            self._process.join()
-            reason = _death(self._process.exitcode)
-            _log(job, f"tflane: {reason}")
-        return None if reason is None else Failure(job, reason)
+        while self.job is not None and self._pipe.poll():
+            try:
+                what, text = self._pipe.recv()
+            except (EOFError, OSError):
+                self._process.join()
+                what, text = "done", _death(self._process.exitcode)
+                _log(self.job, f"tflane: {text}")
+            if what == "done":
+                job, self.job = self.job, None
+                return None if text is None else Failure(job, text)
+            self.stage = f" ({text})" if text else ""
+        return None
 
 
 def _death(code: int) -> str:
@@ -214,19 +220,40 @@ def _train(job: Job) -> None:
 
 
 def _train_jobs(pipe: Any, cores: list[int]) -> None:
-    """Train and measure the jobs that come through the pipe; answer None for each, or why it failed.
+    """Train and measure the jobs that come through the pipe; answer ("done", None) for each, or why it failed.
 
-    Messages go to the job's log.
+    Before that, what a job is doing is told as ("stage", name), and ("stage", "") at its end. Messages go to the job's
+    log.
     """
     if cores:
         os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this
-    with contextlib.suppress(EOFError):  # the comparison is gone
-        while (job := pipe.recv()) is not None:
+
+    def tell(what: str, text: str | None) -> None:
+        with contextlib.suppress(OSError):  # the comparison is gone
+            pipe.send((what, text))
+
+    def begin(stage: str) -> None:
+        if stage:
+            print(f"{time.strftime('%H:%M:%S')} {stage}", flush=True)
+        tell("stage", stage)
+
+    try:
+        while (job := _next(pipe)) is not None:
+            failures: list[Failure] = []
             with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
                 configure_jax()
-                failures: list[Failure] = []
-                with noted(job, failures):
+                with noted(job, failures), showing(begin):
                     if not job.is_complete():
                         _train(job)
                     measure_all(job)
-            pipe.send(failures[0].reason if failures else None)
+            tell("done", failures[0].reason if failures else None)
+    except KeyboardInterrupt as error:  # the comparison tells of it
+        code = 128 + getattr(error, "number", signal.SIGINT)
+        leave(code)
+        sys.exit(code)
+
+
+def _next(pipe: Any) -> Job | None:
+    with contextlib.suppress(EOFError, OSError):  # the comparison is gone
+        return pipe.recv()
+    return None

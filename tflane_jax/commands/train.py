@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from tflane_jax.config_io import to_text
 from tflane_jax.errors import UserError
 from tflane_jax.runs import resumable_config, train_run
 from tflane_jax.training.runtime import configure_jax
+
+_NOT_BEGUN = " before the run began: give the same command again"
 
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
@@ -32,7 +35,15 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     config = _config(options, out, overrides)
 
     configure_jax()
-    result = train_run(config, out, start=options.start)
+    before = _saved_at(out)
+    try:
+        result = train_run(config, out, start=options.start)
+    except KeyboardInterrupt as error:
+        number = getattr(error, "number", signal.SIGINT)
+        began = options.start == "resume" or _saved_at(out) != before
+        remedy = f"; go on with: tflane train --resume --out {out}" if began else _NOT_BEGUN
+        print(f"stopped by {signal.Signals(number).name}{remedy}", file=sys.stderr)
+        return 128 + number
     if result.stopped_by is not None:
         name = signal.Signals(result.stopped_by).name
         print(
@@ -58,6 +69,13 @@ def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) ->
     if overrides:
         raise UserError(f"a run is resumed with its own configuration: leave {overrides[0]} out")
     return resumable_config(out)
+
+
+def _saved_at(out: Path) -> int | None:
+    """Return when the run in a folder began, None where there is none."""
+    with contextlib.suppress(OSError):
+        return (out / "config.json").stat().st_mtime_ns
+    return None
 
 
 def _default_folder(config: str | None) -> Path:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh
@@ -16,6 +17,7 @@ from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.devices import divided, everywhere, prediction_mesh, replicated, share
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Example, Prediction, stack_examples
+from tflane_jax.startup import compiled
 
 
 class Predictor(Protocol):
@@ -82,12 +84,25 @@ def predicted_batches(
     memory = task.start() if task.streams else None
     for indices, batch in ordered_batches(arrays, batch_size):
         if task.streams:
-            memory, answers = predict_stream(task, params, memory, batch)
+            memory, answers = _called(predict_stream, task, params, memory, batch)
         else:
             rows = divided(jax.tree.map(lambda leaf: leaf[mine], batch), mesh) if mesh is not None else batch
-            answers = predict_batch(task, params, rows, mesh)
+            answers = _called(predict_batch, task, params, rows, mesh)
         answers, kept = jax.device_get(answers), slice(len(indices))
         yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
+
+
+def _called(program: Any, task: Predictor, *arguments: Any) -> Any:
+    """Return `program(task, *arguments)`; what it has to compile first is shown, and can be interrupted."""
+    leaves, tree = jax.tree.flatten(arguments)
+    kinds = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves if not isinstance(leaf, Mesh))
+    if (key := (program, task, tree, kinds)) not in _compiled:
+        compiled(program, task, *arguments, what="the prediction")
+        _compiled.add(key)
+    return program(task, *arguments)
+
+
+_compiled: set[Any] = set()
 
 
 def predict_examples(

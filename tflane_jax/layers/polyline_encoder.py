@@ -7,7 +7,9 @@ SMERF (Luo et al. 2024) makes one token of the points of a line, and the lines a
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import flax.linen as nn
@@ -15,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.precision import PLAIN, Computation, computing, full, run_layer, run_part
 from tflane_jax.layers.transformer import EncoderLayer, TransformerConfig
 from tflane_jax.limits import Count, CountOrZero, FractionBelowOne, Positive, Rules, splits
 
@@ -77,9 +80,15 @@ MARKER_POLYLINES = PolylineEncoderConfig(bands=32, layout="interleaved", attend=
 
 
 class PolylineEncoder(nn.Module):
-    """N polylines of P points to N tokens."""
+    """N polylines of P points to N tokens.
+
+    Attributes:
+        config: sizes.
+        computation: precision of linear layers, and whether each layer is computed again for the gradient.
+    """
 
     config: PolylineEncoderConfig
+    computation: Computation = PLAIN
 
     @nn.compact
     def __call__(
@@ -103,25 +112,36 @@ class PolylineEncoder(nn.Module):
         x = points
         if config.bands:
             x = temperature_encoding(points, config.bands, temperature=config.temperature, layout=config.layout)
-        embed = nn.Dense(config.dim, name="embed")
         sizes = TransformerConfig(config.heads, config.hidden, config.dropout)
         if config.attend == "lines":
-            x = embed(jnp.concatenate([x.reshape(lines, count * x.shape[-1]), labels], -1))
+            x = self._dense("embed", jnp.concatenate([x.reshape(lines, count * x.shape[-1]), labels], -1))
             nowhere, mask = jnp.zeros_like(x), key_mask(valid)
             for i in range(config.layers):
-                x = EncoderLayer(sizes, name=f"layer_{i}")(x, nowhere, mask, deterministic=deterministic)
+                layer = partial(EncoderLayer, sizes, name=f"layer_{i}")
+                x = run_layer(self, layer, self.computation, x, nowhere, mask, deterministic=deterministic)
         else:
             each = jnp.broadcast_to(labels[:, None], (lines, count, labels.shape[-1]))
-            x = embed(jnp.concatenate([x, each], -1))
+            x = self._dense("embed", jnp.concatenate([x, each], -1))
             nowhere = jnp.zeros_like(x)
             for i in range(config.layers):
-                layer = EncoderLayer(sizes, name=f"layer_{i}")
-                over_lines = nn.vmap(
-                    lambda layer, x, nowhere: layer(x, nowhere, deterministic=deterministic),
-                    variable_axes={"params": None, "intermediates": 0},
-                    split_rngs={"params": False, "dropout": True},
-                    in_axes=0,
-                )
-                x = over_lines(layer, x, nowhere)
-            x = nn.Dense(config.dim, name="out")(x.reshape(lines, count * config.dim))
+                run = partial(_over_lines, partial(EncoderLayer, sizes, name=f"layer_{i}"), deterministic)
+                x = run_part(self, run, self.computation, x, nowhere)
+            x = self._dense("out", x.reshape(lines, count * config.dim))
         return jnp.where(valid[:, None], x, 0.0)
+
+    def _dense(self, name: str, x: Float[Array, "*b c"]) -> Float[Array, "*b d"]:
+        """Return a linear layer's output; called by the compact method."""
+        with computing(self.computation.precision):
+            return full(nn.Dense(self.config.dim, name=name)(x))
+
+
+def _over_lines(make: Callable[[], EncoderLayer], deterministic: bool, parent: nn.Module, x: Array, position: Array):
+    """Return the features of all lines after a layer of `parent`, whose points attend to those of their own line."""
+    del parent  # `make` is called within it
+    over_lines = nn.vmap(
+        lambda layer, x, position: layer(x, position, deterministic=deterministic),
+        variable_axes={"params": None, "intermediates": 0},
+        split_rngs={"params": False, "dropout": True},
+        in_axes=0,
+    )
+    return over_lines(make(), x, position)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol, TypeVar
 
 import flax.linen as nn
@@ -29,6 +30,17 @@ class Computation(Protocol):
     def precision(self) -> Precision: ...
     @property
     def remat(self) -> bool: ...
+
+
+@dataclass(frozen=True)
+class Plain:
+    """The settings of a part that has none of its own: nothing changes."""
+
+    precision: Precision = "float32"
+    remat: bool = False
+
+
+PLAIN = Plain()
 
 
 def computing(precision: Precision) -> contextlib.AbstractContextManager[Any]:

@@ -18,6 +18,7 @@ types are shifts and means, and similarity, with one head for all channels, is o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 import flax.linen as nn
@@ -37,6 +38,7 @@ from tflane_jax.layers.image_graph import (
     smooth,
 )
 from tflane_jax.layers.masks import key_mask
+from tflane_jax.layers.precision import PLAIN, Computation, full, run_layer
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, FractionBelowOne, Rules
 
 
@@ -71,13 +73,13 @@ class GtnEncoderConfig:
         """Every hop has edge types."""
         yield "relations", bool(self.relations) or self.offers_similarity(0), "at least one, or similarity every_hop"
 
-    def build(self, dim: int, name: str) -> GraphEncoder:
+    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> GraphEncoder:
         """Return the Linen module for `dim` channels; raises UserError where they do not split."""
         if not self.relations and not self.offers_similarity(0):
             raise UserError("a GTN encoder needs edge types: name relations, or set similarity to 'every_hop'")
         _check_split(dim, "channels", self.channels)
         _check_split(dim, "heads", self.heads)
-        return GraphEncoder(self, name=name)
+        return GraphEncoder(self, computation, name=name)
 
     def offers_similarity(self, hop: int) -> bool:
         """Return whether a hop may select similarity."""
@@ -102,10 +104,10 @@ class GcnEncoderConfig:
     hidden: Count = 128
     dropout: FractionBelowOne = 0.1
 
-    def build(self, dim: int, name: str) -> GraphEncoder:
+    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> GraphEncoder:
         """Return the Linen module; it infers the number of channels from its input."""
         del dim
-        return GraphEncoder(self, name=name)
+        return GraphEncoder(self, computation, name=name)
 
     def mixing(self, name: str) -> NeighbourConvolution:
         """Return the module that replaces self-attention in a layer."""
@@ -132,12 +134,12 @@ class HanEncoderConfig:
     hidden: Count = 128
     dropout: FractionBelowOne = 0.1
 
-    def build(self, dim: int, name: str) -> GraphEncoder:
+    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> GraphEncoder:
         """Return the Linen module for `dim` channels; raises UserError where they do not split."""
         if not self.relations:
             raise UserError("a HAN encoder needs edge types: name relations")
         _check_split(dim, "heads", self.heads)
-        return GraphEncoder(self, name=name)
+        return GraphEncoder(self, computation, name=name)
 
     def mixing(self, name: str) -> HeterogeneousAttention:
         """Return the module that replaces self-attention in a layer."""
@@ -148,9 +150,15 @@ GraphEncoderConfig = GtnEncoderConfig | GcnEncoderConfig | HanEncoderConfig
 
 
 class GraphEncoder(nn.Module):
-    """Encoder layers over the graph of a feature map."""
+    """Encoder layers over the graph of a feature map.
+
+    Attributes:
+        config: sizes.
+        computation: precision of linear layers, and whether each layer is computed again for the gradient.
+    """
 
     config: GraphEncoderConfig
+    computation: Computation = PLAIN
 
     @nn.compact
     def __call__(
@@ -174,8 +182,8 @@ class GraphEncoder(nn.Module):
         shown = valid[..., None]
         x, position = jnp.where(shown, features, 0.0), jnp.where(shown, position, 0.0)
         for i in range(self.config.layers):
-            layer = GraphEncoderLayer(self.config, name=f"layer_{i}")
-            x = layer(x, position, valid, deterministic=deterministic)
+            layer = partial(GraphEncoderLayer, self.config, name=f"layer_{i}")
+            x = run_layer(self, layer, self.computation, x, position, valid, deterministic=deterministic)
         return jnp.where(shown, x, 0.0)
 
 
@@ -235,7 +243,8 @@ class MetaPathConvolution(nn.Module):
             if not offered[hop] or query is None or key is None:
                 return mixed
             here, _ = bordered_sides(config.relations, h, valid)
-            similar = masked_attention(query, key, _by_head(here, config.heads), mask).swapaxes(0, 1).reshape(h.shape)
+            here = _by_head(here.astype(query.dtype), config.heads)
+            similar = masked_attention(query, key, here, mask).swapaxes(0, 1).reshape(h.shape)
             # Invalid cells are queries too; their result must not enter a further hop.
             return mixed + type_weights[structural][None, None] * jnp.where(valid[..., None], similar, 0.0)
 
@@ -243,7 +252,7 @@ class MetaPathConvolution(nn.Module):
             self.sow("intermediates", "relations", nn.softmax(weights, -1))
             if query is not None and key is not None:
                 self.sow("intermediates", "probabilities", attention_probabilities(query, key, mask))
-        value = jnp.where(valid[..., None], nn.Dense(dim, name="value")(x), 0.0)
+        value = jnp.where(valid[..., None], full(nn.Dense(dim, name="value")(x)), 0.0)
         propagated = propagate(mix, weights, value)
         return nn.Dense(dim, name="output")(propagated)
 
@@ -259,7 +268,7 @@ class NeighbourConvolution(nn.Module):
         del position
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "relations", jnp.ones((1, 1, 1), x.dtype))
-        return nn.relu(smooth(nn.Dense(x.shape[-1], name="value")(x), valid))
+        return nn.relu(smooth(full(nn.Dense(x.shape[-1], name="value")(x)), valid))
 
 
 class HeterogeneousAttention(nn.Module):
@@ -275,11 +284,11 @@ class HeterogeneousAttention(nn.Module):
         config, (height, width, dim) = self.config, x.shape
         # All cells are nodes of one type, hence one transformation (Wang et al. 2019, Eq. 1).
         transform = nn.Dense(dim, name="value")
-        value = transform(x).reshape(height, width, config.heads, dim // config.heads)
+        value = full(transform(x)).reshape(height, width, config.heads, dim // config.heads)
         placed = (x + position).reshape(height * width, dim)
         # a^T [W h_i || W h_j] of every edge type and head in one product (Eq. 2-3).
         halves = nn.Dense(2 * len(config.relations) * config.heads, use_bias=False, name="scores")(placed)
-        halves = halves.reshape(height, width, len(config.relations), 2, config.heads)
+        halves = full(halves).reshape(height, width, len(config.relations), 2, config.heads)
         by_type = []
         for i, relation in enumerate(config.relations):
             destination, source = halves[:, :, i, 0], halves[:, :, i, 1]
@@ -293,8 +302,8 @@ class HeterogeneousAttention(nn.Module):
         # beta = softmax of mean_i q^T tanh(W z_i + b) (Eq. 7-9), over valid cells.
         summary, question = nn.Dense(config.semantic, name="semantic"), nn.Dense(1, use_bias=False, name="question")
         count = jnp.maximum(valid.sum(), 1).astype(x.dtype)
-        asked = jnp.stack([jnp.where(valid, question(jnp.tanh(summary(z)))[..., 0], 0.0).sum() for z in by_type])
-        type_weights = nn.softmax(asked / count)
+        asked = [jnp.where(valid, full(question(jnp.tanh(summary(z))))[..., 0], 0.0).sum() for z in by_type]
+        type_weights = nn.softmax(jnp.stack(asked) / count)
         if self.is_mutable_collection("intermediates"):
             self.sow("intermediates", "relations", type_weights[None, None])
         return sum((type_weights[i] * z for i, z in enumerate(by_type)), jnp.zeros_like(x))

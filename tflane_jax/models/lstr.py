@@ -7,6 +7,7 @@ query per lane -> class, extent and curve of each lane. Source: docs/reference/l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 import flax.linen as nn
@@ -17,6 +18,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.layers.positions import image_sine_encoding
+from tflane_jax.layers.precision import PLAIN, Computation, Precision, computing, full, run_layer
 from tflane_jax.layers.resnet import ResNet, ResNetConfig
 from tflane_jax.layers.transformer import DecoderLayer, EncoderLayer, TransformerConfig
 from tflane_jax.limits import INCREASING, Count, Fraction, Rules, splits
@@ -41,10 +43,10 @@ class TransformerEncoderConfig:
     layers: Count = 2
     layer: TransformerConfig = TransformerConfig()
 
-    def build(self, dim: int, name: str) -> TransformerEncoder:
+    def build(self, dim: int, name: str, computation: Computation = PLAIN) -> TransformerEncoder:
         """Return the Linen module; it infers the number of channels from its input."""
         del dim
-        return TransformerEncoder(self, name=name)
+        return TransformerEncoder(self, computation, name=name)
 
 
 # Mean and scale of the outputs of anchored heads: alpha, beta; k'', f'', m'', n'; columns at the two anchor rows.
@@ -77,6 +79,10 @@ class LstrConfig:
             describe the same curves.
         init: of the parameters: "flax" has this project's initial values, "lstr" those of LSTR's program
             (`models.lstr_init`).
+        precision: dtype of convolutions and linear layers, see `layers.precision`; parameters, norms, heads and
+            predictions are float32.
+        remat: recompute the activations of each stage of the backbone and of each layer for the gradient instead of
+            keeping them.
     """
 
     backbone: ResNetConfig = ResNetConfig()
@@ -90,6 +96,8 @@ class LstrConfig:
     anchors: Annotated[tuple[Fraction, Fraction], INCREASING] | None = None
     cells: bool = False
     init: Literal["flax", "lstr"] = "flax"
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels split over rows and columns, sine and cosine, and over heads and meta-paths."""
@@ -115,6 +123,7 @@ class TransformerEncoder(nn.Module):
     """Encoder layers over the cells of a feature map."""
 
     config: TransformerEncoderConfig
+    computation: Computation = PLAIN
 
     @nn.compact
     def __call__(
@@ -130,7 +139,8 @@ class TransformerEncoder(nn.Module):
         x = jnp.where(valid[..., None], features, 0.0).reshape(-1, shape[-1])
         position = position.reshape(-1, shape[-1])
         for i in range(self.config.layers):
-            x = EncoderLayer(self.config.layer, name=f"layer_{i}")(x, position, mask, deterministic=deterministic)
+            layer = partial(EncoderLayer, self.config.layer, name=f"layer_{i}")
+            x = run_layer(self, layer, self.computation, x, position, mask, deterministic=deterministic)
         return x.reshape(shape)
 
 
@@ -152,13 +162,16 @@ class Lstr(nn.Module):
         """
         config = self.config
         image, valid = shrink(image, valid, config.shrink)
-        features = ResNet(config.backbone, name="backbone")(image[None], train=train)[-1][0]
-        features = nn.Dense(config.dim, name="input_projection")(features)
+        dtype = jnp.bfloat16 if config.precision == "bfloat16" else None
+        backbone = ResNet(config.backbone, remat=config.remat, dtype=dtype, name="backbone")
+        features = backbone(image[None], train=train)[-1][0]
+        with computing(config.precision):
+            features = full(nn.Dense(config.dim, name="input_projection")(features))
         cells = nearest(valid, *features.shape[:2])
         position = image_sine_encoding(cells, config.dim // 2)
         if config.located:
             features = features + position
-        encoder = config.encoder.build(config.dim, "encoder")
+        encoder = config.encoder.build(config.dim, "encoder", config)
         memory = encoder(features, position, cells, deterministic=not train)
         if config.cells and self.is_mutable_collection(AUXILIARY):
             self.sow(AUXILIARY, "line_cells", nn.Dense(1, name="cell_head")(memory)[..., 0])
@@ -169,8 +182,8 @@ class Lstr(nn.Module):
         x, outputs = jnp.zeros_like(query), []
         norm = nn.LayerNorm(epsilon=1e-5, name="decoder_norm")
         for i in range(config.decoder_layers):
-            layer = DecoderLayer(config.decoder, name=f"decoder_{i}")
-            x = layer(x, memory, query, position, None, mask, deterministic=not train)
+            layer = partial(DecoderLayer, config.decoder, name=f"decoder_{i}")
+            x = run_layer(self, layer, config, x, memory, query, position, None, mask, deterministic=not train)
             outputs.append(norm(x))
         return LaneShapeHeads(config.dim, config.anchors, name="heads")(jnp.stack(outputs))
 

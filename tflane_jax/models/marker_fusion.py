@@ -22,6 +22,7 @@ from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.layers.precision import Precision, computing, full, run_part
 from tflane_jax.limits import Count, Fraction, Positive, Rules, splits
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.marker_memory import (
@@ -62,6 +63,8 @@ class MarkerFusionConfig:
         query_position: add position encodings to the attention's queries. Eq. (3) has none, SMERF has; without, BEV
             features from convolutions carry no positions.
         connectivity: lanes exchange messages with their successors and predecessors (the paper's future work).
+        precision: dtype of linear layers, see `layers.precision`; parameters, tokens and results are float32.
+        remat: recompute the activations of each layer and of each fusion for the gradient instead of keeping them.
     """
 
     prior: MarkerPriorConfig = MarkerPriorConfig()
@@ -76,6 +79,8 @@ class MarkerFusionConfig:
     radius: Positive | None = None
     query_position: bool = True
     connectivity: bool = False
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels of the attention split over heads."""
@@ -196,14 +201,17 @@ class MarkerTokens(nn.Module):
         points = jnp.where(valid[:, None, None], self.range.normalise(lanes.points), 0.0)
         count = points.shape[1]
         if config.encoding == "mlp":
-            x = Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2))
+            with computing(config.precision):
+                x = full(Mlp((config.lines.hidden, config.lines.dim), name="lines")(points.reshape(-1, count * 2)))
         else:
             sizes = config.lines if config.encoding == "sine" else replace(config.lines, bands=0)
             nothing = jnp.zeros((len(points), 0))
-            x = PolylineEncoder(sizes, name="lines")(points, nothing, valid, deterministic=deterministic)
+            x = PolylineEncoder(sizes, config, name="lines")(points, nothing, valid, deterministic=deterministic)
         x = jnp.where(valid[:, None], x, 0.0)
         if config.connectivity:
-            x = jnp.where(valid[:, None], LaneNeighbours(config.lines.dim, name="neighbours")(x, lanes.successor), 0.0)
+            with computing(config.precision):
+                messages = LaneNeighbours(config.lines.dim, name="neighbours")
+                x = jnp.where(valid[:, None], messages(x, lanes.successor), 0.0)
         return x * lanes.weight[:, None]  # Eq. (4)
 
 
@@ -247,6 +255,10 @@ class MarkerFusion(nn.Module):
             mask: which cell may attend to which token.
             gate: c of Eq. (3), as from `fusion_gate`.
         """
+        return run_part(self, MarkerFusion._fuse, self.config, bev, position, tokens, mask, gate)
+
+    def _fuse(self, bev, position, tokens, mask, gate) -> Float[Array, "q c"]:
+        """Return Eq. (3); called by the compact method."""
         config, channels = self.config, bev.shape[-1]
         norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
         query = norm(bev) if added else bev

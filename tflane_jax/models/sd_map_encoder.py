@@ -17,6 +17,7 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import PolylineEncoder, PolylineEncoderConfig
+from tflane_jax.layers.precision import Precision, run_part
 from tflane_jax.limits import Count, Positive, Rules, splits
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.sd_map import SdMapPriorConfig, sd_map_tokens
@@ -34,6 +35,8 @@ class SdMapModuleConfig:
         width, norm, radius: see `MarkerFusionConfig`; SMERF's are the defaults.
         absent: if no line is valid, "nothing" leaves the BEV features exactly as they are; "reference" adds the bias of
             the attention's output and normalises, as the published code does for an empty map in a batch.
+        precision: dtype of linear layers, see `layers.precision`; parameters, tokens and results are float32.
+        remat: recompute the activations of each layer and of each fusion for the gradient instead of keeping them.
     """
 
     prior: SdMapPriorConfig = SdMapPriorConfig()
@@ -43,6 +46,8 @@ class SdMapModuleConfig:
     norm: Literal["sum", "query"] = "sum"
     radius: Positive | None = None
     absent: Literal["nothing", "reference"] = "nothing"
+    precision: Precision = "float32"
+    remat: bool = False
 
     def limits(self) -> Rules:
         """Channels of the attention split over heads."""
@@ -130,7 +135,7 @@ class SdMapEncoder(nn.Module):
             deterministic: no dropout. False needs the random key `dropout`.
         """
         lines = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
-        encoder = PolylineEncoder(self.config.lines, name="lines")
+        encoder = PolylineEncoder(self.config.lines, self.config, name="lines")
         return encoder(lines.points, lines.labels, lines.valid, deterministic=deterministic), lines.valid
 
 
@@ -155,6 +160,10 @@ class SdMapFusion(nn.Module):
             tokens, valid: of the lines.
             mask: which cell may attend to which line, see `sd_map_mask`; None: to all valid lines.
         """
+        return run_part(self, SdMapFusion._fuse, self.config, bev, position, tokens, valid, mask)
+
+    def _fuse(self, bev, position, tokens, valid, mask) -> Float[Array, "q c"]:
+        """Return the BEV features; called by the compact method."""
         config, channels, present = self.config, bev.shape[-1], valid.any()
         norm, added = nn.LayerNorm(epsilon=1e-5, name="norm"), config.norm == "query"
         attention = MultiHeadAttention(

@@ -27,6 +27,8 @@ from tflane_jax.files.atomic import rename_flushed
 from tflane_jax.training.state import TrainState, state_from, tree_of
 
 _VERSION = 1
+# In `Manifest.progress`, where versions that do not know it leave it alone: the checksum of the configuration.
+_CONFIG_SUM = "config_sum"
 Which = int | Literal["last", "best"]
 
 
@@ -97,6 +99,7 @@ class Checkpoints:
                 shutil.rmtree(stale, ignore_errors=True)
             _save_tree(writing / "state", _plain(state))
             content = asdict(manifest) | {"files": _checksums(writing)}
+            content["progress"] = {**manifest.progress, _CONFIG_SUM: _sum_of(manifest.config)}
             (writing / "manifest.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
             if place.is_dir():
                 shutil.rmtree(place)
@@ -154,7 +157,8 @@ class Checkpoints:
         if (difference := _first_difference(saved, _flat(expected))) is not None:
             raise UserError(
                 f"checkpoint {self.path(step)} does not fit this configuration: {difference}. It was made by another "
-                "model, optimiser or number of seeds"
+                "model, optimiser or number of seeds: undo the change of config.json (config.txt has the settings "
+                "that the run was started with), or train another run"
             )
         # Through the template's own dict, because empty parts of an optimiser's state are not stored.
         leaves = jax.tree_util.tree_map_with_path(
@@ -190,6 +194,12 @@ class Checkpoints:
         manifest = self.manifest(step)
         text = json.dumps([manifest.step, manifest.files, manifest.config], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def is_edited(self, step: int) -> bool | None:
+        """Return whether a checkpoint's configuration was changed after it was written; None where that is unknown."""
+        manifest = self.manifest(step)
+        written = manifest.progress.get(_CONFIG_SUM)
+        return None if written is None else written != _sum_of(manifest.config)
 
     def _is_evaluated(self, step: int) -> bool:
         try:
@@ -248,6 +258,10 @@ def _load_tree(folder: Path) -> dict[str, np.ndarray]:
         names = reader.metadata(folder.absolute()).item_metadata.tree
         as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), names)
         return _flat(reader.restore(folder.absolute(), args=ocp.args.PyTreeRestore(restore_args=as_numpy)))
+
+
+def _sum_of(config: dict[str, Any]) -> int:
+    return zlib.crc32(json.dumps(config, sort_keys=True).encode())
 
 
 def _first_line(error: Exception) -> str:

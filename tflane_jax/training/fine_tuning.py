@@ -39,13 +39,13 @@ def starting_params(
     """
     return [
         _params_of_run(folder, fresh.params, partly=partly, frozen=frozen)
-        for folder, fresh in zip(_folders(reference, seeds), states, strict=True)
+        for folder, fresh in zip(origin_folders(reference, seeds), states, strict=True)
     ]
 
 
 def check_origins(reference: str, seeds: Sequence[int]) -> None:
     """Raise UserError if a run to start from is missing or has no checkpoint; nothing is restored."""
-    for folder in _folders(reference, seeds):
+    for folder in origin_folders(reference, seeds):
         try:
             _starting_checkpoint(folder)
         except UserError as error:
@@ -55,13 +55,14 @@ def check_origins(reference: str, seeds: Sequence[int]) -> None:
 def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """Return folder, step and content of the checkpoint that each seed starts from, see `starting_params`."""
     found = []
-    for folder in _folders(reference, seeds):
+    for folder in origin_folders(reference, seeds):
         checkpoints, step, _ = _starting_checkpoint(folder)
         found.append({"run": str(folder), "step": step, "content": checkpoints.content(step)})
     return found
 
 
-def _folders(reference: str, seeds: Sequence[int]) -> list[Path]:
+def origin_folders(reference: str, seeds: Sequence[int]) -> list[Path]:
+    """Return the run folder that each seed starts from, see `starting_params`."""
     return [Path(reference.replace("{seed}", str(seed))) for seed in seeds]
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request to stop after the current step."""
+"""Ctrl-C and SIGTERM as a request to stop: at once before the first step, then after the current one."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import signal
 import threading
 from types import FrameType, TracebackType
 
+from tflane_jax.errors import Interrupted
+
 
 class StopRequest:
     """Inside the block, SIGINT and SIGTERM set `signal`; a second one has its usual effect.
 
-    Outside the main thread, signals are not touched.
+    Between `at_once` and `after_the_step`, they raise `Interrupted` as well. Outside the main thread, signals are not
+    touched.
     """
 
     signal: int | None = None
+    _at_once = False
 
     def __enter__(self) -> StopRequest:
         self._before = {}
@@ -22,10 +26,22 @@ class StopRequest:
                 self._before[number] = signal.signal(number, self._ask)
         return self
 
+    def at_once(self) -> None:
+        """Let a signal, also one that came before, raise `Interrupted`."""
+        self._at_once = True
+        if self.signal is not None:
+            raise Interrupted(self.signal)
+
+    def after_the_step(self) -> None:
+        """Let a signal only be noted. One may have come that raised its error where Python ignores it."""
+        self._at_once = False
+
     def _ask(self, number: int, frame: FrameType | None) -> None:
         del frame
         self.signal = number
         self._put_back()
+        if self._at_once:
+            raise Interrupted(number)
 
     def _put_back(self) -> None:
         for number, handler in self._before.items():

@@ -7,10 +7,9 @@ folder (`training.run_folder`) holds all that is needed to resume.
 from __future__ import annotations
 
 import contextlib
-import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,13 +24,14 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, check_settings
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import apart, arrays_from_first, from_first, is_first, stop_signal
+from tflane_jax.processes import apart, arrays_from_first, count, from_first, is_first, stop_signal
+from tflane_jax.startup import ready, showing, stage, write
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
 from tflane_jax.training.fine_tuning import origins, starting_params
 from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
-from tflane_jax.training.records import Record, RecordWriter, Unwritten
+from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, seed_record
 from tflane_jax.training.restarts import adapt
 from tflane_jax.training.run_folder import Start, claimed, read_config
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
@@ -79,23 +79,6 @@ class TrainingConfig:
     best_metric: str = "all/DET_l"
     init_from: str | None = None
     init_partly: bool = False
-
-
-@dataclass
-class _Window:
-    """Sums of metrics since the last record; checkpoints hold them, so that a resumed run writes the same records."""
-
-    steps: int = 0
-    sums: dict[str, list[float]] = field(default_factory=dict)
-
-    def add(self, metrics: dict[str, np.ndarray]) -> None:
-        for name, value in metrics.items():
-            self.sums[name] = list(np.add(self.sums.get(name, 0.0), np.atleast_1d(value).astype(float)))
-        self.steps += 1
-
-    def record(self, step: int) -> Record:
-        means = {name: np.divide(values, self.steps).tolist() for name, values in self.sums.items()}
-        return {"step": step, "split": "train"} | {k: v[0] if len(v) == 1 else v for k, v in means.items()}
 
 
 @dataclass(frozen=True)
@@ -156,6 +139,7 @@ def train(
     Raises:
         UserError: see `run_folder.claimed` and `Checkpoints`; settings out of range; a loss that is not finite, after
             the last good state was written.
+        Interrupted: a signal came before the first step. With several processes it is kept until they agree.
     """
     check_settings(config, "training.")
     progress = progress and is_first()
@@ -165,7 +149,7 @@ def train(
     if adaptive is not None and evaluate is None:
         raise UserError("optim.restarts.adaptive needs evaluations, and this training has none")
     optimizer = make_optimizer(optim, config.steps)
-    with contextlib.ExitStack() as stack, StopRequest() as stop:
+    with contextlib.ExitStack() as stack, showing(progress), StopRequest() as stop:
         # =============================================================================================================
         # Run folder
         # =============================================================================================================
@@ -181,29 +165,33 @@ def train(
                 _tell(notices)
 
         from_first(claim)
+        if count() == 1:
+            stop.at_once()
         checkpoints = Checkpoints(folder / "checkpoints", keep=config.keep_checkpoints, best_metric=config.best_metric)
 
         # =============================================================================================================
         # State: fresh, of another run, or resumed
         # =============================================================================================================
-        states = init_states(task, optimizer, config.seeds, first_example(arrays))
-        window, metrics, seconds = _Window(), {}, 0.0
+        with stage("making the initial parameters"):
+            states = init_states(task, optimizer, config.seeds, first_example(arrays))
+        window, metrics, seconds = Window(), {}, 0.0
         memories, started_from = [Memory() for _ in config.seeds], {}
         if start == "resume" and (latest := from_first(lambda: _latest(checkpoints))) is not None:
             whole = of_all_seeds(states)
-            states = per_seed(
-                arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole), config.seeds
-            )
+            with stage(f"restoring step {latest['step']}"):
+                restored = arrays_from_first(lambda: checkpoints.restore(latest["step"], whole), whole)
+            states = per_seed(restored, config.seeds)
             try:
                 window, metrics, seconds, memories = _carried(latest["progress"], memories)
             except (KeyError, TypeError, ValueError, AttributeError) as error:
                 raise checkpoints.damaged_progress(latest["step"], error) from error
         elif (origin := config.init_from) is not None:
             fresh = states
-            given = arrays_from_first(
-                lambda: starting_params(origin, fresh, config.seeds, partly=config.init_partly, frozen=frozen),
-                [state.params for state in fresh],
-            )
+            with stage(f"reading {origin}"):
+                given = arrays_from_first(
+                    lambda: starting_params(origin, fresh, config.seeds, partly=config.init_partly, frozen=frozen),
+                    [state.params for state in fresh],
+                )
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
             started_from = {"init_from": from_first(lambda: origins(origin, config.seeds))}
         states = [replicated(state, mesh) for state in states]
@@ -222,14 +210,16 @@ def train(
         began = time.perf_counter()
         place, order = partial(divided, mesh=mesh), range(first, config.steps)
         feed = batches(arrays, config.seeds, order, config.batch_size, prepare, share=share(mesh), place=place)
-        batch = next(feed, None)
+        stack.enter_context(contextlib.closing(feed))
+        with stage("reading the first batch"):
+            batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
             form: dict[str, Any] = {"donate": len(states) == 1, "mesh": mesh, "accumulate": config.accumulate}
             update = compiled_update(task, optim, config.steps, states[0], batch[0], **form)
         compile_seconds = time.perf_counter() - began
-        if progress:
-            tqdm.write(f"compiled the update step in {compile_seconds:.1f} s", file=sys.stderr)
+        ready()
+        stop.after_the_step()
 
         # =============================================================================================================
         # Steps
@@ -244,7 +234,6 @@ def train(
 
         stepping, saved_step, stopped = 0.0, first, stop_signal(stop.signal, 0)
         with (
-            contextlib.closing(feed),
             RecordWriter(folder, first) if is_first() else Unwritten() as writer,
             tqdm(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
         ):
@@ -266,18 +255,18 @@ def train(
                     record = window.record(step)
                     writer.write(record | {"seconds": seconds})
                     bar.set_postfix(loss=f"{np.mean(record['loss']):.4g}", refresh=False)
-                    window = _Window()
+                    window = Window()
                 if evaluate is not None and (step % config.eval_every == 0 or is_last):
                     measured = [evaluate(state.ema_params) for state in states]  # several processes predict together
                     evaluations = from_first(lambda measured=measured: measured)
-                    writer.write(_seed_record(step, "val", {k: [e[k] for e in evaluations] for k in evaluations[0]}))
+                    writer.write(seed_record(step, "val", {k: [e[k] for e in evaluations] for k in evaluations[0]}))
                     metrics = {k: float(np.mean([e[k] for e in evaluations])) for k in evaluations[0]}
                     if adaptive is not None:
                         together = of_all_seeds([state.opt_state for state in states])
                         together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
                         changed = replicated(per_seed(together, config.seeds), mesh)
                         states = [replace(s, opt_state=o) for s, o in zip(states, changed, strict=True)]
-                        writer.write(_seed_record(step, "cycle", cycles))
+                        writer.write(seed_record(step, "cycle", cycles))
                     save(metrics)
                     saved_step = step
                     if draw is not None and is_first():
@@ -305,17 +294,12 @@ def _latest(checkpoints: Checkpoints) -> dict[str, Any] | None:
     return {"step": steps[-1], "progress": checkpoints.manifest(steps[-1]).progress}
 
 
-def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[_Window, dict[str, float], float, list[Memory]]:
+def _carried(saved: dict[str, Any], fresh: list[Memory]) -> tuple[Window, dict[str, float], float, list[Memory]]:
     """Return window, metrics, seconds and the memories of seeds from a checkpoint's progress."""
     sums = {name: list(map(float, values)) for name, values in saved["window"]["sums"].items()}
-    window = _Window(int(saved["window"]["steps"]), sums)
+    window = Window(int(saved["window"]["steps"]), sums)
     metrics = {name: float(value) for name, value in saved["metrics"].items()}
     return window, metrics, float(saved["seconds"]), [Memory(**one) for one in saved.get("cycles", [])] or fresh
-
-
-def _seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:
-    """Return the record of values with one entry per seed."""
-    return {"step": step, "split": split} | {name: v[0] if len(v) == 1 else v for name, v in values.items()}
 
 
 def _not_finite(values: dict[str, np.ndarray], step: int, seeds: tuple[int, ...], kept: Path) -> str:
@@ -336,4 +320,4 @@ def _unchanged(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
 def _tell(notices: Sequence[str]) -> None:
     for notice in notices:
-        tqdm.write(notice, file=sys.stderr)
+        write(notice)

@@ -6,9 +6,12 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+
+import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
@@ -155,3 +158,25 @@ class Unwritten:
 
 def _line(record: Record) -> str:
     return json.dumps(record) + "\n"
+
+
+@dataclass
+class Window:
+    """Sums of metrics since the last record; checkpoints hold them, so that a resumed run writes the same records."""
+
+    steps: int = 0
+    sums: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, metrics: dict[str, np.ndarray]) -> None:
+        for name, value in metrics.items():
+            self.sums[name] = list(np.add(self.sums.get(name, 0.0), np.atleast_1d(value).astype(float)))
+        self.steps += 1
+
+    def record(self, step: int) -> Record:
+        means = {name: np.divide(values, self.steps).tolist() for name, values in self.sums.items()}
+        return {"step": step, "split": "train"} | {k: v[0] if len(v) == 1 else v for k, v in means.items()}
+
+
+def seed_record(step: int, split: str, values: dict[str, list[float]]) -> Record:
+    """Return the record of values with one entry per seed."""
+    return {"step": step, "split": split} | {name: v[0] if len(v) == 1 else v for name, v in values.items()}

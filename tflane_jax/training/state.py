@@ -12,6 +12,7 @@ from flax import struct
 from jaxtyping import Array, Int
 
 from tflane_jax.models.parameters import Params, split_statistics
+from tflane_jax.startup import in_another_thread
 from tflane_jax.training.rng import stream
 from tflane_jax.training.task import Trainable
 from tflane_jax.training.vectors import Vectors, layout_of, ravel
@@ -86,7 +87,8 @@ def init_states(
 
     # Compiled without optimisation, because compiling takes longer than the calls.
     keys = [jax.random.key(seed) for seed in seeds]
-    compiled = jax.jit(init).lower(keys[0], example).compile({"xla_backend_optimization_level": "0"})
+    lowered = jax.jit(init).lower(keys[0], example)
+    compiled = in_another_thread(lambda: lowered.compile({"xla_backend_optimization_level": "0"}))
     return [compiled(key, example) for key in keys]
 
 

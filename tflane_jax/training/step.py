@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from tflane_jax.devices import active, everywhere
 from tflane_jax.models.parameters import Params, split_statistics
+from tflane_jax.startup import compiled
 from tflane_jax.training.loop_convolutions import with_fast_convolutions
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
@@ -123,8 +124,8 @@ def _compiled(
         jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type, sharding=where)
         for each, where in zip(types, placed, strict=True)
     ]
-    with active(mesh):
-        return update.lower(*jax.tree.unflatten(tree, shapes)).compile()
+    arguments = jax.tree.unflatten(tree, shapes)
+    return compiled(update, *arguments, what="the update step", context=functools.partial(active, mesh))
 
 
 def _traced_once(update: UpdateStep) -> UpdateStep:

@@ -68,6 +68,15 @@ def test_another_thread_gives_its_result_or_its_error():
         in_another_thread(lambda: 1 // 0)
 
 
+@pytest.fixture
+def interruptible():
+    """Python's own Ctrl-C, also where the tests were started in the background, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_a_signal_ends_the_wait_and_not_the_work():
     release, ended = threading.Event(), threading.Event()
 
@@ -88,9 +97,10 @@ def test_a_command_does_not_wait_for_a_thread_that_compiles(left, code):
     program = (
         "import os, signal, sys, threading, time\n"
         "from tflane_jax import startup\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def work():\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
-        f"    time.sleep({50 if left else 0.1})\n"
+        f"    time.sleep({600 if left else 0.1})\n"
         "try:\n"
         "    startup.in_another_thread(work)\n"
         "except KeyboardInterrupt:\n"
@@ -99,10 +109,8 @@ def test_a_command_does_not_wait_for_a_thread_that_compiles(left, code):
         "startup.leave(130)\n"
         "sys.exit(7)\n"
     )
-    began = time.perf_counter()
-    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert (ended.returncode, ended.stdout) == (code, "said\n")
-    assert time.perf_counter() - began < 40
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -110,21 +118,22 @@ def test_a_command_does_not_wait_for_a_thread_that_compiles(left, code):
     ("where", "says"), [("init", "before the run began: give the same"), ("loss", "--resume --out")]
 )
 def test_a_signal_before_the_first_step_ends_the_command(tmp_path, capsys, monkeypatch, number, where, says):
-    whole = getattr(LaneGraphTask, where)
+    whole, went_on = getattr(LaneGraphTask, where), []
 
     def interrupting(*arguments):
         os.kill(os.getpid(), number)
         for _ in range(1000):
             time.sleep(0.01)
+        went_on.append(where)
         return whole(*arguments)
 
     monkeypatch.setattr(LaneGraphTask, where, interrupting)
     (tmp_path / "tiny.py").write_text(CONFIG)
-    folder, began = tmp_path / "stopped", time.perf_counter()
+    folder = tmp_path / "stopped"
     # Another number of steps, so that the step is not compiled yet.
     command = ["train", "--config", str(tmp_path / "tiny.py:baseline"), "--out", str(folder), "--training.steps", "7"]
     assert main(command) == 128 + number
-    assert time.perf_counter() - began < 9
+    assert not went_on
     assert f"stopped by {number.name}" in (said := capsys.readouterr().err)
     assert says in said
     assert (folder / "config.json").exists() == (where == "loss")

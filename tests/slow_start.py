@@ -5,6 +5,7 @@ WHERE is what takes a minute or longer: "tracing" or "compiling" the update step
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 
@@ -18,6 +19,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
 def start(where: str) -> int:
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a process that was started in the background ignores it
     with pytest.MonkeyPatch.context() as patch:
         use_fakes(patch)
         quick = LaneGraphTask.loss

@@ -77,6 +77,9 @@ def orthogonal(updates: Vectors) -> Vectors:
             rows = (mine if stack.shape == shape else mine.mT).reshape(stack.count, -1)
             rows = jnp.pad(rows, ((0, 0), (0, stack.rows * ROW - rows.shape[1])))
             parts.setdefault(group, {})[stack.row] = rows.reshape(-1)
+    for group, mine in parts.items():
+        if tail := updates.layout.tail(group):
+            mine[len(updates.groups[group]) // ROW - tail] = jnp.zeros(tail * ROW)
     return updates.map(
         lambda group, masked: (
             jnp.concatenate([parts[group][row] for row in sorted(parts[group])]) if group in parts else masked

@@ -229,12 +229,19 @@ def _decay_what_learns(rate: float) -> optax.GradientTransformation:
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
+def muon_groups(config: OptimConfig) -> tuple[str, ...]:
+    """Return the groups of `Vectors` that Muon updates."""
+    if config.optimizer == "adam":
+        return ()
+    return ("dense",) if config.muon_kernels == "dense" else ("dense", "convolution")
+
+
 def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
     """Return Adam, or Muon for kernels beside Adam for the rest."""
     adam = optax.scale_by_adam(b1=config.b1, b2=config.b2, eps=config.eps)
     if config.optimizer == "adam":
         return adam
-    kernels = ("dense",) if config.muon_kernels == "dense" else ("dense", "convolution")
+    kernels = muon_groups(config)
 
     def labels(params: Any) -> Any:
         return params.map(lambda group, _: "muon" if group in kernels else "adam")

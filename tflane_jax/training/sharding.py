@@ -1,13 +1,12 @@
 """The training state divided over devices: each holds its part of parameters, moving average and moments.
 
 The loss needs all parameters, so an update begins by gathering them. Gradients are summed over the devices, and each
-device then updates its own part. Matrices that Muon makes orthogonal are gathered with their momentum and updated on
-every device: of those, only the storage is divided. Running statistics, counts and keys stay whole on every device.
+device then updates its own part. What Muon makes orthogonal is gathered before, and every device makes all of it: of
+those kernels only the storage is divided. Running statistics, counts and keys stay whole on every device.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,43 +38,39 @@ def placed(state: Any, mesh: Mesh | None, *, shard: bool) -> Any:
     return jax.tree.map(place, state, is_leaf=_is_vectors)
 
 
+def laid_out(state: Any, mesh: Mesh, *, shard: bool) -> Any:
+    """Return shapes and shardings of a state, given by its shapes, as `placed` puts it on the devices."""
+
+    def shapes(node: Any) -> Any:
+        divided = shard and _is_vectors(node)
+        node = jax.eval_shape(lambda vectors: vectors.padded(mesh.size), node) if divided else node
+        where = in_parts(mesh) if divided else everywhere(mesh)
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=where), node)
+
+    return jax.tree.map(shapes, state, is_leaf=_is_vectors)
+
+
 @dataclass(frozen=True)
 class Division:
-    """Where an update computes; without a mesh, nothing here changes anything.
+    """Where the arrays of an update are; without a mesh, nothing here changes anything.
 
     Attributes:
-        mesh: of the devices that share the state; None if it is not divided.
-        whole_groups: groups of `Vectors` whose update needs whole matrices.
+        mesh: of the devices that share the state; None if each has all of it.
     """
 
     mesh: Mesh | None = None
-    whole_groups: tuple[str, ...] = ()
 
     def gathered(self, vectors: Vectors) -> Vectors:
         """Return vectors that are whole on every device."""
-        return self._put(vectors, lambda group: True)
-
-    def for_update(self, tree: Any) -> Any:
-        """Return gradients, or the state of an optimiser, where their update is computed."""
-        return self._put(tree, lambda group: group in self.whole_groups)
+        return vectors if self.mesh is None else lax.with_sharding_constraint(vectors, everywhere(self.mesh))
 
     def at_rest(self, tree: Any) -> Any:
-        """Return a state or metrics where they are between updates: vectors in parts, all else on every device."""
-        return self._put(tree, lambda group: False)
-
-    def _put(self, tree: Any, is_whole: Callable[[str], bool]) -> Any:
+        """Return arrays as they are between updates: `Vectors` in parts, all else whole on every device."""
         if (mesh := self.mesh) is None:
             return tree
-        whole, parts = everywhere(mesh), in_parts(mesh)
 
         def put(node: Any) -> Any:
-            if not _is_vectors(node):
-                return lax.with_sharding_constraint(node, whole)
-            return node.map(
-                lambda group, value: jax.tree.map(
-                    lambda vector: lax.with_sharding_constraint(vector, whole if is_whole(group) else parts), value
-                )
-            )
+            return lax.with_sharding_constraint(node, in_parts(mesh) if _is_vectors(node) else everywhere(mesh))
 
         return jax.tree.map(put, tree, is_leaf=_is_vectors)
 

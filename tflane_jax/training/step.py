@@ -26,7 +26,7 @@ from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.startup import compiled
 from tflane_jax.training.loop_convolutions import with_fast_convolutions
 from tflane_jax.training.rng import stream
-from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate, muon_groups
+from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
 from tflane_jax.training.sharding import Division
 from tflane_jax.training.state import TrainState
 from tflane_jax.training.task import Trainable
@@ -61,7 +61,7 @@ def make_update_step(
         accumulate: parts of a batch, see `TrainingConfig.accumulate`.
         shard_state: the devices share the state, see `sharding.placed`.
     """
-    division = Division(mesh, muon_groups(optim)) if shard_state else Division()
+    division = Division(mesh if shard_state else None)
     update = _update(task, optim, steps, accumulate, division)
     loops = accumulate > 1 or getattr(task, "loops", False)
     update = _traced_once(with_fast_convolutions(update) if loops else update)
@@ -153,26 +153,27 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
 
 
 def _update(task: Trainable, optim: OptimConfig, steps: int, accumulate: int, division: Division) -> UpdateStep:
-    optimizer, rate = make_optimizer(optim, steps), make_rate(optim, steps)
+    optimizer, rate = make_optimizer(optim, steps, whole=division.gathered), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
-        key, learned = stream(state.key, "dropout", state.step), division.gathered(state.learned).tree()
+        key, params = stream(state.key, "dropout", state.step), division.gathered(state.learned).tree()
 
         def of_part(statistics: Params, batch: Any, key: jax.Array) -> tuple[Vectors, Any, Params]:
             def loss_of(learned: Params):
                 return task.loss(learned | statistics, batch, key)
 
-            (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(learned)
+            (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(params)
             terms, statistics = split_statistics(aux)
-            return division.for_update(ravel(grads, state.learned.layout)), (loss, terms), statistics
+            # Whole first: parts of the vectors alone would divide the leaves too, each at other places.
+            whole = division.gathered(ravel(grads, state.learned.layout))
+            return division.at_rest(whole), (loss, terms), statistics
 
         if accumulate == 1:
             gradient, (loss, terms), statistics = of_part(state.statistics, batch, key)
         else:
             gradient, (loss, terms), statistics = _over_parts(of_part, state, batch, key, accumulate)
         grad_norm = norm(gradient)
-        moments = division.for_update(state.opt_state)
-        updates, opt_state = optimizer.update(gradient, moments, state.learned)  # pyright: ignore
+        updates, opt_state = optimizer.update(gradient, state.opt_state, state.learned)  # pyright: ignore
         changed: Vectors = optax.apply_updates(state.learned, updates)  # pyright: ignore
         new = TrainState(
             step=state.step + 1,

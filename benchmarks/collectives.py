@@ -192,7 +192,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         text = f"{options.config}{layers}, {options.examples} example(s) and MiB on each device; "
         text += f"parameters {rows[0]['parameters'] / 2**20:.2f} MiB\n\n{table(rows)}\n\n"
     form: dict[str, Any] = {"kind": options.kind, "utilisation": options.utilisation}
-    scaling, assumptions = estimate(options.paper, 1, (8, 16), **form)
+    scaling, assumptions = estimate(options.paper, options.examples, (8, 16), **form)
     text += f"Estimate, not a measurement: {options.paper} on {options.kind}\n\n{estimate_table(scaling)}\n\n"
     text += "Assumptions\n" + "\n".join(f"- {sentence}" for sentence in assumptions)
     print(text)

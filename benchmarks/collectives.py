@@ -39,7 +39,7 @@ from tflane_jax.training.state import init_state
 from tflane_jax.training.step import make_update_step
 
 DEVICES = (1, 2, 8)
-KINDS_OF_EXCHANGE = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute")
+KINDS_OF_EXCHANGE: tuple[str, ...] = ("all-reduce", "all-gather", "reduce-scatter", "all-to-all", "collective-permute")
 LINKS = {"NVLink 4, 450 GB/s": 450.0, "Ethernet, 100 Gbit/s": 12.5}
 """GB/s of the slowest link of the ring, in one direction: H100's NVLink (900 GB/s in both), and a network card."""
 STEPS = 1000
@@ -50,7 +50,7 @@ def exchanges(program: str, devices: int) -> dict[str, tuple[int, int]]:
 
     Bytes are those of the whole arrays: of what is added up, gathered, or added up and divided.
     """
-    found = dict.fromkeys(KINDS_OF_EXCHANGE, (0, 0))
+    found: dict[str, tuple[int, int]] = dict.fromkeys(KINDS_OF_EXCHANGE, (0, 0))
     for shapes, kind in re.findall(rf" = (\(.*?\)|\S+) ({'|'.join(KINDS_OF_EXCHANGE)})\(", program):
         count, total = found[kind]
         size = sum(_bytes(name, dims) for name, dims in re.findall(r"([a-z]+\d*)\[([\d,]*)\]", shapes))

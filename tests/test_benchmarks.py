@@ -1,14 +1,18 @@
 """The arithmetic of the benchmarks; no test asserts a time."""
 
+import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks import loading, marker_occlusion, metrics, paper_sizes
+from benchmarks import collectives, loading, marker_occlusion, metrics, paper_sizes
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
+from tests.shared import ROOT
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_io import to_text
 from tflane_jax.markers.square_pose import solve_square
@@ -94,6 +98,45 @@ def test_every_part_of_a_paper_size_model_is_in_half_precision(model):
     chosen = [line.rpartition(" = ")[2] for line in text.splitlines() if ".precision" in line]
     assert len(chosen) >= 3
     assert set(chosen) == {"'bfloat16'"}
+
+
+def test_collectives_are_read_from_a_compiled_program():
+    program = """
+  %all-reduce.1 = (f32[3,4]{1,0}, /*index=1*/bf16[8]{0}) all-reduce(%a, %b), channel_id=1, to_apply=%add
+  %fusion = f32[12]{0} fusion(%all-reduce.1), kind=kLoop, calls=%c
+  ROOT %all-gather.2 = pred[16]{0} all-gather(%p), channel_id=2, dimensions={0}
+  %reduce-scatter = f32[] reduce-scatter(%q), channel_id=3
+  %all-reduce.7 = s32[1]{0} all-reduce(%r), channel_id=4"""
+    found = {kind: each for kind, each in collectives.exchanges(program, 8).items() if each[0]}
+    assert found == {"all-reduce": (2, 48 + 16 + 4), "all-gather": (1, 16), "reduce-scatter": (1, 8 * 4)}
+
+
+def test_the_scaling_is_that_of_a_ring(monkeypatch):
+    plan = SimpleNamespace(step_s=0.1, learned=10**9 / collectives.GIB, assumptions=("a", "b", "c", "d"))
+    monkeypatch.setattr(collectives, "make_plan", lambda *args, **form: plan)
+    rows, assumptions = collectives.estimate("gtn_lane/lstr", 1, (8, 16), kind="h100", utilisation=0.4)
+    found = {(row["link"][:8], row["devices"], row["state"]): row for row in rows}
+    assert len(found) == 8
+    slow, shared = found["Ethernet", 16, "whole"], found["Ethernet", 16, "shared"]
+    assert slow["exchange_s"] == pytest.approx(2 * 15 / 16 / 12.5)
+    assert shared["exchange_s"] == pytest.approx(1.5 * slow["exchange_s"])
+    assert slow["efficiency"] == pytest.approx(0.1 / (0.1 + 0.15))
+    assert "250.0 million" in assumptions[0]
+    assert collectives.estimate_table(rows).count("\n") == 9
+
+
+@pytest.mark.slow
+def test_an_update_is_planned_for_devices_that_a_cpu_plays(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.collectives", "--out", str(tmp_path), "--devices", "2"]
+    command += ["--config", "gtn_lane/overfit", "--paper", "gtn_lane/overfit"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert ended.returncode == 0, ended.stderr
+    whole, shared = json.loads((tmp_path / "collectives.json").read_text())["rows"]
+    assert whole["exchanges"]["all-reduce"][1] >= whole["parameters"]
+    assert whole["exchanges"]["all-gather"][0] == 0
+    assert shared["exchanges"]["all-gather"][1] >= shared["parameters"]
+    assert shared["arguments"] < 0.6 * whole["arguments"]
+    assert "Estimate, not a measurement" in (tmp_path / "collectives.md").read_text()
 
 
 def test_table_is_aligned():

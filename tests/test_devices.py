@@ -13,6 +13,7 @@ from tests.slow import with_slow
 from tests.training.many_devices import BATCH, EVENLY, assignments, host_terms, in_parts, normalised, predicted
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
+from tflane_jax.training.checkpoint import Checkpoints
 
 
 @pytest.fixture(scope="module", params=with_slow([2, 8], quick=[2]))
@@ -49,6 +50,33 @@ def test_a_resume_is_bit_identical(forced):
     folder, _ = forced
     assert arrays(folder / "resumed") == arrays(folder / "whole")
     assert timeless(folder / "resumed") == timeless(folder / "whole")
+
+
+def test_a_shared_state_gives_the_same_numbers_and_resumes_as_a_whole_one(forced):
+    whole, shared = (timeless(forced[0] / name) for name in ("whole", "shared"))
+    assert len(whole) == len(shared)
+    for expected, found in zip(whole, shared, strict=True):
+        for name, value in expected.items():
+            if name != "split":
+                np.testing.assert_allclose(found[name], value, rtol=1e-6, err_msg=name)
+    expected, found = (Checkpoints(forced[0] / name / "checkpoints").arrays(30) for name in ("whole", "shared"))
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5, atol=1e-7, err_msg=name)
+
+
+def test_each_device_holds_its_part_of_a_shared_state(forced):
+    devices, held = forced[1]["devices"], forced[1]["held"]
+    assert {len(parts) for _, parts in held.values()} == {devices}
+    assert all(parts == [size // devices] * devices for size, parts in held.values())
+    assert len(held) == 2 * 4  # kernels and biases: parameters, average, two moments
+
+
+@pytest.mark.slow
+def test_muon_has_whole_matrices_of_a_shared_state(forced):
+    if not (found := forced[1]["muon"]):
+        pytest.skip("compiled for two devices only")
+    np.testing.assert_allclose(*found, rtol=1e-5)
 
 
 def test_each_device_matches_its_own_examples(forced):

@@ -40,8 +40,8 @@ def counted(monkeypatch):
     return asked
 
 
-def estimate(task=None, accumulate=1, devices=4, **settings):
-    training = TrainingConfig(steps=3600, batch_size=16, accumulate=accumulate)
+def estimate(task=None, accumulate=1, devices=4, *, shard_state=False, **settings):
+    training = TrainingConfig(steps=3600, batch_size=16, accumulate=accumulate, shard_state=shard_state)
     options = {"devices": devices, "kind": "h100", "utilisation": 0.5} | settings
     return make_plan(task or Task(features=4), EXAMPLE, OptimConfig(lr_scaling="sqrt"), training, **options)
 
@@ -64,6 +64,14 @@ def test_parts_of_a_batch_take_memory_for_a_further_gradient_and_the_same_operat
     assert counted == [4, 2]
     assert parts.step_s == pytest.approx(whole.step_s)
     assert parts.memory == pytest.approx(whole.memory + LEARNED)
+
+
+def test_a_shared_state_takes_a_part_of_the_memory_and_more_exchange(counted):
+    whole, shared = estimate(), estimate(shard_state=True)
+    # Parameters, average and two moments in quarters; parameters are gathered.
+    assert shared.memory == pytest.approx(whole.memory - 4 * LEARNED + 4 * LEARNED / 4 + LEARNED, rel=1e-5)
+    assert shared.step_s - whole.step_s == pytest.approx(3 / 4 * LEARNED * GIB / (KINDS["h100"].link * 1e9))
+    assert estimate(shard_state=True, devices=1).memory == estimate(devices=1).memory
 
 
 def test_half_precision_and_one_device(counted):

@@ -80,6 +80,19 @@ def test_all_stop_when_one_is_told_to_and_one_alone_goes_on(trained, tmp_path):
     np.testing.assert_allclose(found[-1]["score"], expected[-1]["score"], rtol=1e-6)
 
 
+@pytest.mark.slow
+def test_a_state_that_processes_share_gives_the_same_numbers(trained, tmp_path):
+    folder = tmp_path / "run"
+    assert [each["step"] for each in together(folder, ["shared", "shared"])] == [30, 30]
+    whole, shared = timeless(trained[0]), timeless(folder)
+    assert len(whole) == len(shared)
+    for expected, found in zip(whole, shared, strict=True):
+        for name, value in expected.items():
+            if name != "split":
+                np.testing.assert_allclose(found[name], value, rtol=1e-6, err_msg=name)
+    assert (folder / "picture.txt").read_text().split()[0] == "30"
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -1,4 +1,4 @@
-"""Data parallelism: parameters are on every device, each batch is divided among the devices by examples.
+"""Data parallelism: each batch is divided among the devices by examples, parameters are on every device.
 
 A program stays one program over all devices of all processes (GSPMD): XLA divides what is done for each example, and
 adds up gradients and batch statistics. A loss is therefore that of the whole batch, and equal on one device and on many
@@ -8,11 +8,13 @@ up to rounding. With one device nothing here changes anything.
 from __future__ import annotations
 
 import contextlib
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from tflane_jax import processes
@@ -63,6 +65,11 @@ def everywhere(mesh: Mesh | None) -> NamedSharding | None:
     return None if mesh is None else NamedSharding(mesh, PartitionSpec())
 
 
+def in_parts(mesh: Mesh) -> NamedSharding:
+    """Return the sharding of arrays of which every device has a part, along the leading axis."""
+    return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
+
+
 def replicated(tree: Any, mesh: Mesh | None) -> Any:
     """Put a tree that every process holds on every device; on the default device for None."""
     if jax.device_count() == 1:
@@ -73,8 +80,33 @@ def replicated(tree: Any, mesh: Mesh | None) -> Any:
 def _put(leaf: Any, sharding: NamedSharding | None) -> Any:
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), sharding))
-    host = np.asarray(leaf)  # the array may be on all devices
+    host = np.asarray(gathered(leaf))  # the array may be on all devices
     return jax.device_put(host) if sharding is None else jax.make_array_from_process_local_data(sharding, host)
+
+
+def spread(leaf: Any, mesh: Mesh) -> jax.Array:
+    """Put an array, held whole by every process or spread before, on the devices in equal parts."""
+    if isinstance(leaf, jax.Array) and leaf.sharding == in_parts(mesh):
+        return leaf
+    host = np.asarray(gathered(leaf))
+    return jax.make_array_from_callback(host.shape, in_parts(mesh), lambda part: host[part])
+
+
+def gathered(tree: Any) -> Any:
+    """Return arrays that are in parts on several devices as whole ones on each of them; others stay."""
+
+    def whole(leaf: Any) -> Any:
+        where = leaf.sharding if isinstance(leaf, jax.Array) else None
+        if not isinstance(where, NamedSharding) or where.is_fully_replicated:
+            return leaf
+        return _on_every_device(leaf, where.mesh)
+
+    return jax.tree.map(whole, tree)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _on_every_device(leaf: jax.Array, mesh: Any) -> jax.Array:
+    return lax.with_sharding_constraint(leaf, everywhere(mesh))
 
 
 def of_one_process(tree: Any) -> Any:
@@ -91,8 +123,8 @@ def divided(rows: Any, mesh: Mesh | None) -> Any:
     """
     if mesh is None:
         return jax.device_put(rows)
-    sharding = NamedSharding(mesh, PartitionSpec(DATA_AXIS))
-    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(sharding, np.asarray(leaf)), rows)
+    parts = in_parts(mesh)
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(parts, np.asarray(leaf)), rows)
 
 
 def share(mesh: Mesh | None) -> tuple[int, int]:

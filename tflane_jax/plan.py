@@ -63,6 +63,7 @@ class Plan:
         rows: quantity and value, for a table.
         assumptions: one sentence each.
         memory: all parts together; None if nothing was compiled.
+        learned: parameters that have a gradient, all of them.
         step_s: of an update.
         run_s: of all updates.
     """
@@ -70,6 +71,7 @@ class Plan:
     rows: tuple[dict[str, str], ...]
     assumptions: tuple[str, ...]
     memory: float | None
+    learned: float
     step_s: float
     run_s: float
 
@@ -115,10 +117,13 @@ def make_plan(
     between = None if program.between is None else program.between / 1024
     # Parts add up in a further gradient.
     activations = None if between is None else between + (learned if training.accumulate > 1 else 0.0)
+    shared = training.shard_state and devices > 1
+    holders = devices if shared else 1
     parts = {
-        "parameters": _gib((state.learned, state.statistics)),
-        "their moving average": _gib((state.ema_learned, state.ema_statistics)),
-        "optimizer": _gib(state.opt_state),
+        "parameters": learned / holders + _gib(state.statistics),
+        "their moving average": _gib(state.ema_learned) / holders + _gib(state.ema_statistics),
+        "optimizer": _gib(state.opt_state) / holders,
+        **({"parameters, gathered for the loss": learned} if shared else {}),
         "batch": _gib(shapes_of(frames, part * training.accumulate)),
         "gradients and activations": activations,
     }
@@ -128,14 +133,14 @@ def make_plan(
     peak = device.bfloat16 if half else device.float32
     operations = program.gflop * training.accumulate
     compute = operations / (1e3 * peak * utilisation)
-    exchange = 2 * (devices - 1) / devices * learned * GIB / (1e9 * device.link)
+    exchange = (3 if shared else 2) * (devices - 1) / devices * learned * GIB / (1e9 * device.link)
     step = compute + exchange
     rows = {
         **{f"memory: {name}, GiB": _number(value) for name, value in parts.items()},
         f"memory of a device, GiB (it has {device.memory * 1e9 / GIB:.0f})": _number(memory),
         "operations of a step on a device, GFLOP": f"{operations:,.0f}",
         "computing, s a step": _number(compute),
-        "exchange of gradients, s a step": _number(exchange),
+        f"exchange of gradients{' and parameters' if shared else ''}, s a step": _number(exchange),
         "time of a step, s": _number(step),
         "examples a second, all devices": f"{training.batch_size / step:,.1f}" if step else "-",
         f"time of {training.steps:,} steps, hours": _number(step * training.steps / 3600),
@@ -149,9 +154,11 @@ def make_plan(
             "operations are XLA's count before fusion; what a loop does counts once",
             "gradients and activations need what the compiler for this machine plans; a GPU's plan differs",
             "gradients are exchanged after computing, in a ring, at full speed of the link",
+            *(("gathering what Muon needs whole takes neither memory nor time",) if shared else ()),
             "loading, evaluation, checkpoints and compiling take no time",
         ),
         memory,
+        learned,
         step,
         step * training.steps,
     )

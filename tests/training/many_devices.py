@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ import numpy as np
 from tests.models.cases import WITH_TRAFFIC, make_example
 from tests.parameters import random_params
 from tests.training.stub import LineTask, line_arrays
-from tests.training.stub_run import CONFIG, run
+from tests.training.stub_run import CONFIG, OPTIM, TASK, run, score
 from tflane_jax.devices import active, divided, everywhere, replicated, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predictions
@@ -27,11 +29,13 @@ from tflane_jax.matching import match
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.schedule import OptimConfig, make_optimizer
+from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states
 from tflane_jax.training.step import compiled_update
 
 BATCH = 8
 EVENLY = dataclasses.replace(CONFIG, batch_size=BATCH, seeds=(0, 1))
+SHARED = dataclasses.replace(EVENLY, shard_state=True)
 
 
 def assignments(backend: str) -> list:
@@ -119,6 +123,47 @@ def normalised(*, frozen: bool = False) -> dict[str, Any]:
     return {"output": np.asarray(found).tolist(), "statistics": statistics, "exchanges": exchanges}
 
 
+def shared_by_turns(folder: Path) -> None:
+    """Train with a state that the devices share up to step 10, whole on each up to 20, and shared again."""
+    stopped = []
+
+    def evaluate_and_stop(params):
+        stopped.append(params)
+        if len(stopped) == 2:  # both seeds
+            os.kill(os.getpid(), signal.SIGTERM)
+        return score(params)
+
+    run(folder, config=SHARED, evaluate=evaluate_and_stop)
+    stopped.clear()
+    run(folder, start="resume", config=EVENLY, evaluate=evaluate_and_stop)
+    run(folder, start="resume", config=SHARED)
+
+
+def updated(optim: OptimConfig, *, shard: bool) -> Any:
+    """Return the state of the stub after the first update of `run`, on the devices."""
+    arrays, mesh = line_arrays(BATCH), training_mesh(BATCH)
+    [state] = init_states(TASK, make_optimizer(optim, CONFIG.steps), [0], {"x": arrays["x"][0]})
+    state, batch = placed(state, mesh, shard=shard), divided(arrays, mesh)
+    form: dict[str, Any] = {"donate": False, "mesh": mesh, "shard_state": shard}
+    return compiled_update(TASK, optim, CONFIG.steps, state, batch, **form)(state, batch)[0]
+
+
+def held() -> dict[str, list]:
+    """Return the numbers of each vector of a shared state after an update, and how many of them each device holds."""
+    vectors = jax.tree_util.tree_flatten_with_path(updated(OPTIM, shard=True))[0]
+    return {
+        jax.tree_util.keystr(path): [leaf.size, [shard.data.size for shard in leaf.addressable_shards]]
+        for path, leaf in vectors
+        if leaf.ndim
+    }
+
+
+def with_muon() -> list:
+    """Return the stub's kernel after an update by Muon, with the state on every device, and shared."""
+    muon = dataclasses.replace(OPTIM, optimizer="muon")
+    return [np.asarray(updated(muon, shard=shard).params["line"]["kernel"]).tolist() for shard in (False, True)]
+
+
 def main() -> None:
     folder = Path(sys.argv[1])
     jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -127,6 +172,7 @@ def main() -> None:
     for step in (28, 30):
         shutil.rmtree(folder / "resumed" / "checkpoints" / f"step_{step:08d}")
     run(folder / "resumed", start="resume", config=EVENLY)
+    shared_by_turns(folder / "shared")
     facts = {
         "devices": jax.device_count(),
         "assignments": {backend: assignments(backend) for backend in ("jax", "scipy")},
@@ -135,7 +181,9 @@ def main() -> None:
         "predicted by one": predicted(BATCH - 1),
         "in parts": in_parts(),
         "norms": {"learned": normalised(), "frozen": normalised(frozen=True)},
+        "held": held(),
         "host": host_terms() if jax.device_count() == 2 else {},  # compiling takes long
+        "muon": with_muon() if jax.device_count() == 2 else [],
     }
     print(json.dumps(facts))
 

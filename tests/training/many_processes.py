@@ -1,7 +1,8 @@
 """One of several processes that train the stub task: `python -m tests.training.many_processes FOLDER PORT N I START`.
 
-START "new" or "resume"; "stopped" sends this process SIGTERM in its first evaluation. It evaluates with predictions,
-which all processes make together, and draws with predictions of its own.
+START "new", "resume", or "shared", which is new with a state that all share; "stopped" sends this process SIGTERM in
+its first evaluation. It evaluates with predictions, which all processes make together, and draws with predictions of
+its own.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ def main() -> None:
 
     begin = "resume" if start == "resume" else "new"
     try:
-        result = run(Path(folder), start=begin, config=CONFIG, evaluate=evaluate, draw=draw)
+        config = dataclasses.replace(CONFIG, shard_state=start == "shared")
+        result = run(Path(folder), start=begin, config=config, evaluate=evaluate, draw=draw)
     except UserError as error:
         print(json.dumps({"error": str(error)}))
         return

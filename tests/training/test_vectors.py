@@ -95,6 +95,21 @@ def test_any_in_leaf_is_by_leaf(group):
             np.testing.assert_array_equal(leaf, wanted)
 
 
+def test_rows_of_zeros_at_the_end_belong_to_no_leaf():
+    tree = example()
+    plain = ravel(tree, layout_of(tree)).map(lambda group, v: optax.MaskedNode() if group == "other" else v)
+    padded = plain.padded(5)
+    assert all(len(v) % (5 * ROW) == 0 for v in padded.groups.values() if not isinstance(v, optax.MaskedNode))
+    assert isinstance(padded.groups["other"], optax.MaskedNode)
+    assert padded.padded(5) is padded
+    jax.tree.map(np.testing.assert_array_equal, padded.tree(), plain.tree())
+    jax.tree.map(np.testing.assert_array_equal, ravel(padded.tree(), padded.layout), padded)
+    whole = len(plain.groups["plain"])
+    flags = [any_in_leaf(v.groups["plain"] != 0, v.layout, "plain") for v in (plain, padded)]
+    assert len(flags[1]) == len(padded.groups["plain"]) > whole
+    np.testing.assert_array_equal(flags[1][:whole], flags[0])
+
+
 def test_parameters_are_float32():
     with pytest.raises(ValueError, match=r"'kernel'.*float16"):
         layout_of({"kernel": np.zeros((2, 2), np.float16)})

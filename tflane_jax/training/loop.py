@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from tflane_jax.config_io import first_difference
 from tflane_jax.datasets.batches import Prepare, batches, first_example
-from tflane_jax.devices import divided, of_one_process, replicated, share, training_mesh
+from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, check_settings
@@ -33,8 +33,9 @@ from tflane_jax.training.interrupt import StopRequest
 from tflane_jax.training.provenance import add_provenance
 from tflane_jax.training.records import Record, RecordWriter, Unwritten, Window, seed_record
 from tflane_jax.training.restarts import adapt
-from tflane_jax.training.run_folder import Start, claimed, read_config
+from tflane_jax.training.run_folder import Start, claimed, fixed, read_config
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
+from tflane_jax.training.sharding import placed
 from tflane_jax.training.state import init_states, of_all_seeds, per_seed, state_of
 from tflane_jax.training.step import compiled_update, update_all
 from tflane_jax.training.task import Trainable
@@ -56,6 +57,8 @@ class TrainingConfig:
         batch_size: examples of an update (of each seed), on all devices together.
         accumulate: parts in which a batch passes through the model, one after the other, to save memory; see
             docs/scale.md for what is equal to one pass. `batch_size` must be a multiple of it times the devices.
+        shard_state: whether several devices share parameters, their average and moments, each with a part of them, in
+            place of holding all; docs/scale.md has what it saves and costs. A run resumes with and without it.
         seeds: roots of all random numbers in training. Several seeds train side by side, each as it would alone; n
             seeds take n times as long.
         log_every: steps between records; a record holds means over the steps since the last one.
@@ -71,6 +74,7 @@ class TrainingConfig:
     steps: Count = 10_000
     batch_size: Count = 8
     accumulate: Count = 1
+    shard_state: bool = False
     seeds: Annotated[tuple[CountOrZero, ...], NOT_EMPTY, DIFFERENT] = (0,)
     log_every: Count = 50
     eval_every: Count = 1000
@@ -157,7 +161,7 @@ def train(
             stack.enter_context(claimed(folder, start))
             if start == "resume":
                 saved, notices = (current_form or _unchanged)(read_config(folder))
-                if difference := first_difference(saved, resolved):
+                if difference := first_difference(fixed(saved), fixed(resolved)):
                     raise UserError(
                         f"{folder} was started with another configuration ({difference}): "
                         "resume it as it is, or start another run"
@@ -194,7 +198,8 @@ def train(
                 )
             states = [state_of(params, optimizer, s.key) for params, s in zip(given, states, strict=True)]
             started_from = {"init_from": from_first(lambda: origins(origin, config.seeds))}
-        states = [replicated(state, mesh) for state in states]
+        place = partial(placed, mesh=mesh, shard=config.shard_state)
+        states = [place(state) for state in states]
         first = step = int(states[0].step)
 
         def begin() -> None:
@@ -208,14 +213,15 @@ def train(
         # Compile
         # =============================================================================================================
         began = time.perf_counter()
-        place, order = partial(divided, mesh=mesh), range(first, config.steps)
-        feed = batches(arrays, config.seeds, order, config.batch_size, prepare, share=share(mesh), place=place)
+        order, divide = range(first, config.steps), partial(divided, mesh=mesh)
+        feed = batches(arrays, config.seeds, order, config.batch_size, prepare, share=share(mesh), place=divide)
         stack.enter_context(contextlib.closing(feed))
         with stage("reading the first batch"):
             batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
             form: dict[str, Any] = {"donate": len(states) == 1, "mesh": mesh, "accumulate": config.accumulate}
+            form["shard_state"] = config.shard_state
             update = compiled_update(task, optim, config.steps, states[0], batch[0], **form)
         compile_seconds = time.perf_counter() - began
         ready()
@@ -264,14 +270,16 @@ def train(
                     if adaptive is not None:
                         together = of_all_seeds([state.opt_state for state in states])
                         together, memories, cycles = adapt(adaptive, together, memories, evaluations, config.steps)
-                        changed = replicated(per_seed(together, config.seeds), mesh)
-                        states = [replace(s, opt_state=o) for s, o in zip(states, changed, strict=True)]
+                        changed = per_seed(together, config.seeds)
+                        states = [replace(s, opt_state=place(o)) for s, o in zip(states, changed, strict=True)]
                         writer.write(seed_record(step, "cycle", cycles))
                     save(metrics)
                     saved_step = step
-                    if draw is not None and is_first():
-                        with apart():
-                            draw(folder, step, states[0].ema_params, writer.records)
+                    if draw is not None:
+                        shown = states[0].ema_params  # several processes gather them together
+                        if is_first():
+                            with apart():
+                                draw(folder, step, shown, writer.records)
                 elif step % config.checkpoint_every == 0 or is_last:
                     save({})
                     saved_step = step

@@ -6,6 +6,7 @@ wide or tall, share one batched iteration: a model has a hundred kernels, but a 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -37,8 +38,17 @@ class MuonState(NamedTuple):
     mu: Any
 
 
-def scale_by_muon() -> optax.GradientTransformation:
-    """Return Muon with Nesterov momentum for `Vectors`; updates have a root mean square of about 0.2, like Adam's."""
+def same(vectors: Vectors) -> Vectors:
+    """Return the vectors as they are."""
+    return vectors
+
+
+def scale_by_muon(whole: Callable[[Vectors], Vectors] = same) -> optax.GradientTransformation:
+    """Return Muon with Nesterov momentum for `Vectors`; updates have a root mean square of about 0.2, like Adam's.
+
+    `whole` gathers vectors that several devices share: before matrices are made orthogonal, and after, so that every
+    device makes all of them.
+    """
 
     def init(params: Any) -> MuonState:
         return MuonState(jnp.zeros((), jnp.int32), jax.tree.map(jnp.zeros_like, params))
@@ -51,7 +61,7 @@ def scale_by_muon() -> optax.GradientTransformation:
             optax.tree.bias_correction(mu, _MOMENTUM, count + 1),
             optax.tree.bias_correction(updates, _MOMENTUM, count),
         )
-        return orthogonal(ahead), MuonState(count, mu)
+        return whole(orthogonal(whole(ahead))), MuonState(count, mu)
 
     return optax.GradientTransformation(init, update)  # pyright: ignore[reportArgumentType]
 
@@ -77,6 +87,9 @@ def orthogonal(updates: Vectors) -> Vectors:
             rows = (mine if stack.shape == shape else mine.mT).reshape(stack.count, -1)
             rows = jnp.pad(rows, ((0, 0), (0, stack.rows * ROW - rows.shape[1])))
             parts.setdefault(group, {})[stack.row] = rows.reshape(-1)
+    for group, mine in parts.items():
+        if tail := updates.layout.tail(group):
+            mine[len(updates.groups[group]) // ROW - tail] = jnp.zeros(tail * ROW)
     return updates.map(
         lambda group, masked: (
             jnp.concatenate([parts[group][row] for row in sorted(parts[group])]) if group in parts else masked

@@ -36,6 +36,7 @@ def scale_by_factors(factors: Factors) -> optax.GradientTransformation:
         def scaled(group: str, change: Any) -> Any:
             members = layout.members(group)
             of_row = np.repeat([of_leaf[i] for i in members], [layout.places[i].rows for i in members])
+            of_row = np.pad(of_row, (0, layout.tail(group)))
             return (change.reshape(-1, ROW) * of_row.astype(np.float32)[:, None]).reshape(change.shape)
 
         return updates.map(scaled), state

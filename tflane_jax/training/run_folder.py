@@ -51,6 +51,12 @@ def read_config(folder: Path) -> dict[str, Any]:
     return content
 
 
+def fixed(config: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration (JSON) without what a resumed run may change: where the devices hold its state."""
+    training = {name: value for name, value in config.get("training", {}).items() if name != "shard_state"}
+    return config | {"training": training}
+
+
 @contextlib.contextmanager
 def claimed(folder: Path, start: Start) -> Iterator[None]:
     """Prepare the folder and lock it for this process inside the block.

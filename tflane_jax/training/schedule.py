@@ -31,7 +31,7 @@ from tflane_jax.limits import (
     SettingError,
     check_settings,
 )
-from tflane_jax.training.muon import scale_by_muon
+from tflane_jax.training.muon import same, scale_by_muon
 from tflane_jax.training.rate_factors import Factors, scale_by_factors
 from tflane_jax.training.restarts import (
     Cycle,
@@ -184,10 +184,16 @@ def warmup_factor(config: OptimConfig, step: Int[ArrayLike, "..."]) -> Float[Arr
     return 1.0 - (1.0 - config.warmup_ratio) * (missing if config.warmup_steps else jnp.zeros_like(missing))
 
 
-def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformation:
+def make_optimizer(
+    config: OptimConfig, steps: int, *, whole: Callable[[Vectors], Vectors] = same
+) -> optax.GradientTransformation:
     """Return the gradient transformation of a run of `steps` updates, for `Vectors`.
 
     Its `init` raises UserError for `lr_factors` that match nothing.
+
+    Args:
+        config, steps: of the run.
+        whole: see `scale_by_muon`.
 
     Raises:
         UserError: a setting cannot work, see `make_schedule` and `RestartsConfig`.
@@ -195,7 +201,7 @@ def make_optimizer(config: OptimConfig, steps: int) -> optax.GradientTransformat
     """
     _check(config, steps)
     decay = optax.masked(_decay_what_learns(config.weight_decay), is_decayed)
-    adam = _preconditioner(config)
+    adam = _preconditioner(config, whole)
     return optax.chain(
         _clip_by_norm(config.clip_norm),
         optax.chain(*((adam, decay) if config.decay == "decoupled" else (decay, adam)), _scale_by_rate(config, steps)),
@@ -229,7 +235,7 @@ def _decay_what_learns(rate: float) -> optax.GradientTransformation:
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
-def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
+def _preconditioner(config: OptimConfig, whole: Callable[[Vectors], Vectors]) -> optax.GradientTransformation:
     """Return Adam, or Muon for kernels beside Adam for the rest."""
     adam = optax.scale_by_adam(b1=config.b1, b2=config.b2, eps=config.eps)
     if config.optimizer == "adam":
@@ -239,7 +245,7 @@ def _preconditioner(config: OptimConfig) -> optax.GradientTransformation:
     def labels(params: Any) -> Any:
         return params.map(lambda group, _: "muon" if group in kernels else "adam")
 
-    return optax.partition({"adam": adam, "muon": scale_by_muon()}, labels)
+    return optax.partition({"adam": adam, "muon": scale_by_muon(whole)}, labels)
 
 
 def _scale_by_rate(config: OptimConfig, steps: int) -> optax.GradientTransformation:

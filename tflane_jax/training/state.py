@@ -11,6 +11,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Int
 
+from tflane_jax.devices import gathered
 from tflane_jax.models.parameters import Params, split_statistics
 from tflane_jax.startup import in_another_thread
 from tflane_jax.training.rng import stream
@@ -42,12 +43,12 @@ class TrainState:
     @property
     def params(self) -> Params:
         """Return the task's parameters."""
-        return _tree(self.learned) | self.statistics
+        return _tree(gathered(self.learned)) | self.statistics
 
     @property
     def ema_params(self) -> Params:
         """Return their moving average, which is what gets evaluated."""
-        return _tree(self.ema_learned) | self.ema_statistics
+        return _tree(gathered(self.ema_learned)) | self.ema_statistics
 
 
 @jax.jit

@@ -27,6 +27,7 @@ from tflane_jax.startup import compiled
 from tflane_jax.training.loop_convolutions import with_fast_convolutions
 from tflane_jax.training.rng import stream
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, make_rate
+from tflane_jax.training.sharding import Division
 from tflane_jax.training.state import TrainState
 from tflane_jax.training.task import Trainable
 from tflane_jax.training.vectors import Vectors, norm, ravel
@@ -43,6 +44,7 @@ def make_update_step(
     donate: bool = True,
     mesh: Mesh | None = None,
     accumulate: int = 1,
+    shard_state: bool = False,
 ) -> UpdateStep:
     """Return the jitted update (state, batch) -> (state, metrics) of one seed.
 
@@ -57,11 +59,13 @@ def make_update_step(
         donate: give the memory of the input state to the new one; the input state cannot be used again.
         mesh: of several devices, on each of which the new state and the metrics are.
         accumulate: parts of a batch, see `TrainingConfig.accumulate`.
+        shard_state: the devices share the state, see `sharding.placed`.
     """
-    update = _update(task, optim, steps, accumulate)
+    division = Division(mesh if shard_state else None)
+    update = _update(task, optim, steps, accumulate, division)
     loops = accumulate > 1 or getattr(task, "loops", False)
     update = _traced_once(with_fast_convolutions(update) if loops else update)
-    placed: Any = {} if mesh is None else {"out_shardings": everywhere(mesh)}
+    placed: Any = {} if mesh is None or shard_state else {"out_shardings": everywhere(mesh)}
     return jax.jit(update, donate_argnums=0 if donate else (), **placed)
 
 
@@ -91,20 +95,21 @@ def compiled_update(
     donate: bool = True,
     mesh: Mesh | None = None,
     accumulate: int = 1,
+    shard_state: bool = False,
 ) -> UpdateStep:
     """Return the update of one seed, compiled for the shapes of a state and a batch.
 
     A process compiles it once: trainings that differ only in seeds or starting parameters use the same program.
 
     Args:
-        task, optim, steps, donate, accumulate: see `make_update_step`.
-        state, batch: with `mesh` as `devices.replicated` and `devices.divided` return them.
+        task, optim, steps, donate, accumulate, shard_state: see `make_update_step`.
+        state, batch: with `mesh` as `sharding.placed` and `devices.divided` return them.
         mesh: see `devices.training_mesh`.
     """
     leaves, tree = jax.tree.flatten((state, batch))
     placed = tuple(leaf.sharding if mesh is not None else None for leaf in leaves)
     types = tuple(jax.typeof(leaf) for leaf in leaves)
-    return _compiled(task, optim, steps, donate, tree, types, placed, mesh, accumulate)
+    return _compiled(task, optim, steps, donate, tree, types, placed, mesh, accumulate, shard_state)
 
 
 @functools.lru_cache(maxsize=16)
@@ -118,8 +123,10 @@ def _compiled(
     placed: tuple[Any, ...],
     mesh: Mesh | None,
     accumulate: int,
+    shard_state: bool,
 ) -> UpdateStep:
-    update: Any = make_update_step(task, optim, steps, donate=donate, mesh=mesh, accumulate=accumulate)
+    form: dict[str, Any] = {"donate": donate, "mesh": mesh, "accumulate": accumulate, "shard_state": shard_state}
+    update: Any = make_update_step(task, optim, steps, **form)
     shapes = [
         jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type, sharding=where)
         for each, where in zip(types, placed, strict=True)
@@ -145,19 +152,21 @@ def _traced_once(update: UpdateStep) -> UpdateStep:
     return checked
 
 
-def _update(task: Trainable, optim: OptimConfig, steps: int, accumulate: int) -> UpdateStep:
-    optimizer, rate = make_optimizer(optim, steps), make_rate(optim, steps)
+def _update(task: Trainable, optim: OptimConfig, steps: int, accumulate: int, division: Division) -> UpdateStep:
+    optimizer, rate = make_optimizer(optim, steps, whole=division.gathered), make_rate(optim, steps)
 
     def update(state: TrainState, batch: Any) -> tuple[TrainState, Metrics]:
-        key, learned = stream(state.key, "dropout", state.step), state.learned.tree()
+        key, params = stream(state.key, "dropout", state.step), division.gathered(state.learned).tree()
 
         def of_part(statistics: Params, batch: Any, key: jax.Array) -> tuple[Vectors, Any, Params]:
             def loss_of(learned: Params):
                 return task.loss(learned | statistics, batch, key)
 
-            (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(learned)
+            (loss, aux), grads = jax.value_and_grad(loss_of, has_aux=True)(params)
             terms, statistics = split_statistics(aux)
-            return ravel(grads, state.learned.layout), (loss, terms), statistics
+            # Whole first: parts of the vectors alone would divide the leaves too, each at other places.
+            whole = division.gathered(ravel(grads, state.learned.layout))
+            return division.at_rest(whole), (loss, terms), statistics
 
         if accumulate == 1:
             gradient, (loss, terms), statistics = of_part(state.statistics, batch, key)
@@ -181,7 +190,8 @@ def _update(task: Trainable, optim: OptimConfig, steps: int, accumulate: int) ->
             "learning_rate": rate(state.opt_state, state.step),
             "finite": jnp.isfinite(loss) & jnp.isfinite(grad_norm),
         }
-        return jax.tree.map(lambda after, before: jnp.where(metrics["finite"], after, before), new, state), metrics
+        kept = jax.tree.map(lambda after, before: jnp.where(metrics["finite"], after, before), new, state)
+        return division.at_rest((kept, metrics))
 
     return update
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -58,15 +58,26 @@ class Stack:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where every leaf of a tree lies: static, and equal for equal trees."""
+    """Where every leaf of a tree lies: static, and equal for equal trees.
+
+    Attributes:
+        treedef: of the tree.
+        places: of the leaves, in the order of the tree.
+        multiple: the rows of every vector are a multiple of this; rows of zeros follow the leaves where needed.
+    """
 
     treedef: Any
     places: tuple[Place, ...]
+    multiple: int = 1
 
     def members(self, group: str) -> list[int]:
         """Return the leaves of a group, by their number in the tree, in the order of its vector."""
         members = [i for i, place in enumerate(self.places) if place.group == group]
         return sorted(members, key=lambda i: self.places[i].row)
+
+    def tail(self, group: str) -> int:
+        """Return how many rows of zeros follow the leaves of a group."""
+        return -max(place.row + place.rows for place in self.places if place.group == group) % self.multiple
 
     def stacks(self, group: str) -> list[Stack]:
         """Return the kernels of a group as stacks of matrices; those without numbers are left out."""
@@ -103,6 +114,21 @@ class Vectors:
     def map(self, function: Callable[[str, Any], Any]) -> Vectors:
         """Return other values, from (group, value) of each group."""
         return Vectors({group: function(group, value) for group, value in self.groups.items()}, self.layout)
+
+    def padded(self, multiple: int) -> Vectors:
+        """Return the vectors of a layout with `multiple`; this one has it already, or none (1)."""
+        if self.layout.multiple == multiple:
+            return self
+        assert self.layout.multiple == 1
+        layout = replace(self.layout, multiple=multiple)
+
+        def longer(group: str, vector: Any) -> Any:
+            if isinstance(vector, optax.MaskedNode) or not (tail := layout.tail(group)):
+                return vector
+            pad = np.pad if isinstance(vector, np.ndarray) else jnp.pad
+            return pad(vector, ((0, 0),) * (vector.ndim - 1) + ((0, tail * ROW),))
+
+        return Vectors({group: longer(group, vector) for group, vector in self.groups.items()}, layout)
 
 
 def layout_of(params: Any) -> Layout:
@@ -154,6 +180,8 @@ def ravel(tree: Any, layout: Layout) -> Vectors:
             parts.append(leaf.reshape(*lead, place.size))
             if missing := place.rows * ROW - place.size:
                 parts.append(np.zeros((*lead, missing), np.float32))
+        if tail := layout.tail(group):
+            parts.append(np.zeros((*parts[0].shape[:-1], tail * ROW), np.float32))
         concatenate = jnp.concatenate if any(isinstance(part, jax.Array) for part in parts) else np.concatenate
         groups[group] = concatenate(parts, -1)
     return Vectors(groups, layout)
@@ -170,6 +198,7 @@ def any_in_leaf(vector: Bool[Array, " n"], layout: Layout, group: str) -> Bool[A
     leaf_of_row = np.repeat(
         np.arange(len(members := layout.members(group))), [layout.places[i].rows for i in members]
     ).astype(np.int32)
+    leaf_of_row = np.pad(leaf_of_row, (0, layout.tail(group)), "edge")
     rows = vector.reshape(-1, ROW).any(1)
     leaves = jax.ops.segment_max(
         rows.astype(jnp.int32), leaf_of_row, num_segments=len(members), indices_are_sorted=True

@@ -113,7 +113,7 @@ def test_other_checkpoints_are_no_backbone():
 @pytest.mark.slow
 def test_a_run_starts_from_the_backbone_alone(file, tmp_path):
     """Every seed keeps its own fresh parameters elsewhere; such a folder cannot be evaluated."""
-    model, folder = host(), tmp_path / "imagenet"
+    model, folder = host(stages=(0, 1)), tmp_path / "imagenet"
     params, _ = load_backbone(file, model)
     save_weights(RunConfig(task=replace(RunConfig().task, model=model)), params, folder, part=PART)
     with pytest.raises(UserError, match=rf"holds the weights of {PART} alone"):

@@ -36,7 +36,7 @@ from tflane_jax.world.roads.sd_map import SdMapConfig
 def get_config():
     cameras = CameraRigConfig(cameras=ARGOVERSE2_RING, scale=0.05)
     example = ExampleConfig(sensor=None, cameras=cameras, sd_map=SdMapConfig())
-    return RunConfig(data=WorldData(train=5, val=0, test=0, example=example))
+    return RunConfig(data=WorldData(train=5, val=1, test=1, example=example))
 """
 EXAMPLE = ExampleConfig(
     lanes=8,

@@ -8,9 +8,10 @@ import pytest
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
 from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence
+from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import Measured
 from tflane_jax.ablations.statistics import holm, paired_difference, scene_weights
+from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio
 
 SCENES, SEEDS = 40, (0, 1, 2, 3)
@@ -124,6 +125,7 @@ def test_scores_that_are_no_ratio_have_no_interval(results):
     found = effects(results, Declaration("all/AP_l", (Claim("+TFM"),)), "", "last")
     assert all(math.isnan(e.low) and math.isnan(e.high) and not math.isnan(e.p) for e in found)
     assert "95 %" not in sentence(found[:1])
+    assert "seeds, no interval over scenes: decided by seeds alone)" in sentence(found[:1])
 
 
 def test_rows_of_other_scenes_are_refused():
@@ -131,7 +133,7 @@ def test_rows_of_other_scenes_are_refused():
     for model, lanes in (("baseline", (4, 4)), ("+TFM", (4, 5))):
         ratio = SceneRatio((1, 2), lanes)
         found.add("", "last", model, 0, Measured(1, "a protocol", {"": {PRIMARY: 0.3}}, {"": {PRIMARY: ratio}}))
-    with pytest.raises(ValueError, match="not measured on the same lanes"):
+    with pytest.raises(UserError, match="not measured on the same lanes"):
         effects(found, Declaration(PRIMARY, (Claim("+TFM"),)), "", "last")
 
 

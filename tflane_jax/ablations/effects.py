@@ -7,7 +7,7 @@ measure and checkpoint) and between test scenes (bootstrap interval over scenes,
 the wrong direction, else *not shown*.
 
 The interval is exact for ratios of counts, such as recall. Scores that rank detections over all scenes (DET_l, AP_l,
-TOP_ll) have none.
+TOP_ll) have none: their findings stand on p alone, and say so.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
+from tflane_jax.ablations.recorded import Which
 from tflane_jax.ablations.report import listed
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import CHECKPOINTS, Which
+from tflane_jax.ablations.scores import CHECKPOINTS
 from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio, scene_weights
+from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 
 SAMPLES = 10_000
+HAS_INTERVAL = "95 %"
+NO_INTERVAL = "no interval over scenes: decided by seeds alone"
 Finding = Literal["shown", "not shown", "contradicted"]
 
 
@@ -161,7 +165,7 @@ def _samples(
 ) -> dict[str, Float[np.ndarray, " b"]]:
     """Return bootstrap samples of the measure for each row, all of the same draws; empty if it is no ratio of counts.
 
-    Raises ValueError if rows count different lanes, so that they were not measured on the same scenes.
+    Raises UserError if rows count different lanes, so that they were not measured on the same scenes.
     """
     ratios = {row: [results.ratios[test, which][row][seed] for seed in seeds] for row in rows}
     if not all(score in of_seed for each in ratios.values() for of_seed in each for score in measure.scores):
@@ -172,7 +176,10 @@ def _samples(
         weights = scene_weights(len(denominator), SAMPLES)
         for row, each in ratios.items():
             if any(of_seed[score].denominator != denominator for of_seed in each):
-                raise ValueError(f"{row} and {rows[0]} were not measured on the same lanes ({score})")
+                raise UserError(
+                    f"{row} and {rows[0]} were not measured on the same lanes ({score}): a recorded run, or one that "
+                    "an earlier state of the code measured, saw other test data; train and measure it again"
+                )
             numerators = np.array([of_seed[score].numerator for of_seed in each])
             samples[row] = samples[row] + weight * resampled_ratio(numerators, np.array(denominator), weights)
     return samples
@@ -234,9 +241,10 @@ def sentence(of_row: Sequence[Effect]) -> str:
 
 def _numbers(effect: Effect) -> str:
     """Return a difference in points of percent, with its uncertainties."""
-    parts = [] if math.isnan(effect.low) else [f"95 % {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
     parts += [] if math.isnan(effect.p) else [_p_value(effect.p_holm)]
     parts.append(f"better in {effect.better} of {len(effect.seeds)} seeds")
+    parts += [NO_INTERVAL] if math.isnan(effect.low) else []
     return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
 
 

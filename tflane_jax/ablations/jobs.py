@@ -13,8 +13,9 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from tflane_jax.ablations.recorded import RecordedRun
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
@@ -29,6 +30,9 @@ from tflane_jax.training.run_folder import Start, read_config
 Tests = Mapping[str, Sequence[str]]
 """Test sets by name: settings of the data, `--data.name value`, that differ from the configuration's test split."""
 
+ScoredBy = Literal["this code", "any code"]
+"""State of the code whose scores count where they are kept beside a run; others are measured again."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -42,6 +46,8 @@ class Job:
         retrain: whether a run of another configuration in the folder is deleted.
         label: name for people.
         further: evaluations of the last checkpoint beside the configuration's own.
+        scored_by: which kept scores count.
+        recorded: the run in a record of scores, which takes the place of the folder; None for none.
     """
 
     config: RunConfig
@@ -51,6 +57,8 @@ class Job:
     retrain: bool = False
     label: str = ""
     further: tuple[EvaluationConfig, ...] = ()
+    scored_by: ScoredBy = "this code"
+    recorded: RecordedRun | None = None
 
     @property
     def log(self) -> Path:
@@ -95,11 +103,17 @@ class Job:
 
     def start(self) -> Start:
         """Return how the training has to start."""
+        if self.recorded is not None:
+            return "resume"
         if not self._exists():
             return "new"
         return "overwrite" if self.retrain and self.difference() else "resume"
 
     def is_complete(self) -> bool:
+        """Return whether nothing is left to train: the run is recorded, or at hand."""
+        return self.recorded is not None or self.is_at_hand()
+
+    def is_at_hand(self) -> bool:
         """Return whether the folder holds this very run with the checkpoint of its last step."""
         steps = Checkpoints(self.folder / "checkpoints").steps()
         return self._exists() and steps[-1:] == [self.config.training.steps] and not self.difference()
@@ -109,6 +123,8 @@ class Job:
 
     def step(self) -> int:
         """Return the last step in the run's records, 0 without records; for progress bars."""
+        if self.recorded is not None:
+            return self.config.training.steps
         with contextlib.suppress(OSError, IndexError, ValueError, KeyError, TypeError, RecursionError):
             lines = (self.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
             return min(int(json.loads(lines[-1])["step"]), self.config.training.steps)

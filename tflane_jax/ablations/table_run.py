@@ -6,20 +6,24 @@
 <out>/TABLE/effects.md, .json     the claims: shown, not shown, or contradicted
 <out>/TABLE/curves.png            validation over training, mean and range over seeds
 <out>/TABLE/comparison.png        test frames in which the first claim's rows differ
+<out>/TABLE/scores.json.gz        the record of the runs' scores, from which the table can be made without them
 <out>/TABLE/summary.json          what docs/results.md is made of
 """
 
 from __future__ import annotations
 
 import importlib.util
+import itertools
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from tflane_jax.ablations.archive import Archive, write_archive
 from tflane_jax.ablations.compare import (
     draw_models,
     evaluate_runs,
@@ -29,26 +33,37 @@ from tflane_jax.ablations.compare import (
     without_failures,
 )
 from tflane_jax.ablations.comparison import Variant, compact
+from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, check, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects
-from tflane_jax.ablations.jobs import Job, check_rows
+from tflane_jax.ablations.facts import facts, row_minutes
+from tflane_jax.ablations.jobs import Job, ScoredBy, check_rows
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
+from tflane_jax.ablations.reuse import FILE, archive_of, thread_settings, unused, with_recorded
+from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY, remaining_seconds, stored_jobs
 from tflane_jax.ablations.workers import train_all, worker_threads
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.files.fields import load_json
 from tflane_jax.plots.tables import format_table, latex_table, save_table
-from tflane_jax.training.provenance import read_provenance
-from tflane_jax.training.records import read_records
 
 GEOMETRIC = ", geometric"
 """Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
 
 
-def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False) -> Path:
+def run_table(
+    table: PaperTable,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    jobs: int = 1,
+    quick: bool = False,
+    archive: Archive | None = None,
+    scored_by: ScoredBy = "this code",
+) -> Path:
     """Train what is missing, evaluate, test the claims, and write the table's folder.
 
     The same command resumes a table that was stopped. Several processes, also of several machines that share the
@@ -60,6 +75,8 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
         out: folder of all tables and their runs.
         jobs: trainings at a time.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
+        archive: recorded runs, which are taken instead of trained; None for none.
+        scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
 
     Returns:
         The file of the table.
@@ -68,25 +85,36 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
         UserError: trainings failed, after the files of the others were written.
     """
     began, root = time.monotonic(), out / "quick" if quick else out
-    folder, (host_plan, plan) = root / table.name, plan_table(table, seeds, out, jobs=jobs, quick=quick)
+    folder = root / table.name
+    host_plan, plan = plan_table(table, seeds, out, jobs=jobs, quick=quick, archive=archive, scored_by=scored_by)
     configs = table.configs(table.rows, quick=quick)
     # Fewer seeds than the table has are an interim look at it.
-    declared = declare(table.declaration, plan, range(max(len(seeds), 0 if quick else table.seeds)), folder)
+    many = range(max(len(seeds), 0 if quick else table.seeds))
+    if archive is not None:
+        _adopt_declaration(archive, folder, lambda trial: declare(table.declaration, plan, many, trial))
+        for line in unused(plan, archive, table.declaration.scores):
+            print(line)
+    declared = declare(table.declaration, plan, many, folder)
     _tell_work({**host_plan, **plan}, table, jobs)
 
     failures = train_all(_by_seed(host_plan), jobs)
     failures += train_all(_by_seed(plan), jobs)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
-    _add_geometric(without_failures(plan, failures), results)
+    trained = without_failures(plan, failures)
+    _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
         raise UserError(summary_of(failures, len(_by_seed(plan))))
+    scores = archive_of(table.name, load_json(folder / DECLARATION), trained, table.declaration.scores, _curves(table))
+    write_archive(folder / FILE, scores)
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
     save_effects(results, declared, OWN_TEST, first.task.errors, folder / "effects")
     pair = (table.claims[0].control or table.rows[0].name, table.claims[0].treatment)
-    draw_models(first, first_models(trained, results), pair, folder / "comparison.png")
+    models = first_models(trained, results)
+    if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters
+        draw_models(first, models, pair, folder / "comparison.png")
     _draw_curves(table, trained, folder / "curves.png")
     _save_summary(table, declared, results, trained, first, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
@@ -96,7 +124,14 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
 
 
 def plan_table(
-    table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False
+    table: PaperTable,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    jobs: int = 1,
+    quick: bool = False,
+    archive: Archive | None = None,
+    scored_by: ScoredBy = "this code",
 ) -> tuple[dict[str, list[Job]], dict[str, list[Job]]]:
     """Return the trainings of the hosts that rows start from, and of the rows.
 
@@ -104,17 +139,45 @@ def plan_table(
     """
     configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
     check(table.declaration, configs)
-    threads, store = worker_threads(jobs), (out / "quick" if quick else out) / "runs"
-    host_plan = stored_jobs(hosts, seeds, store, threads=threads)
-    origins = {row.name: host_plan[row.start] for row in table.rows if row.start}
-    plan = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
-    check_rows({f"host {name}": jobs for name, jobs in host_plan.items()} | plan)
+    store = (out / "quick" if quick else out) / "runs"
+    archive = archive or Archive(table.name, None, {})
+    host_plans, plans = [], []
+    for threads in thread_settings(archive, worker_threads(jobs)):
+        host_plans.append(stored_jobs(hosts, seeds, store, threads=threads))
+        origins = {row.name: host_plans[-1][row.start] for row in table.rows if row.start}
+        every = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
+        plans.append({name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in every.items()})
+    plan = with_recorded(plans, archive, table.declaration.scores)
+    # The host of a recorded row is needed no more.
+    starts = {job.config.training.init_from for of_row in plan.values() for job in of_row if job.recorded is None}
+    host_plan = {name: [job for job in of_host if str(job.folder) in starts] for name, of_host in host_plans[0].items()}
+    check_rows({f"host {name}": of_host for name, of_host in host_plan.items()} | plan)
     return host_plan, plan
+
+
+def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path], Declared]) -> None:
+    """Let a table that was recorded keep its declaration, unless the folder has one or it is another one.
+
+    Args:
+        archive: of the table.
+        folder: of the table.
+        check_in: declares the table in a folder; raises UserError if that holds another declaration.
+    """
+    if archive.declaration is None or (folder / DECLARATION).exists():
+        return
+    with tempfile.TemporaryDirectory() as trial:
+        write_json(Path(trial) / DECLARATION, archive.declaration)
+        try:
+            check_in(Path(trial))
+        except UserError:
+            print("the recorded declaration is another one, so that the table is declared anew")
+            return
+    write_json(folder / DECLARATION, archive.declaration)
 
 
 def _by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
     """Return every run once, seed by seed, so that a table stopped early has pairs."""
-    every = [job for of_seed in zip(*plan.values(), strict=True) for job in of_seed]
+    every = [job for of_seed in itertools.zip_longest(*plan.values()) for job in of_seed if job is not None]
     return list({job.folder: job for job in every}.values())
 
 
@@ -122,7 +185,9 @@ def _tell_work(plan: Mapping[str, Sequence[Job]], table: PaperTable, jobs: int) 
     """Print how many runs are complete, and how long the others will take."""
     every = _by_seed(plan)
     complete = sum(job.is_complete() for job in every)
+    recorded = sum(job.recorded is not None for job in every)
     text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
+    text += f" ({recorded} of them recorded)" if recorded else ""
     if complete < len(every):
         seconds, guesses = remaining_seconds(plan, table.minutes)
         basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
@@ -187,10 +252,13 @@ def _draw_curves(table: PaperTable, trained: Mapping[str, Sequence[Job]], path: 
         return
     from tflane_jax.plots.curves import save_comparison_curves
 
-    records = {
-        name: [read_records(job.folder / "metrics.jsonl") for job in jobs] for name, jobs in trained.items() if jobs
-    }
-    save_comparison_curves(path, records, list(dict.fromkeys((table.primary, *table.columns))))
+    records = {name: [facts(job).validation for job in jobs] for name, jobs in trained.items() if jobs}
+    save_comparison_curves(path, records, _curves(table))
+
+
+def _curves(table: PaperTable) -> list[str]:
+    """Return the scores whose validation curves are drawn."""
+    return list(dict.fromkeys((table.primary, *table.columns)))
 
 
 def _save_summary(
@@ -207,8 +275,8 @@ def _save_summary(
     every = [
         e for which in CHECKPOINTS for e in effects(results, declared.declaration, OWN_TEST, which, first.task.errors)
     ]
-    starts = [start for jobs in trained.values() for job in jobs for start in read_provenance(job.folder)]
-    threads = [job.threads for jobs in trained.values() for job in jobs]
+    runs = [job for jobs in trained.values() for job in jobs]
+    commits = {commit for job in runs for commit in facts(job).commits}
     write_json(
         folder / "summary.json",
         {
@@ -219,11 +287,11 @@ def _save_summary(
             "declared": declared.sentence(),
             "note": table.note,
             "seeds": list(results.seeds),
-            "steps": sorted({job.config.training.steps for jobs in trained.values() for job in jobs}),
-            "cores of a run": sorted({setting["cores"] for setting in threads}),
-            "commits": sorted({start["git"]["commit"][:9] for start in starts if start.get("git")}),
-            "devices": sorted({start["device"] for start in starts}),
-            "core minutes of a run": _minutes(trained),
+            "steps": sorted({job.config.training.steps for job in runs}),
+            "cores of a run": sorted({job.threads["cores"] for job in runs}),
+            "commits": sorted(commits) + sorted({text for job in runs for text in _measured_elsewhere(job)}),
+            "devices": sorted({device for job in runs for device in facts(job).devices}),
+            "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),
             "findings": findings(every),
             "quoted": asdict(table.quoted),
@@ -231,12 +299,10 @@ def _save_summary(
     )
 
 
-def _minutes(trained: Mapping[str, Sequence[Job]]) -> dict[str, float]:
-    """Return the training time of each row, in minutes, mean over runs."""
-    found = {}
-    for name, jobs in trained.items():
-        ends = [read_records(job.folder / "metrics.jsonl") for job in jobs]
-        seconds = [[r["seconds"] for r in records if "seconds" in r][-1] for records in ends if records]
-        if seconds:
-            found[name] = round(sum(seconds) / len(seconds) / 60, 1)
-    return found
+def _measured_elsewhere(job: Job) -> set[str]:
+    """Return by which other states of the code a run was measured, in words; by which ones a recorded run was."""
+    found = [measure(job, config, which) for config, which in evaluations(job)]
+    codes = {measured.code[:9] for measured in found if measured is not None}
+    if job.recorded is not None:
+        return {f"recorded by code {code}" for code in codes}
+    return {f"measured by code {code}" for code in codes - {code_digest()[:9]}}

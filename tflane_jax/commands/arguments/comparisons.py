@@ -94,7 +94,20 @@ def tables(commands) -> None:
         "--record",
         metavar="DIR",
         type=Path,
-        help="copy the summaries to DIR and write DIR.md anew; the repository keeps docs/results",
+        help="copy the summaries and the scores of all runs to DIR and write DIR.md anew; the repository keeps "
+        "docs/results",
+    )
+    parser.add_argument(
+        "--from",
+        dest="source",
+        metavar="DIR",
+        type=Path,
+        help="take the runs that are recorded in DIR instead of training them, such as docs/results",
+    )
+    parser.add_argument(
+        "--earlier-scores",
+        action="store_true",
+        help="keep scores of complete runs that an earlier state of the code measured (default: measure again)",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/tables"), help="default runs/tables")
 

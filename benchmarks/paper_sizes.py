@@ -52,6 +52,8 @@ def settings(config: RunConfig, folder: Path) -> list[str]:
         "evaluation.batch_size": "1",
         "evaluation.pictures": "0",
     }
+    if config.task.frozen:
+        short["task.model.encoder.images.frozen_stages"] = "0"
     if isinstance(config.data, OpenLaneV2Data):
         short["data.root"] = str(folder / "openlane_v2")
         if config.data.tracks is not None:

@@ -16,6 +16,7 @@ from tests.shared import ROOT
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_io import to_text
 from tflane_jax.markers.square_pose import solve_square
+from tflane_jax.runs import check_origin
 from tflane_jax.training.schedule import make_optimizer
 
 
@@ -150,7 +151,9 @@ def test_a_paper_size_is_trained_briefly_on_data_that_are_there(name, tmp_path):
     short = apply_overrides(config, paper_sizes.settings(config, tmp_path))
     assert (short.training.steps, short.training.batch_size) == (paper_sizes.UPDATES, 1)
     make_optimizer(short.optim, short.training.steps)  # raises where the schedule does not fit
-    assert short.task == config.task
+    check_origin(short)  # raises where layers would be frozen at random
+    unfrozen = apply_overrides(config, ["--task.model.encoder.images.frozen_stages", "0"])
+    assert short.task == unfrozen.task
 
 
 def test_loading_is_compared_with_the_update_for_each_example(monkeypatch):

@@ -145,6 +145,7 @@ def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, str] | 
         source=repr(config.data.source("test")),
         evaluation=to_json(config.evaluation),
         code=code_digest(),
+        **({"content": job.content} if job.content else {}),
     )
 
 

@@ -29,14 +29,15 @@ from tflane_jax.ablations.compare import (
     without_failures,
 )
 from tflane_jax.ablations.comparison import Variant, compact
-from tflane_jax.ablations.declaration import Declared, check, declare
+from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects
-from tflane_jax.ablations.jobs import Job, check_rows
+from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
-from tflane_jax.ablations.store import TOPOLOGY, remaining_seconds, stored_jobs
-from tflane_jax.ablations.workers import train_all, worker_threads
+from tflane_jax.ablations.store import TOPOLOGY
+from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.ablations.workers import train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -48,7 +49,15 @@ GEOMETRIC = ", geometric"
 """Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
 
 
-def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False) -> Path:
+def run_table(
+    table: PaperTable,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    jobs: int = 1,
+    cores: int | None = None,
+    quick: bool = False,
+) -> Path:
     """Train what is missing, evaluate, test the claims, and write the table's folder.
 
     The same command resumes a table that was stopped. Several processes, also of several machines that share the
@@ -59,6 +68,7 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
         seeds: of training.
         out: folder of all tables and their runs.
         jobs: trainings at a time.
+        cores: of each training; None shares all between the trainings.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
 
     Returns:
@@ -67,21 +77,22 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
     Raises:
         UserError: trainings failed, after the files of the others were written.
     """
-    began, root = time.monotonic(), out / "quick" if quick else out
-    folder, (host_plan, plan) = root / table.name, plan_table(table, seeds, out, jobs=jobs, quick=quick)
-    configs = table.configs(table.rows, quick=quick)
+    began, folder = time.monotonic(), store_of(out, quick=quick).parent / table.name
+    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, quick=quick)
+    configs, plan = planned.rows, planned.jobs
     # Fewer seeds than the table has are an interim look at it.
-    declared = declare(table.declaration, plan, range(max(len(seeds), 0 if quick else table.seeds)), folder)
-    _tell_work({**host_plan, **plan}, table, jobs)
+    every = range(max(len(seeds), 0 if quick else table.seeds))
+    declared = declare(table.declaration, plan, planned.declared(), every, folder)
+    tell_work(planned, seeds, store_of(out, quick=quick), jobs)
 
-    failures = train_all(_by_seed(host_plan), jobs)
-    failures += train_all(_by_seed(plan), jobs)
+    failures = train_all(seed_by_seed(planned.host_jobs), jobs, cores)
+    failures += train_all(seed_by_seed(plan), jobs, cores)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
     _add_geometric(without_failures(plan, failures), results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
-        raise UserError(summary_of(failures, len(_by_seed(plan))))
+        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
     save_effects(results, declared, OWN_TEST, first.task.errors, folder / "effects")
@@ -91,48 +102,8 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
     _save_summary(table, declared, results, trained, first, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
     if failures:
-        raise UserError(summary_of(failures, len(_by_seed(plan))))
+        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
     return path
-
-
-def plan_table(
-    table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False
-) -> tuple[dict[str, list[Job]], dict[str, list[Job]]]:
-    """Return the trainings of the hosts that rows start from, and of the rows.
-
-    Raises UserError where one of them must fail. The arguments are those of `run_table`.
-    """
-    configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
-    check(table.declaration, configs)
-    threads, store = worker_threads(jobs), (out / "quick" if quick else out) / "runs"
-    host_plan = stored_jobs(hosts, seeds, store, threads=threads)
-    origins = {row.name: host_plan[row.start] for row in table.rows if row.start}
-    plan = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
-    check_rows({f"host {name}": jobs for name, jobs in host_plan.items()} | plan)
-    return host_plan, plan
-
-
-def _by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
-    """Return every run once, seed by seed, so that a table stopped early has pairs."""
-    every = [job for of_seed in zip(*plan.values(), strict=True) for job in of_seed]
-    return list({job.folder: job for job in every}.values())
-
-
-def _tell_work(plan: Mapping[str, Sequence[Job]], table: PaperTable, jobs: int) -> None:
-    """Print how many runs are complete, and how long the others will take."""
-    every = _by_seed(plan)
-    complete = sum(job.is_complete() for job in every)
-    text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
-    if complete < len(every):
-        seconds, guesses = remaining_seconds(plan, table.minutes)
-        basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
-        text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
-    print(text, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    minutes = max(1, round(seconds / 60))
-    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
 
 
 def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:

@@ -19,17 +19,21 @@ def run(options: argparse.Namespace) -> int:
     jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs
     if jobs < 1:
         raise UserError(f"--jobs {jobs}: at least one training runs at a time")
+    if options.cores is not None and options.cores < 1:
+        raise UserError(f"--cores {options.cores}: at least one")
     if not chosen:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         return 0
     configure_jax()
-    from tflane_jax.ablations.table_run import plan_table, run_table
+    from tflane_jax.ablations.table_plan import plan_table
+    from tflane_jax.ablations.table_run import run_table
 
+    how = {"jobs": jobs, "cores": options.cores, "quick": options.quick}
     seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}
     if len(chosen) > 1:  # what is wrong in the last one is told before the first one is trained
         for table in chosen:
-            plan_table(table, seeds[table.name], options.out, jobs=jobs, quick=options.quick)
-    written = [run_table(t, seeds[t.name], options.out, jobs=jobs, quick=options.quick) for t in chosen]
+            plan_table(table, seeds[table.name], options.out, **how)
+    written = [run_table(t, seeds[t.name], options.out, **how) for t in chosen]
     if options.record is not None:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     return 0

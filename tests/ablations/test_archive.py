@@ -17,7 +17,8 @@ from tflane_jax.ablations.paper.table import TableRow
 from tflane_jax.ablations.published import record
 from tflane_jax.ablations.reuse import find_archive, unused
 from tflane_jax.ablations.scores import is_measured
-from tflane_jax.ablations.table_run import plan_table, run_table
+from tflane_jax.ablations.table_plan import plan_table
+from tflane_jax.ablations.table_run import run_table
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import Evaluation, SceneRatio
@@ -98,7 +99,7 @@ def trainings(monkeypatch):
 def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monkeypatch, capsys):
     forbid(monkeypatch, "workers.train_run", "scores.open_run", "compare.open_run")
     monkeypatch.setattr("tflane_jax.ablations.scores.code_digest", lambda: OTHER_CODE)
-    monkeypatch.setattr("tflane_jax.ablations.table_run.worker_threads", lambda jobs: {"cores": 96})
+    monkeypatch.setattr("tflane_jax.ablations.table_plan.worker_threads", lambda *_: {"cores": 96})
     results = made.with_name("results")
     run_table(small(tiny), range(2), tmp_path, archive=find_archive(results, "paper.9"))
     told = capsys.readouterr().out
@@ -157,10 +158,22 @@ def test_recorded_runs_of_another_configuration_are_trained(tiny, made, tmp_path
     ]
     for scores in every:
         scores.pop("all/recall", None)  # two checkpoints may share their scores
-    _, plan = plan_table(small(tiny), range(1), tmp_path, archive=archive)
-    assert all(job.recorded is None for (job,) in plan.values())
-    lines = unused(plan, archive, ["all/recall"])
+    plan = plan_table(small(tiny), range(1), tmp_path, archive=archive)
+    assert all(job.recorded is None for (job,) in plan.jobs.values())
+    lines = unused(plan.jobs, archive, ["all/recall"])
     assert lines[1] == "the recorded run of tfm, seed 0, is not used: it has no all/recall"
+
+
+def test_runs_of_a_cpu_and_of_a_gpu_do_not_meet(tiny, made, tmp_path, monkeypatch):
+    archive = find_archive(made.with_name("results"), "paper.9")
+    monkeypatch.setattr("tflane_jax.ablations.table_plan.worker_threads", lambda *_: {"cores": 1, "device": "gpu: x"})
+    every = plan_table(small(tiny), range(2), tmp_path, archive=archive).jobs
+    assert all(job.recorded is not None for jobs in every.values() for job in jobs)
+    more = plan_table(small(tiny), range(3), tmp_path, archive=archive).jobs
+    assert all(job.recorded is None for jobs in more.values() for job in jobs)
+    lines = unused(more, archive, ())
+    assert len(lines) == 6
+    assert lines[0].endswith("base, seed 0, is not used: runs of different devices do not meet in a table")
 
 
 @pytest.mark.slow
@@ -176,9 +189,9 @@ def test_a_recorded_row_needs_no_host(tiny, tmp_path, monkeypatch):
     run_table(table, range(1), tmp_path / "b", archive=archive)
     assert names == []
     assert summary(tmp_path / "a")[0] == summary(tmp_path / "b")[0]
-    hosts, rows = plan_table(table, range(2), tmp_path / "b", archive=archive)
-    assert [job.config.training.seeds for job in hosts["host"]] == [(1,)]
-    assert [job.recorded is None for jobs in rows.values() for job in jobs] == [False, True] * 2
+    plan = plan_table(table, range(2), tmp_path / "b", archive=archive)
+    assert [job.config.training.seeds for job in plan.host_jobs["host"]] == [(1,)]
+    assert [job.recorded is None for jobs in plan.jobs.values() for job in jobs] == [False, True] * 2
 
 
 def test_scores_by_an_earlier_state_of_the_code_may_stay(tiny, made, tmp_path, monkeypatch):
@@ -190,9 +203,9 @@ def test_scores_by_an_earlier_state_of_the_code_may_stay(tiny, made, tmp_path, m
         run_table(small(tiny), range(2), tmp_path, scored_by="any code")
     assert summary(tmp_path)[1][-1].startswith("measured by code ")
     assert summary(tmp_path)[0] == summary(made)[0]
-    _, plan = plan_table(small(tiny), range(1), tmp_path)
-    assert not any(is_measured(job) for (job,) in plan.values())
-    assert all(is_measured(replace(job, scored_by="any code")) for (job,) in plan.values())
+    plan = plan_table(small(tiny), range(1), tmp_path)
+    assert not any(is_measured(job) for (job,) in plan.jobs.values())
+    assert all(is_measured(replace(job, scored_by="any code")) for (job,) in plan.jobs.values())
 
 
 def test_the_command_takes_recorded_runs(tiny, made, tmp_path, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -182,3 +183,21 @@ def test_claims_about_pairs_are_corrected_together(results):
     assert [e.finding for e in found] == ["shown", "contradicted", "contradicted"]
     assert found[0].difference == pytest.approx(-found[2].difference)
     assert sentence(found[:1]).endswith("Claim: it helps")
+
+
+def test_a_secondary_measure_is_corrected_apart(results):
+    more = replace(DECLARED, secondary="all/AP_l")
+    found, plain = effects(results, more, "", "last"), effects(results, DECLARED, "", "last")
+    assert repr(found[: len(plain)]) == repr(plain)  # nan too
+    extra = found[len(plain) :]
+    assert [(e.measure, e.row) for e in extra] == [
+        ("secondary measure all/AP_l", row) for row in ("baseline", "+TFM, none", "matched")
+    ]
+    assert [e.p_holm for e in extra] == holm([e.p for e in extra])
+    text = sentence([e for e in found if e.row == "baseline"])
+    assert text.startswith(f"**shown**: +TFM is better than *baseline* in {PRIMARY}, +")
+    assert "; not shown in the secondary measure all/AP_l, " in text
+    # Read as errors, its sign alone turns.
+    as_errors = effects(results, more, "", "last", ["all/AP_l"])
+    assert repr(as_errors[: len(plain)]) == repr(plain)
+    assert [e.better for e in as_errors[len(plain) :]] == [len(SEEDS) - e.better for e in extra]

@@ -73,7 +73,7 @@ def compare(
         check(declaration, configs)
     plan = plan_jobs(configs, seeds, out, threads=worker_threads(jobs), tests=tests, retrain=retrain)
     check_rows(plan)
-    declared = None if declaration is None else declare(declaration, plan, seeds, out)
+    declared = None if declaration is None else declare(declaration, plan, configs, seeds, out)
     # Seed by seed, so that a comparison stopped early has pairs.
     every = [plan[name][i] for i in range(len(seeds)) for name in plan]
     failures = train_all(every, jobs)

@@ -83,13 +83,18 @@ class Effect:
 
 
 def measures(declaration: Declaration) -> tuple[Measure, ...]:
-    """Return the primary measure, the negative control, and their difference, which tests that the effect differs."""
-    primary, control = declaration.primary, declaration.negative_control
-    alone = Measure(primary, {primary: 1.0})
-    if control is None:
-        return (alone,)
-    difference = Measure("difference of the two", {primary: 1.0, control: -1.0})
-    return alone, Measure(f"negative control {control}", {control: 1.0}), difference
+    """Return the primary measure, the negative control, their difference, and the secondary measure.
+
+    The difference tests that the effect differs between primary measure and negative control.
+    """
+    primary, control, secondary = declaration.primary, declaration.negative_control, declaration.secondary
+    found = [Measure(primary, {primary: 1.0})]
+    if control is not None:
+        found.append(Measure(f"negative control {control}", {control: 1.0}))
+        found.append(Measure("difference of the two", {primary: 1.0, control: -1.0}))
+    if secondary is not None:
+        found.append(Measure(f"secondary measure {secondary}", {secondary: 1.0}))
+    return tuple(found)
 
 
 def effects(
@@ -106,8 +111,9 @@ def effects(
         which: checkpoint.
         errors: scores where lower is better.
     """
-    sign, found = -1.0 if declaration.primary in errors else 1.0, []
+    found = []
     for measure in measures(declaration):
+        sign = -1.0 if next(iter(measure.scores)) in errors else 1.0
         every = [e for claim in declaration.claims for e in _of_claim(results, claim, measure, test, which, sign)]
         for effect, corrected in zip(every, holm([effect.p for effect in every]), strict=True):
             judged = _finding(effect, corrected, declaration.alpha, sign)
@@ -228,7 +234,7 @@ def findings(every: Sequence[Effect]) -> list[str]:
 
 
 def sentence(of_row: Sequence[Effect]) -> str:
-    """Return the effects against one row as a sentence: primary measure, then negative control and their difference."""
+    """Return the effects against one row as a sentence: primary measure, then the others, see `measures`."""
     primary, *others = of_row
     claim = primary.claim
     text = (

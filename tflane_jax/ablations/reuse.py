@@ -1,8 +1,8 @@
 """Runs that are recorded (`ablations.archive`) in the place of trainings, and the record of a table's own runs.
 
 A recorded run has the place of a training with the same configuration, seed and thread setting. If there is none with
-the thread setting of this process, one with another setting has it: a table is made from what was trained, wherever
-that was.
+the thread setting of this process, one with another setting has it, because a table is made from what was trained,
+wherever that was. Runs of a CPU and of an accelerator do not meet in a table, see `with_recorded`.
 """
 
 from __future__ import annotations
@@ -62,6 +62,9 @@ def thread_settings(archive: Archive, own: Mapping[str, Any]) -> list[Mapping[st
 def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[str]) -> dict[str, list[Job]]:
     """Return the first plan with recorded runs in the place of trainings.
 
+    Recorded runs of another device than that of this process are taken only if no training and no run of a third
+    device remains.
+
     Args:
         plans: the same trainings with different thread settings, that of this process first.
         archive: what is recorded.
@@ -75,9 +78,20 @@ def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[st
                 return replace(job, recorded=run)
         return same[0]
 
-    return {
-        name: [best([plan[name][i] for plan in plans]) for i in range(len(jobs))] for name, jobs in plans[0].items()
-    }
+    own = _device(next(iter(plans[0].values()))[0])
+    for allowed in (plans, [plan for plan in plans if _device(next(iter(plan.values()))[0]) == own]):
+        found = {
+            name: [best([plan[name][i] for plan in allowed]) for i in range(len(jobs))]
+            for name, jobs in plans[0].items()
+        }
+        if len({_device(job) for jobs in found.values() for job in jobs}) == 1:
+            break
+    return found
+
+
+def _device(job: Job) -> Any:
+    """Return the accelerator of a training; None for a CPU."""
+    return job.threads.get("device")
 
 
 def unused(plan: Plan, archive: Archive, scores: Collection[str]) -> list[str]:
@@ -88,7 +102,8 @@ def unused(plan: Plan, archive: Archive, scores: Collection[str]) -> list[str]:
         for job in jobs:
             (seed,) = job.config.training.seeds
             run = archive.runs.get(job.folder.name) or by_name.get((name, seed))
-            if job.recorded is None and run is not None and (reason := _why_not(run, job, scores)):
+            if job.recorded is None and run is not None:
+                reason = _why_not(run, job, scores) or "runs of different devices do not meet in a table"
                 lines.append(f"the recorded run of {name}, seed {seed}, is not used: {reason}")
     return lines
 

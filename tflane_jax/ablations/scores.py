@@ -132,6 +132,7 @@ def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, dict[st
         "checkpoint": checkpoints.content(step),
         "source": repr(config.data.source("test")),
         "evaluation": to_json(config.evaluation),
+        **({"content": job.content} if job.content else {}),
     }
 
 

@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import importlib.util
-import itertools
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -34,16 +33,17 @@ from tflane_jax.ablations.compare import (
 )
 from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
-from tflane_jax.ablations.declaration import Declared, check, declare
+from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects
 from tflane_jax.ablations.facts import facts, row_minutes
-from tflane_jax.ablations.jobs import Job, ScoredBy, check_rows
+from tflane_jax.ablations.jobs import Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.reuse import FILE, archive_of, thread_settings, unused, with_recorded
+from tflane_jax.ablations.reuse import FILE, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
-from tflane_jax.ablations.store import TOPOLOGY, remaining_seconds, stored_jobs
-from tflane_jax.ablations.workers import train_all, worker_threads
+from tflane_jax.ablations.store import TOPOLOGY
+from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.ablations.workers import train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -60,6 +60,7 @@ def run_table(
     out: Path,
     *,
     jobs: int = 1,
+    cores: int | None = None,
     quick: bool = False,
     archive: Archive | None = None,
     scored_by: ScoredBy = "this code",
@@ -74,6 +75,7 @@ def run_table(
         seeds: of training.
         out: folder of all tables and their runs.
         jobs: trainings at a time.
+        cores: of each training; None shares all between the trainings.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
         archive: recorded runs, which are taken instead of trained; None for none.
         scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
@@ -84,28 +86,30 @@ def run_table(
     Raises:
         UserError: trainings failed, after the files of the others were written.
     """
-    began, root = time.monotonic(), out / "quick" if quick else out
-    folder = root / table.name
-    host_plan, plan = plan_table(table, seeds, out, jobs=jobs, quick=quick, archive=archive, scored_by=scored_by)
-    configs = table.configs(table.rows, quick=quick)
+    began, folder = time.monotonic(), store_of(out, quick=quick).parent / table.name
+    how: dict[str, Any] = {"quick": quick, "archive": archive, "scored_by": scored_by}
+    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
+    configs, plan = planned.rows, planned.jobs
     # Fewer seeds than the table has are an interim look at it.
-    many = range(max(len(seeds), 0 if quick else table.seeds))
+    every = range(max(len(seeds), 0 if quick else table.seeds))
     if archive is not None:
-        _adopt_declaration(archive, folder, lambda trial: declare(table.declaration, plan, many, trial))
+        _adopt_declaration(
+            archive, folder, lambda trial: declare(table.declaration, plan, planned.declared(), every, trial)
+        )
         for line in unused(plan, archive, table.declaration.scores):
             print(line)
-    declared = declare(table.declaration, plan, many, folder)
-    _tell_work({**host_plan, **plan}, table, jobs)
+    declared = declare(table.declaration, plan, planned.declared(), every, folder)
+    tell_work(planned, seeds, store_of(out, quick=quick), jobs)
 
-    failures = train_all(_by_seed(host_plan), jobs)
-    failures += train_all(_by_seed(plan), jobs)
+    failures = train_all(seed_by_seed(planned.host_jobs), jobs, cores)
+    failures += train_all(seed_by_seed(plan), jobs, cores)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
     trained = without_failures(plan, failures)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
-        raise UserError(summary_of(failures, len(_by_seed(plan))))
+        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
     scores = archive_of(table.name, load_json(folder / DECLARATION), trained, table.declaration.scores, _curves(table))
     write_archive(folder / FILE, scores)
     first = next(iter(configs.values()))
@@ -119,40 +123,8 @@ def run_table(
     _save_summary(table, declared, results, trained, first, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
     if failures:
-        raise UserError(summary_of(failures, len(_by_seed(plan))))
+        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
     return path
-
-
-def plan_table(
-    table: PaperTable,
-    seeds: Sequence[int],
-    out: Path,
-    *,
-    jobs: int = 1,
-    quick: bool = False,
-    archive: Archive | None = None,
-    scored_by: ScoredBy = "this code",
-) -> tuple[dict[str, list[Job]], dict[str, list[Job]]]:
-    """Return the trainings of the hosts that rows start from, and of the rows.
-
-    Raises UserError where one of them must fail. The arguments are those of `run_table`.
-    """
-    configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
-    check(table.declaration, configs)
-    store = (out / "quick" if quick else out) / "runs"
-    archive = archive or Archive(table.name, None, {})
-    host_plans, plans = [], []
-    for threads in thread_settings(archive, worker_threads(jobs)):
-        host_plans.append(stored_jobs(hosts, seeds, store, threads=threads))
-        origins = {row.name: host_plans[-1][row.start] for row in table.rows if row.start}
-        every = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
-        plans.append({name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in every.items()})
-    plan = with_recorded(plans, archive, table.declaration.scores)
-    # The host of a recorded row is needed no more.
-    starts = {job.config.training.init_from for of_row in plan.values() for job in of_row if job.recorded is None}
-    host_plan = {name: [job for job in of_host if str(job.folder) in starts] for name, of_host in host_plans[0].items()}
-    check_rows({f"host {name}": of_host for name, of_host in host_plan.items()} | plan)
-    return host_plan, plan
 
 
 def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path], Declared]) -> None:
@@ -173,31 +145,6 @@ def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path]
             print("the recorded declaration is another one, so that the table is declared anew")
             return
     write_json(folder / DECLARATION, archive.declaration)
-
-
-def _by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
-    """Return every run once, seed by seed, so that a table stopped early has pairs."""
-    every = [job for of_seed in itertools.zip_longest(*plan.values()) for job in of_seed if job is not None]
-    return list({job.folder: job for job in every}.values())
-
-
-def _tell_work(plan: Mapping[str, Sequence[Job]], table: PaperTable, jobs: int) -> None:
-    """Print how many runs are complete, and how long the others will take."""
-    every = _by_seed(plan)
-    complete = sum(job.is_complete() for job in every)
-    recorded = sum(job.recorded is not None for job in every)
-    text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
-    text += f" ({recorded} of them recorded)" if recorded else ""
-    if complete < len(every):
-        seconds, guesses = remaining_seconds(plan, table.minutes)
-        basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
-        text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
-    print(text, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    minutes = max(1, round(seconds / 60))
-    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
 
 
 def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:

@@ -201,3 +201,8 @@ def test_a_secondary_measure_is_corrected_apart(results):
     as_errors = effects(results, more, "", "last", ["all/AP_l"])
     assert repr(as_errors[: len(plain)]) == repr(plain)
     assert [e.better for e in as_errors[len(plain) :]] == [len(SEEDS) - e.better for e in extra]
+
+
+def test_a_score_that_was_not_measured_is_named(results):
+    with pytest.raises(UserError, match="the run of seed 0 has no all/mAP: an earlier state of the code"):
+        effects(results, Declaration("all/mAP", (Claim("+TFM"),)), "", "last")

@@ -163,6 +163,12 @@ def _compared(results: Results, table: Mapping[str, Any], treatment: str) -> lis
 
 
 def _values(by_seed: Mapping[int, Mapping[str, float]], measure: Measure, seeds: Sequence[int]) -> np.ndarray:
+    every = [(seed, score) for seed in seeds for score in measure.scores]
+    if missing := [(seed, score) for seed, score in every if score not in by_seed[seed]]:
+        raise UserError(
+            f"the run of seed {missing[0][0]} has no {missing[0][1]}: an earlier state of the code measured it; leave "
+            "out --earlier-scores to measure it again"
+        )
     return np.array([sum(weight * by_seed[seed][score] for score, weight in measure.scores.items()) for seed in seeds])
 
 

@@ -122,7 +122,7 @@ class MapLines:
     Attributes:
         points: (L, P, 3) metres, ego frame; a ring repeats its first point at the end.
         category: (L,) `LineClass`.
-        closed: (L,) the line is a ring; its start and direction are arbitrary.
+        closed: (L,) the line is a ring; its start is arbitrary.
         valid: (L,).
         visibility: (L,) fraction of the line in direct line of sight, 0 to 1; None if the source cannot tell.
         identity: (L,) number of the line in its map, the same in every frame of a scene, for dividers, crossings and

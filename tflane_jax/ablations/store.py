@@ -111,7 +111,9 @@ def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[s
         if found:
             complete = sum(job.is_complete() for job in found)
             same = first_difference({**setting, "cores": 0}, {**here, "cores": 0}) == ""
-            remedy = f"add --cores {setting['cores']} to use them" if same else "start in the same environment to use them"
+            remedy = (
+                f"add --cores {setting['cores']} to use them" if same else "start in the same environment to use them"
+            )
             lines.append(
                 f"{len(found)} of these runs exist with {listed_setting(setting)} ({complete} complete), but numbers "
                 f"depend on it, and here is {listed_setting(here)}: {remedy}"

@@ -122,9 +122,9 @@ def test_runs_of_another_thread_setting_are_told_with_the_option_that_uses_them(
     (tmp_path / "damaged").mkdir()
     (tmp_path / "damaged" / "provenance.json").write_text('[{"threads": {}}]')
     told = sorted(runs_elsewhere(planned({"cores": 2}), tmp_path, planned))
-    assert [line.partition(":")[0].partition(", but")[0] for line in told] == [
-        "1 of these runs are complete with cores 2, OMP_NUM_THREADS 3",
-        "2 of these runs are complete with cores 1",
+    assert [line.partition(", but")[0] for line in told] == [
+        "1 of these runs exist with cores 2, OMP_NUM_THREADS 3 (1 complete)",
+        "2 of these runs exist with cores 1 (2 complete)",
     ]
     assert "environment" in told[0]
     assert told[1].endswith("add --cores 1 to use them")

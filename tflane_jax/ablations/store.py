@@ -97,7 +97,7 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[str, Any]], Sequence[Job]]) -> list[str]:
-    """Return a line for each other thread setting with which runs were trained that a plan has not begun.
+    """Return a line for each other thread setting with which runs began that a plan has not begun.
 
     Args:
         plan: every run once.
@@ -107,13 +107,16 @@ def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[s
     lines, missing = [], [i for i, job in enumerate(plan) if not job.exists()]
     for setting in _settings(store) if missing else ():
         there, here = replan(setting), plan[0].threads
-        complete = sum(there[i].is_complete() for i in missing)
-        if complete:
+        found = [there[i] for i in missing if there[i].exists()]
+        if found:
+            complete = sum(job.is_complete() for job in found)
             same = first_difference({**setting, "cores": 0}, {**here, "cores": 0}) == ""
-            remedy = f"add --cores {setting['cores']} to use them" if same else "use them in the same environment"
+            remedy = (
+                f"add --cores {setting['cores']} to use them" if same else "start in the same environment to use them"
+            )
             lines.append(
-                f"{complete} of these runs are complete with {listed_setting(setting)}, but with "
-                f"{listed_setting(here)} they are others, since their numbers differ: {remedy}"
+                f"{len(found)} of these runs exist with {listed_setting(setting)} ({complete} complete), but numbers "
+                f"depend on it, and here is {listed_setting(here)}: {remedy}"
             )
     return lines
 

@@ -9,13 +9,14 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import collectives, loading, marker_occlusion, metrics, paper_sizes
+from benchmarks import collectives, loading, marker_occlusion, marker_scenes, metrics, paper_sizes
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 from tests.shared import ROOT
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_io import to_text
 from tflane_jax.markers.square_pose import solve_square
+from tflane_jax.scene import MarkerObservations
 from tflane_jax.training.schedule import make_optimizer
 
 
@@ -73,6 +74,28 @@ def test_composites_show_the_board_where_they_say(damage, tmp_path, monkeypatch,
             assert abs(fit.camera_from_marker[0, 2, 3] - 10.0) < 0.4
         else:
             assert not len(found.marker_id)
+
+
+def test_a_drive_that_is_not_its_parts_is_noticed():
+    markers = MarkerObservations.empty(2, 3, 4)
+    reading = SimpleNamespace(observed=SimpleNamespace(markers=markers))
+    step = SimpleNamespace(reading=reading, guidance=[np.ones(2)], prediction=[np.ones(3)])
+    parts = SimpleNamespace(markers=markers), [np.ones(2)], [np.ones(3)]
+    marker_scenes._check(step, *parts)
+    other = markers.replace(residual=markers.residual + np.float32(1e-6))
+    for place, wrong in enumerate((SimpleNamespace(markers=other), [np.zeros(2)], [np.nextafter(np.ones(3), 2.0)])):
+        with pytest.raises(AssertionError):
+            marker_scenes._check(step, *(wrong if i == place else part for i, part in enumerate(parts)))
+
+
+@pytest.mark.slow
+def test_a_rendered_drive_is_scored_with_and_without_its_boards(tmp_path, monkeypatch):
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    record = marker_scenes.run(tmp_path, None, scenes=1)
+    assert sum(record["frames"].values()) == 8
+    assert list(record["scores"]) == ["markers", "boards withheld"]
+    assert all(0.0 <= groups["all"]["recall"] <= 1.0 for groups in record["scores"].values())
+    assert "| boards withheld" in (tmp_path / "marker_scenes.md").read_text()
 
 
 @pytest.mark.slow

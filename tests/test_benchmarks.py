@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -12,12 +13,26 @@ import pytest
 from benchmarks import collectives, loading, marker_occlusion, marker_scenes, metrics, paper_sizes
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
+from tests.models.cases import CAMERA_TOPONET, make_camera_example
+from tests.models.test_marker_fusion import CONFIG as MARKERS
+from tests.parameters import random_params
 from tests.shared import ROOT
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_io import to_text
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.pixels import PixelConfig
+from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.markers.square_pose import solve_square
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import MarkerObservations
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.marker_drive import DriveModel
 from tflane_jax.training.schedule import make_optimizer
+from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.simulate import WorldConfig
 
 
 def test_ratio_is_taken_round_by_round():
@@ -89,13 +104,26 @@ def test_a_drive_that_is_not_its_parts_is_noticed():
 
 
 @pytest.mark.slow
-def test_a_rendered_drive_is_scored_with_and_without_its_boards(tmp_path, monkeypatch):
+def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monkeypatch):
+    """A random model of two cameras, on two short scenes."""
+    front = CameraMount("front", 0.0, 0.0, 1.5, 0.0, 0.0, 900.0, 960, 540)
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
-    record = marker_scenes.run(tmp_path, None, scenes=1)
-    assert sum(record["frames"].values()) == 8
-    assert list(record["scores"]) == ["markers", "boards withheld"]
-    assert all(0.0 <= groups["all"]["recall"] <= 1.0 for groups in record["scores"].values())
-    assert "| boards withheld" in (tmp_path / "marker_scenes.md").read_text()
+    model = replace(CAMERA_TOPONET, denoising=None, priors=PriorsConfig(markers=MARKERS))
+    task = LaneGraphTask(model)
+    rig = CameraRigConfig(cameras=(front, replace(front, name="again")), scale=0.1, multiple=32)
+    markers = MarkerConfig(pixels=PixelConfig(detector=DetectorConfig()))
+    source = ProceduralConfig(
+        "test",
+        scenes=2,
+        world=WorldConfig(duration_s=3.1, keyframes=3, markers=PlacementConfig(side="both")),
+        example=ExampleConfig(range=model.range, sensor=None, cameras=rig, markers=markers),
+    )
+    drive = DriveModel(task, random_params(task.init, make_camera_example()), source)
+    scores, frames = marker_scenes.measure(source, drive, drive, tmp_path)
+    assert sum(frames.values()) == 6
+    assert list(scores) == [marker_scenes.WITH, marker_scenes.WITHHELD, marker_scenes.WITHOUT]
+    assert scores[marker_scenes.WITHHELD] == scores[marker_scenes.WITHOUT]
+    assert all(0.0 <= groups["all"]["recall"] <= 1.0 for groups in scores.values())
 
 
 @pytest.mark.slow

@@ -96,6 +96,8 @@ class DataSource(Generic[ConfigT]):
         check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
         drives: config -> where its examples were recorded, area by area; None for data that show no real place.
         tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
+        interval: config -> seconds between successive examples of a scene; None where they are not known without data.
+        cameras: config -> names of the cameras whose images are read from files, in order; None for no such images.
     """
 
     name: str
@@ -114,6 +116,8 @@ class DataSource(Generic[ConfigT]):
     check: Callable[..., FolderCheck] | None = None
     drives: Callable[[ConfigT], list[Drive]] | None = None
     tracks: bool = False
+    interval: Callable[[ConfigT], float | None] = lambda config: None
+    cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
 
 
 def loading_of(config: Any) -> StreamingConfig:

@@ -5,22 +5,34 @@
     tflane train --config camera/bevformer_detr_r50 --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-Encoder and training are those of `toponet_r50.py`; control points, loss weights and image sizes are the baseline's.
+Encoder, ablations (`:remat`, `:bfloat16`) and training are those of `toponet_r50.py`; control points, loss weights
+and image sizes are the baseline's.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.models.bevformer_detr import paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
+_TOPONET = str(Path(__file__).with_name("toponet_r50.py"))
+
 
 def get_config() -> RunConfig:
     """Return the baseline's configuration."""
-    toponet = load_config(str(Path(__file__).with_name("toponet_r50.py")))
+    return _baseline(load_config(_TOPONET))
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return variants of the encoder."""
+    toponet = load_ablations(_TOPONET)
+    return {name: _baseline(toponet[name]) for name in ("remat", "bfloat16")}
+
+
+def _baseline(toponet: RunConfig) -> RunConfig:
     assert isinstance(toponet.data, OpenLaneV2Data)
     assert isinstance(toponet.task, LaneGraphTask)
     task = LaneGraphTask(

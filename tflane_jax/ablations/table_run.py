@@ -37,6 +37,7 @@ from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
 from tflane_jax.ablations.store import TOPOLOGY, remaining_seconds, stored_jobs
 from tflane_jax.ablations.workers import train_all, worker_threads
+from tflane_jax.accelerators import leave_to_workers
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -102,6 +103,7 @@ def plan_table(
 
     Raises UserError where one of them must fail. The arguments are those of `run_table`.
     """
+    leave_to_workers(jobs)
     configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
     check(table.declaration, configs)
     threads, store = worker_threads(jobs), (out / "quick" if quick else out) / "runs"
@@ -215,6 +217,7 @@ def _save_summary(
             "table": table.name,
             "title": table.title,
             "quick": quick,
+            **({"steps factor": table.steps_factor} if table.steps_factor > 1 else {}),
             "protocol": results.protocol,
             "declared": declared.sentence(),
             "note": table.note,

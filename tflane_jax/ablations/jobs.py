@@ -19,7 +19,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
-from tflane_jax.run_checks import check_run
+from tflane_jax.run_checks import check_rate_factors, check_run
 from tflane_jax.runs import check_origin, current_form
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origin_folders, origins
@@ -136,6 +136,7 @@ def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
         if (job := next((job for job in jobs if not job.is_complete()), None)) is not None:
             try:
                 check_run(job.config)
+                check_rate_factors(job.config)
                 training = job.config.training
                 starts = folders & set(origin_folders(training.init_from or "", training.seeds))
                 if job.start() != "resume" and not starts:

@@ -1,12 +1,15 @@
 """Which GPUs a process takes: of a cluster's job, and as one of several workers."""
 
 import os
+from types import SimpleNamespace
 
 import jax
 import pytest
 
 from tflane_jax import accelerators, processes
+from tflane_jax.ablations.workers import worker_threads
 from tflane_jax.accelerators import devices_of_task, gpus, leave_to_workers, of_worker
+from tflane_jax.training import provenance
 
 EIGHT = "0,1,2,3,4,5,6,7"
 
@@ -103,7 +106,11 @@ def test_gpus_are_found_without_a_variable_and_a_chosen_fraction_stays(tmp_path,
 def test_a_process_with_workers_reserves_no_memory(monkeypatch):
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "")
     monkeypatch.delenv("XLA_PYTHON_CLIENT_PREALLOCATE")
-    leave_to_workers(1)
-    assert "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ
-    leave_to_workers(2)
+    leave_to_workers()
     assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
+
+
+def test_the_setting_of_a_worker_has_one_gpu(monkeypatch):
+    monkeypatch.setattr(provenance.jax, "devices", lambda: [SimpleNamespace(platform="gpu", device_kind="H100")] * 8)
+    monkeypatch.setattr(provenance.jax, "device_count", lambda: 8)
+    assert [worker_threads(parallel)["device"] for parallel in (1, 2)] == ["gpu: H100 x 8", "gpu: H100 x 1"]

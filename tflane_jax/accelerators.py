@@ -80,7 +80,6 @@ def of_worker(slot: int, parallel: int) -> dict[str, str]:
     return found
 
 
-def leave_to_workers(parallel: int) -> None:
-    """Let this process and those that it starts reserve no memory in advance, where `parallel` > 1 of them train."""
-    if parallel > 1:
-        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+def leave_to_workers() -> None:
+    """Let this process, and those that it starts to train, reserve no memory of GPUs in advance."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

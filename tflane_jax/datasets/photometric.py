@@ -51,6 +51,8 @@ class PhotometricConfig:
 
 LANESEGNET_PHOTOMETRIC = PhotometricConfig(grid_mask=0.7)
 """LaneSegNet at the paper's size: photometric distortion, and one GridMask for all views."""
+MAPTR_PHOTOMETRIC = LANESEGNET_PHOTOMETRIC
+"""MapTR and MapTRv2 at the papers' size have the same."""
 
 
 def augment_example(example: Example, config: PhotometricConfig, seed: int | Sequence[int]) -> Example:

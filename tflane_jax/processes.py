@@ -197,7 +197,7 @@ def all_rows(tree: Any) -> Any:
     whole, start = [], 0
     for leaf in leaves:
         part = np.ascontiguousarray(every[:, start : start + leaf.nbytes])
-        whole.append(part.view(leaf.dtype).reshape(-1, *leaf.shape[1:]))
+        whole.append(part.view(leaf.dtype).reshape(len(every) * len(leaf), *leaf.shape[1:]))
         start += leaf.nbytes
     return jax.tree.unflatten(treedef, whole)
 

@@ -60,7 +60,7 @@ def joined(monkeypatch):
 def test_a_process_that_asks_the_cluster_names_its_gpus(joined, monkeypatch):
     processes.join(None, None, None)
     assert joined["devices"] == list(range(8))
-    assert "cluster_detection_method" not in joined
+    assert joined["cluster_detection_method"] is None
     monkeypatch.setenv("JAX_LOCAL_DEVICE_IDS", "5")
     processes.join(None, None, None)
     assert joined["devices"] is None  # JAX reads the variable

@@ -59,12 +59,16 @@ def join(coordinator: str | None, processes: int | None, process: int | None) ->
         raise UserError("--coordinator, --processes and --process belong together: give all three")
     if processes is not None and process is not None and not 0 <= process < processes:
         raise UserError(f"--process {process} is none of {processes}: they are numbered from 0")
-    given_up, own = {"cluster_detection_method": "deactivate"}, None
-    if coordinator is None and "JAX_LOCAL_DEVICE_IDS" not in os.environ:
-        given_up, own = {}, devices_of_task(os.environ)
+    ask = coordinator is None  # the cluster
+    own = devices_of_task(os.environ) if ask and "JAX_LOCAL_DEVICE_IDS" not in os.environ else None
     try:
         jax.distributed.initialize(
-            coordinator, processes, process, own, heartbeat_timeout_seconds=HEARTBEAT_SECONDS, **given_up
+            coordinator,
+            processes,
+            process,
+            own,
+            cluster_detection_method=None if ask else "deactivate",
+            heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
         )
     except (RuntimeError, ValueError) as error:
         raise UserError(f"the processes of this training cannot be joined: {str(error).splitlines()[0]}") from error

@@ -13,6 +13,7 @@ import pytest
 
 from tests.shared import ROOT
 from tflane_jax.config import LogData, OpenLaneV2Data, RunConfig, apply_overrides, load_ablations, load_config
+from tflane_jax.config import _with_reference_batch as with_reference_batch
 from tflane_jax.config_files import shipped_configs
 from tflane_jax.config_io import from_json, settings, to_json, to_text
 from tflane_jax.errors import UserError
@@ -23,6 +24,7 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.run_checks import check_run
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.schedule import scaled_to_batch
 
 GOLDEN = Path(__file__).parent / "golden_configs"
 FLOW = RunConfig(task=LaneGraphTask(TopoNetConfig(priors=PriorsConfig(traffic_flow=TrafficFlowConfig()))))
@@ -75,6 +77,30 @@ def test_shipped_configurations_keep_their_limits(name, monkeypatch):
     config = configurations()[name]
     monkeypatch.setattr(Path, "exists", lambda path: True)
     check_run(config)
+
+
+@pytest.mark.parametrize("name", ["default", *(name for name in shipped() if "." in name and name.count(".") == 1)])
+def test_a_shipped_learning_rate_is_that_of_the_shipped_batch(name):
+    config = configurations()[name]
+    optim = with_reference_batch(replace(config, optim=replace(config.optim, lr_scaling="linear")), config).optim
+    assert scaled_to_batch(optim, config.training.batch_size).lr == config.optim.lr
+
+
+@pytest.mark.parametrize(
+    "name", sorted({name for name in shipped() if name.endswith("_r50")} - {"markers.toponet_r50"})
+)
+def test_a_configuration_of_paper_size_has_half_precision_and_recomputed_activations(name):
+    """The marker paper's has the settings alone, docs/scale.md."""
+    found = {key: to_text(configurations()[f"{name}.{key}"]) for key in ("remat", "bfloat16")}
+    assert "encoder.images.remat = True" in found["remat"]
+    assert "encoder.images.precision = 'bfloat16'" in found["bfloat16"]
+
+
+def test_a_scaled_learning_rate_starts_from_the_batch_of_the_file():
+    arguments = ["--optim.lr_scaling", "linear", "--training.batch_size", "64"]
+    config = apply_overrides(load_config("tf_lane/maptr_r50"), arguments)
+    assert config.optim.reference_batch == 32
+    assert apply_overrides(config, ["--training.batch_size", "16"]).optim.reference_batch == 32
 
 
 def test_every_golden_text_has_its_configuration():

@@ -137,6 +137,13 @@ def test_a_range_that_is_not_the_hosts_is_refused():
         migrate(old)
 
 
+@pytest.mark.parametrize(("scaling", "expected"), [("none", None), ("sqrt", 8)])
+def test_a_reference_batch_that_changed_nothing_is_that_of_the_configuration(scaling, expected):
+    old = to_json(RunConfig())
+    old["optim"] |= {"lr_scaling": scaling, "reference_batch": 8}
+    assert migrate(old)[0]["optim"]["reference_batch"] == expected
+
+
 def test_new_settings_are_listed_with_their_defaults():
     now = to_json(RunConfig())
     before = copy.deepcopy(now)

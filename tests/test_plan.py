@@ -12,9 +12,9 @@ from tflane_jax.cli import main
 from tflane_jax.commands import summary as command
 from tflane_jax.errors import UserError
 from tflane_jax.plan import GIB, KINDS, make_plan
-from tflane_jax.summary import Program
+from tflane_jax.summary import Program, any_steps
 from tflane_jax.training.loop import TrainingConfig
-from tflane_jax.training.schedule import OptimConfig
+from tflane_jax.training.schedule import OptimConfig, make_optimizer
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ def counted(monkeypatch):
 def estimate(task=None, accumulate=1, devices=4, *, shard_state=False, **settings):
     training = TrainingConfig(steps=3600, batch_size=16, accumulate=accumulate, shard_state=shard_state)
     options = {"devices": devices, "kind": "h100", "utilisation": 0.5} | settings
-    return make_plan(task or Task(features=4), EXAMPLE, OptimConfig(lr_scaling="sqrt"), training, **options)
+    optim = OptimConfig(lr_scaling="sqrt", reference_batch=8)
+    return make_plan(task or Task(features=4), EXAMPLE, optim, training, **options)
 
 
 def test_memory_and_time_of_a_step(counted):
@@ -72,6 +73,11 @@ def test_a_shared_state_takes_a_part_of_the_memory_and_more_exchange(counted):
     assert shared.memory == pytest.approx(whole.memory - 4 * LEARNED + 4 * LEARNED / 4 + LEARNED, rel=1e-5)
     assert shared.step_s - whole.step_s == pytest.approx(3 / 4 * LEARNED * GIB / (KINDS["h100"].link * 1e9))
     assert estimate(shard_state=True, devices=1).memory == estimate(devices=1).memory
+
+
+def test_a_long_warm_up_fits_the_counted_step():
+    optim = OptimConfig(warmup_steps=5000)
+    make_optimizer(optim, any_steps(optim))  # raises where it does not
 
 
 def test_half_precision_and_one_device(counted):

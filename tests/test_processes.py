@@ -11,33 +11,45 @@ import pytest
 
 from tests.shared import ROOT
 from tests.slow import with_slow
+from tests.test_cli import CONFIG as TINY
 from tests.training.many_processes import CONFIG, draw, score
 from tests.training.stub_run import run
 from tests.training.test_loop import arrays, timeless
 from tflane_jax import processes
 from tflane_jax.errors import UserError
+from tflane_jax.training.checkpoint import Checkpoints
+
+
+def free_port():
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        return free.getsockname()[1]
+
+
+def ended(commands):
+    """Run commands side by side; return exit code, output and errors of each."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    began = [subprocess.Popen([sys.executable, "-m", *command], cwd=ROOT, **pipes) for command in commands]
+    try:
+        said = [each.communicate(timeout=200) for each in began]
+        return [(each.returncode, *texts) for each, texts in zip(began, said, strict=True)]
+    finally:
+        for each in began:
+            each.kill()
+
+
+def begun(folder, starts):
+    """Return the command of a process for each of `starts`."""
+    common = ["tests.training.many_processes", str(folder), str(free_port()), str(len(starts))]
+    return [[*common, str(i), start] for i, start in enumerate(starts)]
 
 
 def together(folder, starts):
     """Run a process for each of `starts`; return what each of them said last."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "tests.training.many_processes", str(folder), str(port), str(len(starts))]
-    began = [
-        subprocess.Popen(
-            [*command, str(i), start],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for i, start in enumerate(starts)
-    ]
-    ended = [(each, *each.communicate(timeout=100)) for each in began]
-    for each, _, errors in ended:
-        assert each.returncode == 0, errors
-    return [json.loads(out.splitlines()[-1]) for _, out, _ in ended]
+    found = ended(begun(folder, starts))
+    for code, _, errors in found:
+        assert code == 0, errors
+    return [json.loads(out.splitlines()[-1]) for _, out, _ in found]
 
 
 @pytest.fixture(scope="module", params=with_slow([2, 4], quick=[2]))
@@ -78,6 +90,56 @@ def test_all_stop_when_one_is_told_to_and_one_alone_goes_on(trained, tmp_path):
     expected, found = timeless(trained[0]), timeless(folder)
     assert len(found) == len(expected)
     np.testing.assert_allclose(found[-1]["score"], expected[-1]["score"], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_two_resume_what_two_began_bit_for_bit(trained, tmp_path):
+    if len(trained[1]) != 2:
+        pytest.skip("bit-identical with the same number of processes only")
+    folder = tmp_path / "run"
+    assert [each["step"] for each in together(folder, ["new", "stopped"])] == [10, 10]
+    assert [each["step"] for each in together(folder, ["resume", "resume"])] == [30, 30]
+    assert arrays(folder) == arrays(trained[0])
+    assert timeless(folder) == timeless(trained[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "code"), [("killed", -signal.SIGKILL), ("unreadable:15", 2)], ids=["killed", "unreadable"]
+)
+def test_one_that_ends_alone_ends_the_others_and_one_goes_on(trained, tmp_path, fault, code):
+    folder = tmp_path / "run"
+    (first, *_), (second, _, errors) = ended(begun(folder, ["new", fault]))
+    assert second == code
+    assert first != 0
+    if code == 2:
+        assert errors.splitlines()[-1] == "tflane: cannot read image.jpg"
+    (alone,) = together(folder, ["resume"])
+    assert alone["step"] == 30
+    np.testing.assert_allclose(timeless(folder)[-1]["score"], timeless(trained[0])[-1]["score"], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_what_one_cannot_read_before_the_first_step_ends_all_with_the_same_message(tmp_path):
+    said = together(tmp_path / "run", ["new", "unreadable:0"])
+    assert [each["error"] for each in said] == ["process 1: cannot read image.jpg", "cannot read image.jpg"]
+
+
+@pytest.mark.slow
+def test_the_command_line_trains_on_two_processes(tmp_path):
+    (tmp_path / "tiny.py").write_text(TINY)
+    folder, joined = tmp_path / "run", ["--coordinator", f"localhost:{free_port()}", "--processes", "2", "--process"]
+    train = ["tests.slow_start", "nothing", "train", "--config", str(tmp_path / "tiny.py:baseline"), "--out"]
+    (code, out, errors), (other, nothing, _) = ended([[*train, str(folder), *joined, str(i)] for i in range(2)])
+    assert (code, other) == (0, 0), errors
+    assert "2 processes, 2 devices (cpu)" in errors
+    assert f"{folder}: 4 steps" in out
+    assert "steps" not in nothing
+    assert Checkpoints(folder / "checkpoints").steps() == [2, 4]
+    joined[1] = f"localhost:{free_port()}"
+    for code, _, errors in ended([[*train, str(folder), *joined, str(i)] for i in range(2)]):
+        assert code == 2
+        assert f"{folder} already holds a run" in errors.splitlines()[-1]
 
 
 @pytest.mark.slow

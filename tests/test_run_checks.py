@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tflane_jax import runs
+from tflane_jax import devices, runs
 from tflane_jax.cli import main
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.config_io import with_setting
@@ -43,6 +43,9 @@ WRONG = {
         "optim.drops": (DropsConfig(()), DropsConfig((5, 5)), DropsConfig((1,), 0.0), DropsConfig((1,), 2.0)),
         "training.steps": (0, -3, 1.5, None),
         "training.batch_size": (0, "8"),
+        "training.accumulate": (0, 3, 16),
+        "optim.lr_scaling": ("square", "sqrt", None),
+        "optim.reference_batch": (0, 8.0),
         "training.seeds": ((), (1, 1), (-1,), 3, (0.5,)),
         "training.log_every": (0,),
         "training.eval_every": (0,),
@@ -81,6 +84,7 @@ WRONG = {
         "data.example.sensor.grid.rows": (0,),
         "data.example.sensor.lost": (1.5,),
         "task.clip": (0, 3),
+        "task.time": ("loop", "scan"),
         "task.empty_frames": ("drop",),
         "task.model": (None, RestartsConfig()),
         "task.losses": (None,),
@@ -203,6 +207,7 @@ def test_a_wrong_setting_is_named_with_its_value(reference, setting, value, tmp_
 
 # The message is about the setting that the value no longer fits.
 FITS = {
+    "optim.lr_scaling": "optim.reference_batch is None",
     "data.world.duration_s": "data.world.keyframes is 4",
     "data.world.rate_hz": "data.example.history_hz is 2.0",
     "task.model.decoder.dim": "task.model.decoder.heads is 8: it must be a divisor of dim",
@@ -272,3 +277,20 @@ def test_images_do_not_train_a_model_of_lane_graphs():
 def test_overrides_may_break_no_limit_of_another_setting():
     with pytest.raises(UserError, match=r"--optim\.warmup_steps is 500: it must be less than .*training\.steps, 100"):
         apply_overrides(RunConfig(), ["--training.steps", "100"])
+
+
+def test_patterns_of_learning_rates_are_checked_before_data_are_built(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "load", None)
+    config = loaded("gtn_lane/gtn")
+    config = replace(config, optim=replace(config.optim, lr_factors=(("backbone/nowhere", 0.1),)))
+    with pytest.raises(UserError, match=r"optim\.lr_factors: no parameter matches 'backbone/nowhere'"):
+        runs.train_run(config, tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_batch_that_devices_cannot_share_is_refused_before_data_are_built(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "load", None)
+    monkeypatch.setattr(devices.jax, "device_count", lambda: 3)
+    with pytest.raises(UserError, match=r"training\.batch_size is 8, which 3 devices cannot share evenly"):
+        runs.train_run(loaded(""), tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()

@@ -100,14 +100,23 @@ def load_config(reference: str) -> RunConfig:
     """
     name, ablation = split_reference(reference)
     if not ablation:
-        return _checked(find_config(name), _called(find_config(name), "get_config", RunConfig))
+        config = _called(find_config(name), "get_config", RunConfig)
+        return _checked(find_config(name), _with_reference_batch(config, config))
     ablations = load_ablations(name)
     if ablation not in ablations:
         close = difflib.get_close_matches(ablation, ablations, 3)
         raise UserError(
             f"config file {name} has no ablation {ablation}, only {', '.join(ablations)}{_did_you_mean(close)}"
         )
-    return _checked(find_config(name), ablations[ablation])
+    return _checked(find_config(name), _with_reference_batch(ablations[ablation], ablations[ablation]))
+
+
+def _with_reference_batch(config: RunConfig, chosen: RunConfig) -> RunConfig:
+    """Return a configuration whose learning rate is scaled, if it is, from the batch of the one it was chosen for."""
+    if config.optim.lr_scaling == "none" or config.optim.reference_batch is not None:
+        return config
+    optim = dataclasses.replace(config.optim, reference_batch=chosen.training.batch_size)
+    return dataclasses.replace(config, optim=optim)
 
 
 def load_ablations(name: str) -> dict[str, RunConfig]:
@@ -193,6 +202,8 @@ def _lines_of(path: Path, error: SettingError) -> str:
 def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
     """Return the configuration with settings changed by `--a.b.c value` arguments, typed by tyro.
 
+    A learning rate that is scaled without `optim.reference_batch` was chosen for the batch of `config`.
+
     An argument that chooses an optional part, or the class of a part, is applied first, wherever it appears:
     `--a.b None`, `--a.b default` or `--a.b NameOfItsClass`; the part then has its defaults.
 
@@ -204,6 +215,7 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
         return config
     import tyro
 
+    given = config
     config, arguments = _choose_parts(config, arguments)
     _check_names(config, arguments)
     output = io.StringIO()
@@ -212,6 +224,7 @@ def apply_overrides(config: RunConfig, arguments: Sequence[str]) -> RunConfig:
             changed = tyro.cli(RunConfig, default=config, args=list(arguments), config=(tyro.conf.AvoidSubcommands,))
     except SystemExit as error:
         raise UserError(_without_boxes(output.getvalue())) from error
+    changed = _with_reference_batch(changed, given)
     check_settings(changed, "--")
     return changed
 

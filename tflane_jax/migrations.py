@@ -193,6 +193,12 @@ def _loss_of_host(root: Json) -> tuple[Json, list[str]]:
     return renamed_class("LaneGraphLossConfig", "BevFormerDetrLossConfig" if of_baseline else "TopoNetLossConfig")(root)
 
 
+def _unused_reference_batch(node: Json, path: str, root: Json) -> tuple[Json, list[str]]:
+    """Drop the former default of a setting that changed nothing, because the learning rate was not scaled."""
+    unused = node.get("lr_scaling") == "none" and node.get("reference_batch") == 8
+    return node | {"reference_batch": None} if unused else node, []
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # The changes so far, oldest first. Add new ones at the end.
 
@@ -215,4 +221,5 @@ MIGRATIONS: tuple[Migration, ...] = (
     nested_settings("BevFormerDetrConfig", ("sd_map", "markers"), "priors", "PriorsConfig"),
     removed_setting("LaneGraphLossConfig", "control_points", lambda root: value_at(root, f"{_MODEL}.control_points")),
     _loss_of_host,
+    _at_class("OptimConfig", _unused_reference_batch),
 )

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from tflane_jax.errors import UserError
 from tflane_jax.scene import shapes_of
-from tflane_jax.summary import training_program
+from tflane_jax.summary import any_steps, training_program
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig, make_optimizer, scaled_to_batch
@@ -112,7 +112,9 @@ def make_plan(
     part = training.batch_size // passes
     program = training_program(task, example, part, optim, compiled=compiled)
     frames = example if task.frames == 1 else shapes_of(example, task.frames)
-    state: Any = jax.eval_shape(partial(init_state, task, make_optimizer(optim, 10**6)), jax.random.key(0), frames)
+    state: Any = jax.eval_shape(
+        partial(init_state, task, make_optimizer(optim, any_steps(optim))), jax.random.key(0), frames
+    )
     learned = _gib(state.learned)
     between = None if program.between is None else program.between / 1024
     # Parts add up in a further gradient.
@@ -151,7 +153,7 @@ def make_plan(
             f"{kind}: {device.memory:g} GB, {peak:g} TFLOP/s of {'bfloat16' if half else 'float32 (TF32)'} products, "
             f"{device.link:g} GB/s to the others; peak numbers of the data sheet",
             f"computing reaches {utilisation:.0%} of the peak: a guess, not measured (--utilisation)",
-            "operations are XLA's count before fusion; what a loop does counts once",
+            "operations are XLA's count before fusion; frames of a clip and parts of a batch all count",
             "gradients and activations need what the compiler for this machine plans; a GPU's plan differs",
             "gradients are exchanged after computing, in a ring, at full speed of the link",
             *(("gathering what Muon needs whole takes neither memory nor time",) if shared else ()),

@@ -13,10 +13,12 @@ from tflane_jax.config_io import settings
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.limits import SettingError, check_settings
-from tflane_jax.models.parameters import Params, first_misfit
+from tflane_jax.models.parameters import Params, first_misfit, split_statistics
 from tflane_jax.scene import Example, RoadImage, shapes_of
 from tflane_jax.tasks.base import AnyTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.training.rate_factors import factor_of_leaves
+from tflane_jax.training.vectors import layout_of
 
 KINDS = {Example: "lane graphs", RoadImage: "images"}
 """Kinds of examples, in words."""
@@ -33,6 +35,21 @@ def check_run(config: RunConfig) -> None:
     config.task.check_settings(config.data)
     _check_scores(config)
     _check_files(config)
+
+
+def check_rate_factors(config: RunConfig) -> None:
+    """Raise UserError for a pattern in `optim.lr_factors` that matches no parameter.
+
+    It traces the model. No-op without patterns, and without the data that shapes of parameters depend on.
+    """
+    if not config.optim.lr_factors:
+        return
+    try:
+        example = config.task.shapes(config.data)
+    except UserError:
+        return
+    learned, _ = split_statistics(shapes_of_params(config.task, example))
+    factor_of_leaves(layout_of(learned), config.optim.lr_factors)
 
 
 def check_kind(config: RunConfig) -> None:

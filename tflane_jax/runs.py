@@ -25,13 +25,14 @@ from tflane_jax.datasets.batches import in_workers
 from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
+from tflane_jax.devices import training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import from_first, is_first
-from tflane_jax.run_checks import check_model, check_run
+from tflane_jax.processes import agreed, from_first, is_first
+from tflane_jax.run_checks import check_model, check_rate_factors, check_run
 from tflane_jax.startup import showing, stage
 from tflane_jax.training.checkpoint import Checkpoints, Manifest, Which
 from tflane_jax.training.fine_tuning import check_origins
@@ -69,22 +70,25 @@ def train_run(config: RunConfig, folder: Path, *, start: Start = "new", progress
     Raises UserError like `training.loop.train` and the datasets, and `Interrupted` like that.
     """
     from_first(lambda: check_start(folder, start))  # before building data, which may take long
-    check_run(config)
+    with agreed():
+        check_run(config)
+        training_mesh(config.training.batch_size, config.training.accumulate)
+        check_rate_factors(config)
     if start != "resume":
-        check_origin(config)
+        from_first(lambda: check_origin(config))
     with showing(progress and is_first()):
         return _train(config, folder, start=start, progress=progress)
 
 
 def _train(config: RunConfig, folder: Path, *, start: Start, progress: bool) -> TrainingResult:
     task = config.task
-    with stage("reading the training data"):
+    with agreed(), stage("reading the training data"):
         data: Any = task.load(config.data.source("train"), progress=progress)
         task.check(config.data, data)
         arrays, prepare = task.examples(data), task.prepare(config.data)
         if prepare is not None:
             arrays = in_workers(arrays, loading_of(config.data))
-    with stage("reading the validation data"):
+    with agreed(), stage("reading the validation data"):
         validation: Any = task.load(config.data.source("val"), progress=progress)
 
     def evaluate(params: Params) -> dict[str, float]:

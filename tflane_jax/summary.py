@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -64,10 +64,22 @@ def training_program(
 ) -> Program:
     """Return the cost of an update: loss, gradient, optimiser, moving average; of clips if the task is one of clips."""
     example, optim = trained_on(task, example), scaled_to_batch(optim, batch_size)
-    optimizer, step = make_optimizer(optim, 1000), make_update_step(task, optim, 1000)
+    steps = any_steps(optim)
+    optimizer, step = make_optimizer(optim, steps), make_update_step(task, optim, steps)
     state = jax.eval_shape(partial(init_state, task, optimizer), jax.random.key(0), example)
     lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))
-    return _program("training step", batch_size, lowered, compiled)
+    program = _program("training step", batch_size, lowered, compiled)
+    if not getattr(task, "loops", False):
+        return program
+    # XLA counts the operations of a loop once.
+    step = make_update_step(task.unrolled, optim, steps)
+    lowered = jax.jit(step).lower(state, shapes_of(example, batch_size))
+    return replace(program, gflop=_program(program.name, batch_size, lowered, False).gflop)
+
+
+def any_steps(optim: OptimConfig) -> int:
+    """Return a number of steps that a run may have; it changes no cost of a step."""
+    return optim.warmup_steps + 1000
 
 
 def _program(name: str, batch: int, lowered: Any, compiled: bool) -> Program:

@@ -9,15 +9,17 @@ import pytest
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
 from tflane_jax.ablations.declaration import Claim, check
-from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow, shortened
+from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow, longer, shortened
 from tflane_jax.ablations.published import page, record
 from tflane_jax.ablations.scores import is_measured
 from tflane_jax.ablations.store import stored_jobs
 from tflane_jax.ablations.table_run import run_table
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.cli import main
+from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
-from tflane_jax.training.schedule import make_optimizer
+from tflane_jax.training.restarts import RestartsConfig
+from tflane_jax.training.schedule import DropsConfig, OptimConfig, make_optimizer
 
 pytestmark = pytest.mark.usefixtures("cheap")
 TABLE_FILES = {"table.md", "table.json", "table.tex", "effects.md", "effects.json", "summary.json"}
@@ -174,6 +176,22 @@ def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
         assert tmp_path / "runs" in [*(tmp_path / "runs" / "x").parents]
         assert next(host for host in hosts if str(host) == start)
         assert json.loads((type(tmp_path)(start) / "config.json").read_text())["training"]["seeds"] == seeds
+
+
+def test_a_table_with_more_steps_has_another_name_and_slower_schedules():
+    table = TABLES["tf_lane.2"]
+    assert table.lengthened(1) is table
+    long = table.lengthened(10)
+    assert (long.name, long.title) == ("tf_lane.2.steps_x10", f"{table.title}, 10 times the steps")
+    for name, config in long.configs(long.rows).items():
+        short = table.configs(table.rows)[name].training
+        assert config.training == replace(short, steps=10 * short.steps, eval_every=10 * short.eval_every)
+    drops = OptimConfig(epoch_steps=3, drops=DropsConfig((5, 9)))
+    assert longer(RunConfig(optim=drops), 10).optim == replace(drops, epoch_steps=30, drops=DropsConfig((50, 90)))
+    restarts = longer(RunConfig(optim=OptimConfig(restarts=RestartsConfig(cycle_steps=7))), 10).optim.restarts
+    assert restarts == RestartsConfig(cycle_steps=70)
+    assert main(["tables", "tf_lane.2", "--steps-factor", "2", "--record", "docs"]) == 2
+    assert main(["tables", "tf_lane.2", "--steps-factor", "0"]) == 2
 
 
 def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch):

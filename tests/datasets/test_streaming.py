@@ -134,6 +134,18 @@ def test_an_evaluation_goes_through_all_examples_in_order():
         assert_same(batch, other)
 
 
+@pytest.mark.parametrize("make", [streamed, in_memory])
+def test_processes_of_an_evaluation_load_their_own_rows(make):
+    whole = list(ordered_batches(make(), 4))
+    for index in range(2):
+        for (indices, batch), (expected, part) in zip(whole, ordered_batches(make(), 4, (index, 2)), strict=True):
+            assert indices == expected
+            assert_same(jax.tree.map(lambda leaf, i=index: leaf[2 * i : 2 * i + 2], batch), part)
+    asked = Counting(SIZE)
+    list(ordered_batches(streamed(dataset=asked), 4, (1, 2)))
+    assert sorted(asked.asked) == [2, 3, 6, 6]
+
+
 def test_one_example_gives_the_shapes():
     assert_same(first_example(streamed()), first_example(in_memory()))
     assert_same(chosen_examples(streamed(), [5, 0]), chosen_examples(in_memory(), [5, 0]))

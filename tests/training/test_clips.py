@@ -152,6 +152,14 @@ def test_a_scan_over_time_gives_the_losses_and_gradients_of_the_unrolled_form():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(b, a, rtol=1e-3, atol=1e-5 * size), gradient, again)
 
 
+@pytest.mark.slow
+def test_operations_of_a_scan_are_those_of_all_frames():
+    example, optim = shapes_of(make_camera_example(0)), OptimConfig(warmup_steps=2000)
+    tasks = replace(CAMERA_CLIPS, clip=2), replace(CAMERA_CLIPS, clip=2, time="scan")
+    unrolled, scan = (training_program(task, example, 1, optim, compiled=False).gflop for task in tasks)
+    assert scan == pytest.approx(unrolled, rel=1e-6)
+
+
 def test_only_a_host_with_bev_memory_loops_over_time():
     assert replace(CAMERA_CLIPS, time="scan").loops
     for task in (CAMERA_CLIPS, replace(CLIPS, time="scan"), replace(CAMERA_CLIPS, clip=1, time="scan")):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,9 @@ from tests.training.stub_run import CONFIG, OPTIM, RESOLVED, run, score
 from tflane_jax.datasets.batches import batch_indices
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
+from tflane_jax.training import run_folder
 from tflane_jax.training.checkpoint import Checkpoints
+from tflane_jax.training.fine_tuning import check_origins
 from tflane_jax.training.loop import train
 from tflane_jax.training.records import read_records
 
@@ -175,6 +178,14 @@ def test_fine_tuning_starts_from_the_best_average(whole, tmp_path):
         run(tmp_path / "other", config=dataclasses.replace(config, steps=9), task=LineTask(features=2))
 
 
+@pytest.mark.parametrize("content", ["{}", '{"training": {}}', '{"training": {"best_metric": "score", "seeds": 3}}'])
+def test_a_run_to_start_from_without_its_settings_is_damaged(whole, tmp_path, content):
+    shutil.copytree(whole, tmp_path / "origin")
+    (tmp_path / "origin" / "config.json").write_text(content)
+    with pytest.raises(UserError, match=r"config\.json is damaged: it lacks training\.best_metric or training\.seeds"):
+        check_origins(str(tmp_path / "origin"), (0,))
+
+
 def test_every_seed_may_start_from_a_run_of_its_own(whole, tmp_path):
     short = dataclasses.replace(CONFIG, steps=4)
     for seed in (0, 1):
@@ -253,6 +264,25 @@ def test_overwriting_starts_again_and_spares_foreign_files(tmp_path):
     assert Checkpoints(folder / "checkpoints").steps() == [7, 10]
     assert timeless(folder)[-1]["step"] == 10
     assert (folder / "notes.txt").exists()
+
+
+def test_what_cannot_be_overwritten_is_named_and_stays_a_run(tmp_path, monkeypatch):
+    folder, elsewhere, short = tmp_path / "run", tmp_path / "disk", dataclasses.replace(CONFIG, steps=4)
+    run(folder, config=short)
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied", str(path / "step_00000004"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_folder.shutil, "rmtree", refuse)
+        with pytest.raises(UserError, match=r"cannot delete .*step_00000004: Permission denied"):
+            run(folder, start="overwrite", config=short)
+    (folder / "checkpoints").rename(elsewhere)
+    (folder / "checkpoints").symlink_to(elsewhere)
+    with pytest.raises(UserError, match=r"checkpoints is a link, and what it points to is not deleted"):
+        run(folder, start="overwrite", config=short)
+    assert Checkpoints(elsewhere).steps() == [4]
+    assert (folder / "config.json").exists()
 
 
 def test_two_processes_never_share_a_folder(tmp_path):

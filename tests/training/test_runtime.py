@@ -50,6 +50,7 @@ def test_a_program_that_another_job_has_half_written_is_compiled_anew(tmp_path):
     for file in (tmp_path / "cache" / "programs").glob("jit*"):
         file.write_bytes(file.read_bytes()[:100])
     assert start(tmp_path / "cache") == 0
+    assert start(tmp_path / "cache") > 0  # it was replaced
 
 
 def test_the_environment_chooses_the_folder_and_none(tmp_path):

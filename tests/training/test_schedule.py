@@ -284,6 +284,8 @@ def test_the_rate_is_scaled_by_the_global_batch(rule, batch, expected):
 
 def test_an_unscaled_rate_and_a_reference_batch_of_zero_are_refused():
     with pytest.raises(ValueError, match="scaled_to_batch"):
-        make_optimizer(OptimConfig(lr_scaling="sqrt"), 1000)
+        make_optimizer(OptimConfig(lr_scaling="sqrt", reference_batch=8), 1000)
     with pytest.raises(UserError, match=r"optim\.reference_batch is 0"):
         scaled_to_batch(OptimConfig(reference_batch=0), 8)
+    with pytest.raises(UserError, match=r"optim\.reference_batch is None: it must be the batch size"):
+        scaled_to_batch(OptimConfig(lr_scaling="linear"), 8)

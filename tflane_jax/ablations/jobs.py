@@ -20,7 +20,7 @@ from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
-from tflane_jax.run_checks import check_run
+from tflane_jax.run_checks import check_rate_factors, check_run
 from tflane_jax.runs import check_origin, current_form
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origin_folders, origins
@@ -156,6 +156,7 @@ def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
             job = waiting[0]
             try:
                 check_run(job.config)
+                check_rate_factors(job.config)
                 _check_same(waiting)
                 training = job.config.training
                 starts = folders & set(origin_folders(training.init_from or "", training.seeds))

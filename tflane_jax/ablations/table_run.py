@@ -230,6 +230,7 @@ def _save_summary(
             "table": table.name,
             "title": table.title,
             "quick": quick,
+            **({"steps factor": table.steps_factor} if table.steps_factor > 1 else {}),
             "protocol": results.protocol,
             "declared": declared.sentence(),
             "note": table.note,

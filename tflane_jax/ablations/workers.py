@@ -12,11 +12,12 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tqdm import tqdm
 
+from tflane_jax import accelerators
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import is_measured, measure_all
@@ -51,7 +52,7 @@ def worker_threads(parallel: int, cores: int | None = None) -> dict[str, Any]:
     """Return the thread setting in which `train_all` trains; raise UserError for more cores than there are."""
     if parallel == 1 and cores is None:
         return thread_setting()
-    return thread_setting(len(_cores(0, parallel, cores)) or None)
+    return thread_setting(len(_cores(0, parallel, cores)) or None, devices=1)
 
 
 def _cores(slot: int, parallel: int, cores: int | None = None) -> list[int]:
@@ -162,10 +163,10 @@ def _build(job: Job, built: set[Any]) -> None:
 
 
 class Worker:
-    """A process on its own cores that trains one job after the other, and compiles every model once."""
+    """A process on its own cores and GPU that trains one job after the other, and compiles every model once."""
 
     def __init__(self, slot: int, parallel: int, cores: int | None = None) -> None:
-        self._cores = _cores(slot, parallel, cores)
+        self._cores, self._accelerator = _cores(slot, parallel, cores), accelerators.of_worker(slot, parallel)
         self.job: Job | None = None
         self.tasks: set[Any] = set()
         self.stage = ""
@@ -177,7 +178,8 @@ class Worker:
     def _begin_process(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, far = context.Pipe()
-        self._process: Any = context.Process(target=_train_jobs, args=(far, self._cores), daemon=True)
+        given = far, self._cores, self._accelerator
+        self._process: Any = context.Process(target=_train_jobs, args=given, daemon=True)
         self._process.start()
         far.close()  # so that reading fails, instead of waiting, once the process is gone
         self.tasks.clear()
@@ -231,7 +233,7 @@ def _train(job: Job) -> None:
         raise UserError(f"stopped by {signal.Signals(result.stopped_by).name} after step {result.step}")
 
 
-def _train_jobs(pipe: Any, cores: list[int]) -> None:
+def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> None:
     """Train and measure the jobs that come through the pipe; answer ("done", None) for each, or why it failed.
 
     Before that, what a job is doing is told as ("stage", name), and ("stage", "") at its end. Messages go to the job's
@@ -240,6 +242,7 @@ def _train_jobs(pipe: Any, cores: list[int]) -> None:
     end_with_parent()
     if cores:
         os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this
+    os.environ.update(accelerator)
 
     def tell(what: str, text: str | None) -> None:
         with contextlib.suppress(OSError):  # the comparison is gone

@@ -14,7 +14,11 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace) -> int:
     """Run the named tables, or list all."""
-    chosen = [find_table(name) for name in options.names]
+    if options.steps_factor < 1:
+        raise UserError(f"--steps-factor {options.steps_factor}: at least 1")
+    if options.steps_factor > 1 and options.record is not None:
+        raise UserError("--record keeps the tables as they are declared: leave out --steps-factor")
+    chosen = [find_table(name).lengthened(options.steps_factor) for name in options.names]
     if options.seeds is not None and options.seeds < 1:
         raise UserError(f"--seeds {options.seeds}: at least one")
     jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs

@@ -9,12 +9,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
+
 from tflane_jax import processes
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.config_files import split_reference
-from tflane_jax.config_io import to_text
+from tflane_jax.config_io import from_json, to_json, to_text
 from tflane_jax.errors import UserError
 from tflane_jax.runs import resumable_config, train_run
+from tflane_jax.startup import write
 from tflane_jax.training.runtime import configure_jax
 
 _NOT_BEGUN = " before the run began: give the same command again"
@@ -31,10 +34,15 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError("say what to train: --config FILE (or a name, say tf_lane/toponet), or --resume with --out RUN")
     if options.distributed or (options.coordinator, options.processes, options.process) != (None, None, None):
         processes.join(options.coordinator, options.processes, options.process)
+    with processes.leaving():
+        return _trained(options, overrides)
+
+
+def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
-
     configure_jax()
+    _tell_devices()
     before = _saved_at(out)
     try:
         result = train_run(config, out, start=options.start)
@@ -65,10 +73,19 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 
 def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) -> RunConfig:
     if options.config is not None:
-        return apply_overrides(load_config(options.config), overrides)
+        with processes.agreed():
+            return apply_overrides(load_config(options.config), overrides)
     if overrides:
         raise UserError(f"a run is resumed with its own configuration: leave {overrides[0]} out")
-    return resumable_config(out)
+    return from_json(RunConfig, processes.from_first(lambda: to_json(resumable_config(out))))
+
+
+def _tell_devices() -> None:
+    """Say how many devices share the training, so that one that is missing is seen."""
+    number, devices = jax.process_count(), jax.devices()
+    if processes.is_first() and (number > 1 or len(devices) > 1):
+        joined = f"{number} processes, " if number > 1 else ""
+        write(f"{joined}{len(devices)} devices ({devices[0].device_kind})")
 
 
 def _saved_at(out: Path) -> int | None:

@@ -152,22 +152,28 @@ def batches(
             yield batch
 
 
-def ordered_batches(arrays: Any, batch_size: int) -> Iterator[tuple[range, Any]]:
+def ordered_batches(arrays: Any, batch_size: int, share: tuple[int, int] = (0, 1)) -> Iterator[tuple[range, Any]]:
     """Yield all examples once in order: their indices, and a batch (numpy) that begins with them.
 
     The last batch is filled up with copies of the last example, so that all batches have the same size.
+
+    Args:
+        arrays: examples, see the module's docstring.
+        batch_size: examples of a batch.
+        share: (index, count) of this process among those that divide every batch evenly; it gets its own rows alone.
     """
-    examples = count(arrays)
+    examples, rows = count(arrays), batch_size // share[1]
+    places = range(share[0] * rows, (share[0] + 1) * rows)
     starts = range(0, examples, batch_size)
     stream: Generator[Any] = _nothing()
     if isinstance(arrays, Streamed):
-        stream = arrays.stream(InOrder(examples), len(starts) * batch_size)
+        stream = arrays.stream(InOrder(examples, batch_size, places), len(starts) * rows)
     with contextlib.closing(stream):
         for start in starts:
             if isinstance(arrays, Streamed):
-                batch = stack_examples([next(stream) for _ in range(batch_size)])
+                batch = stack_examples([next(stream) for _ in places])
             else:
-                filled = np.minimum(np.arange(start, start + batch_size), examples - 1)
+                filled = np.minimum(start + np.array(places), examples - 1)
                 batch = jax.tree.map(lambda leaf, rows=filled: leaf[rows], arrays)
             yield range(start, min(start + batch_size, examples)), batch
 

@@ -58,15 +58,21 @@ Prepare = Callable[[Any, tuple[int, int, int]], Any]
 
 @dataclass(frozen=True)
 class InOrder:
-    """Requests of all examples in order; beyond the end the last one is repeated.
+    """Requests of all examples in order, or of the same places of every batch; beyond the end the last one is repeated.
 
     Attributes:
         examples: number of examples.
+        batch_size: of the batches.
+        places: places in each batch that are requested.
     """
 
     examples: int
+    batch_size: int = 1
+    places: range = range(1)
 
     def __call__(self, number: int) -> Request:
+        batch, place = divmod(number, len(self.places))
+        number = batch * self.batch_size + self.places[place]
         return Request(min(number, self.examples - 1), (0, 0, number))
 
 

@@ -216,7 +216,7 @@ def evaluate_lanes(
     config = config or EvaluationConfig()
     sightings, metrics = Sightings(), LaneGraphMetrics(config.versions)
     changed = with_traffic(arrays, config.traffic)
-    predicted = predicted_batches(task, params, changed, config.batch_size)
+    predicted = predicted_batches(task, params, changed, config.batch_size, _without_images)
     originals = None if changed is arrays else ordered_batches(arrays, config.batch_size)
     for number, (indices, batch, answer) in enumerate(predicted):
         if originals is not None:
@@ -262,6 +262,10 @@ def _labels(batch: Example) -> Example:
     """Return examples without sensor data and priors, which no protocol reads."""
     inputs = ("bev", "hidden", "cameras", "traffic_flow", "markers", "sd_map")
     return batch.replace(**dict.fromkeys(inputs))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _without_images(batch: Example) -> Example:
+    return batch.replace(cameras=None)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class Sightings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -16,6 +16,7 @@ from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.devices import divided, everywhere, prediction_mesh, replicated, share
 from tflane_jax.models.parameters import Params
+from tflane_jax.processes import all_rows
 from tflane_jax.scene import Example, Prediction, stack_examples
 from tflane_jax.startup import compiled
 
@@ -66,28 +67,39 @@ def predictions(task: Predictor, params: Params, arrays: Any, batch_size: int) -
         batch_size: examples per call. The last batch is padded and its predictions cut, so that all batches use one
             compiled program.
     """
-    for indices, _, answers in predicted_batches(task, params, arrays, batch_size):
+    for indices, _, answers in predicted_batches(task, params, arrays, batch_size, lambda batch: None):
         yield indices, answers
 
 
 def predicted_batches(
-    task: Predictor, params: Params, arrays: Any, batch_size: int
+    task: Predictor,
+    params: Params,
+    arrays: Any,
+    batch_size: int,
+    needed: Callable[[Any], Any] | None = None,
 ) -> Iterator[tuple[range, Any, Prediction]]:
     """Yield indices, stacked examples and stacked predictions; padding may add examples beyond the indices.
 
     A model with memory processes the examples in order, as a stream; at the start of a scene, `has_previous` is False
-    and its memory is ignored. Several devices share each batch, if they can do so evenly.
+    and its memory is ignored. Several devices share each batch, if they can do so evenly. Each of several processes
+    then loads its own rows alone.
+
+    Args:
+        task, params: the model.
+        arrays, batch_size: see `predictions`.
+        needed: batch -> what the caller reads of it, which alone is exchanged between processes; None for all.
     """
     mesh = None if task.streams else prediction_mesh(batch_size)
-    params, (part, parts) = replicated(params, mesh), share(mesh)
-    mine = slice(part * batch_size // parts, (part + 1) * batch_size // parts)
+    params, part = replicated(params, mesh), share(mesh)
     memory = task.start() if task.streams else None
-    for indices, batch in ordered_batches(arrays, batch_size):
+    for indices, batch in ordered_batches(arrays, batch_size, part):
         if task.streams:
             memory, answers = _called(predict_stream, task, params, memory, batch)
         else:
-            rows = divided(jax.tree.map(lambda leaf: leaf[mine], batch), mesh) if mesh is not None else batch
+            rows = divided(batch, mesh) if mesh is not None else batch
             answers = _called(predict_batch, task, params, rows, mesh)
+            if part[1] > 1:
+                batch = all_rows(batch if needed is None else needed(batch))
         answers, kept = jax.device_get(answers), slice(len(indices))
         yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 

@@ -75,6 +75,11 @@ class Task(Generic[ExampleT, DataT, SourceT, MemoryT]):
         return False
 
     @property
+    def unrolled(self) -> AnyTask:
+        """The same task with a program that has no such loops."""
+        return self
+
+    @property
     def frozen(self) -> tuple[str, ...]:
         """Paths of modules that are never trained, and so need weights to start from."""
         return ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
@@ -82,6 +82,11 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def loops(self) -> bool:
         """Whether the frames of a clip pass through the model in a loop."""
         return self.clip > 1 and self.time == "scan" and self.start().bev is not None
+
+    @property
+    def unrolled(self) -> LaneGraphTask:
+        """The same task with a program that holds every frame of a clip."""
+        return replace(self, time="unrolled")
 
     @property
     def frozen(self) -> tuple[str, ...]:
@@ -203,6 +208,9 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
         source, world = data.source("train"), getattr(data, "world", None)
         images = source.example.cameras is not None or getattr(source, "image", None) is not None
         check_settings_fit(self.model, source.example, images=images)
+        if self.time == "scan" and not self.loops:
+            clips = "'unrolled', without clips (task.clip above 1) of a host that carries BEV features between frames"
+            raise SettingError("task.time", self.time, clips)
         if world is not None and world.keyframes % self.clip:
             raise SettingError("data.world.keyframes", world.keyframes, f"a multiple of task.clip ({self.clip})")
 

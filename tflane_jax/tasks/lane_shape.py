@@ -135,7 +135,8 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     ) -> Evaluation:
         """Return TuSimple's metrics, and the loss of the last decoder layer as validation loss; without groups."""
         metrics, losses = TuSimpleMetrics(), []
-        for indices, batch, answer in predicted_batches(self, params, data.images, config.batch_size):
+        predicted = predicted_batches(self, params, data.images, config.batch_size, lambda b: b.replace(image=None))
+        for indices, batch, answer in predicted:
             lines = jax.tree.map(lambda leaf, i=indices: leaf[: len(i)], batch.lines)
             losses += [float(_loss(self, answer.curves, lines))] * len(indices)
             for row, index in enumerate(indices):

@@ -68,10 +68,13 @@ def origin_folders(reference: str, seeds: Sequence[int]) -> list[Path]:
 
 def _starting_checkpoint(folder: Path) -> tuple[Checkpoints, int, list[int]]:
     """Return the checkpoints of a run, the step to start from, and the run's seeds."""
-    settings = migrate(read_config(folder))[0]["training"]
-    checkpoints = Checkpoints(folder / "checkpoints", best_metric=settings["best_metric"])
+    settings = migrate(read_config(folder))[0].get("training")
+    metric, seeds = (settings.get(name) if isinstance(settings, dict) else None for name in ("best_metric", "seeds"))
+    if not isinstance(metric, str) or not isinstance(seeds, list) or not seeds:
+        raise UserError(f"{folder / 'config.json'} is damaged: it lacks training.best_metric or training.seeds")
+    checkpoints = Checkpoints(folder / "checkpoints", best_metric=metric)
     step = checkpoints.best_step()
-    return checkpoints, checkpoints.find("last") if step is None else step, settings["seeds"]
+    return checkpoints, checkpoints.find("last") if step is None else step, seeds
 
 
 def _params_of_run(folder: Path, fresh: Params, *, partly: bool, frozen: Sequence[str]) -> Params:

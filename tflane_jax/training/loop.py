@@ -22,9 +22,9 @@ from tflane_jax.datasets.batches import Prepare, batches, first_example
 from tflane_jax.devices import divided, of_one_process, share, training_mesh
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
-from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, check_settings
+from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.parameters import Params
-from tflane_jax.processes import apart, arrays_from_first, count, from_first, is_first, stop_signal
+from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, count, from_first, is_first, stop_signal
 from tflane_jax.startup import ready, showing, stage, write
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
@@ -83,6 +83,10 @@ class TrainingConfig:
     best_metric: str = "all/DET_l"
     init_from: str | None = None
     init_partly: bool = False
+
+    def limits(self) -> Rules:
+        """Parts of a batch are equal."""
+        yield splits("accumulate", self.accumulate, "batch_size", self.batch_size)
 
 
 @dataclass(frozen=True)
@@ -216,7 +220,7 @@ def train(
         order, divide = range(first, config.steps), partial(divided, mesh=mesh)
         feed = batches(arrays, config.seeds, order, config.batch_size, prepare, share=share(mesh), place=divide)
         stack.enter_context(contextlib.closing(feed))
-        with stage("reading the first batch"):
+        with agreed(), stage("reading the first batch"):
             batch = next(feed, None)
         update: Any = None
         if batch is not None:  # a run that is complete has no next batch
@@ -248,7 +252,7 @@ def train(
                 states, values = update_all(update, states, batch)
                 if not values["finite"].all():
                     save({})
-                    raise UserError(_not_finite(values, step, config.seeds, checkpoints.path(step)))
+                    raise AgreedError(_not_finite(values, step, config.seeds, checkpoints.path(step)))
                 step += 1
                 window.add({name: value for name, value in values.items() if name != "finite"})
                 batch = next(feed, None)

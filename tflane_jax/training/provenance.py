@@ -29,16 +29,16 @@ _THREAD_VARIABLES = ("XLA_FLAGS", "OMP_NUM_THREADS", "NPROC", "PJRT_NPROC")
 _CPU = "cpu:"
 
 
-def thread_setting(cores: int | None = None) -> dict[str, Any]:
+def thread_setting(cores: int | None = None, devices: int | None = None) -> dict[str, Any]:
     """Return what decides how numbers are rounded: cores, environment variables that are set, an accelerator if any.
 
     Args:
-        cores: number of cores to report instead, for a process that is going to be started on as many.
+        cores, devices: numbers to report instead, for a process that is going to be started on as many.
     """
     if cores is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     setting = {"cores": cores} | {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ}
-    device = _device()
+    device = _device(devices)
     return setting if device.startswith(_CPU) else setting | {"device": device}
 
 
@@ -95,10 +95,10 @@ def read_provenance(folder: Path) -> list[dict[str, Any]]:
     return [start for start in starts if isinstance(start, dict) and isinstance(start.get("threads", {}), dict)]
 
 
-def _device() -> str:
-    """Return platform, kind and number of the devices."""
+def _device(count: int | None = None) -> str:
+    """Return platform, kind and number of the devices, or another number."""
     device = jax.devices()[0]
-    return f"{device.platform}: {device.device_kind} x {jax.device_count()}"
+    return f"{device.platform}: {device.device_kind} x {count or jax.device_count()}"
 
 
 def listed_setting(setting: Mapping[str, Any]) -> str:

@@ -78,7 +78,7 @@ def claimed(folder: Path, start: Start) -> Iterator[None]:
     with lock:
         _lock(lock.fileno(), folder)
         if start == "overwrite":
-            for name in _CONTENT:
+            for name in reversed(_CONTENT):  # config.json last: until then the folder holds a run to overwrite
                 _delete(folder / name)
         yield
 
@@ -94,6 +94,11 @@ def check_start(folder: Path, start: Start) -> None:
         )
     if start == "resume" and not holds_run:
         raise UserError(f"{folder} holds no run to resume: leave --resume out to start one")
+    if start == "overwrite" and (links := [folder / name for name in _CONTENT if (folder / name).is_symlink()]):
+        raise UserError(
+            f"{links[0]} is a link, and what it points to is not deleted: remove the link, or choose another folder "
+            "with --out"
+        )
     try:
         found = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
     except OSError as error:
@@ -130,7 +135,13 @@ def is_locked(folder: Path) -> bool:
 
 
 def _delete(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    elif path.name != "run.lock":
-        path.unlink(missing_ok=True)
+    try:
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != "run.lock":
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"cannot delete {error.filename or path}: {error.strerror or error}; the run in {path.parent} cannot be "
+            "replaced: delete it, or choose another folder with --out"
+        ) from error

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
+import inspect
 import sys
+import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from tflane_jax.datasets.cache import cache_root
+from tflane_jax.startup import write
 
 # Parameters of glibc's mallopt: sizes from which memory is given back and mapped apart, and the number of heaps.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 _KEPT = 2**30
 
+_UNREADABLE = "Error reading persistent compilation cache entry"  # the beginning of a warning of JAX's
 _PROGRAMS = 2 * 2**30  # bytes of kept programs
 
 
@@ -31,6 +37,9 @@ def configure_jax(*, keep_programs: bool = True) -> None:
     gc.set_threshold(100_000, 50, 100)
     if keep_programs and jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         _keep_programs(cache_root() / "programs")
+    if keep_programs and warnings.showwarning is not _show_or_replace:
+        global _show
+        _show, warnings.showwarning = warnings.showwarning, _show_or_replace
 
 
 def _keep_programs(folder: Path) -> None:
@@ -47,6 +56,31 @@ def _keep_programs(folder: Path) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+_show = warnings.showwarning
+
+
+def _show_or_replace(message: Warning | str, *arguments: Any, **named: Any) -> None:
+    """Show a warning; delete the kept program that it is about, if JAX cannot read it.
+
+    A process that was killed, or a disk that was full, leaves half a program. JAX then compiles, but writes no file
+    where there is one, so that every later start would compile too.
+    """
+    if not str(message).startswith(_UNREADABLE):
+        _show(message, *arguments, **named)
+        return
+    frame = inspect.currentframe()
+    while frame is not None and "cache_key" not in frame.f_locals:  # JAX's function that reads
+        frame = frame.f_back
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if frame is None or folder is None:
+        _show(message, *arguments, **named)
+        return
+    for file in Path(folder).glob(f"{frame.f_locals['cache_key']}*"):
+        with contextlib.suppress(OSError):
+            file.unlink()
+            write(f"{file} was damaged: the program is compiled and kept anew")
 
 
 def _keep_freed_memory() -> None:

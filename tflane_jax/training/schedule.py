@@ -68,7 +68,8 @@ class OptimConfig:
         lr_scaling: how `lr` changes with the batch size B of the run (of all devices, see `scaled_to_batch`): "none";
             "linear", times B / reference_batch (Goyal et al. 2017, for SGD); "sqrt", times the square root of it, often
             used with Adam.
-        reference_batch: examples of an update that `lr` was chosen for; 8 is TopoNet's.
+        reference_batch: examples of an update that `lr` was chosen for. None, where `lr_scaling` is set by an override
+            (`--optim.lr_scaling`) or in a configuration file: those that the file has as `training.batch_size`.
         lr_factors: (pattern, factor) pairs. The parameters of a module whose path matches the pattern, for example
             `encoder/images/backbone`, learn at `factor` times the rate, their weight decay included; `*` stands for any
             text, the first pattern that matches decides, and 0 keeps parameters as they are. Every pattern must match.
@@ -92,7 +93,7 @@ class OptimConfig:
 
     lr: PositiveOrZero = 2e-4
     lr_scaling: Literal["none", "linear", "sqrt"] = "none"
-    reference_batch: Count = 8
+    reference_batch: Count | None = None
     lr_factors: Factors = ()
     warmup_steps: CountOrZero = 500
     warmup_ratio: Fraction = 1 / 3
@@ -111,7 +112,9 @@ class OptimConfig:
     drops: DropsConfig | None = None
 
     def limits(self) -> Rules:
-        """One rule lowers the learning rate."""
+        """One rule lowers the learning rate, and what it is scaled by is known."""
+        known = self.lr_scaling == "none" or self.reference_batch is not None
+        yield "reference_batch", known, f"the batch size that optim.lr is for, with lr_scaling {self.lr_scaling!r}"
         alone = not self.epoch_steps or self.restarts is None
         yield "epoch_steps", alone, "0 with restarts: optim.epoch_steps and optim.restarts exclude each other"
         for name, value in (("restarts", self.restarts), ("epoch_steps", self.epoch_steps)):
@@ -126,7 +129,7 @@ Rate = Callable[[Any, Int[ArrayLike, ""]], Float[Array, ""]]
 def scaled_to_batch(config: OptimConfig, batch_size: int) -> OptimConfig:
     """Return the settings with the learning rate of a batch of `batch_size` examples, and `lr_scaling` "none"."""
     check_settings(config, "optim.")
-    if config.lr_scaling == "none":
+    if config.lr_scaling == "none" or config.reference_batch is None:
         return config
     ratio = batch_size / config.reference_batch
     factor = ratio if config.lr_scaling == "linear" else math.sqrt(ratio)

@@ -60,6 +60,7 @@ class PaperTable:
         hosts: models that rows start from. They are trained first and are no rows.
         minutes: that a run takes on one core, for estimates; the mean over rows in docs/results where it is recorded.
         note: a sentence of the table's text, such as why a column of the paper is missing.
+        steps_factor: how many times as long every run is, see `lengthened`.
     """
 
     name: str
@@ -77,6 +78,19 @@ class PaperTable:
     hosts: tuple[TableRow, ...] = ()
     minutes: float = 6.0
     note: str = ""
+    steps_factor: int = 1
+
+    def lengthened(self, factor: int) -> PaperTable:
+        """Return the table with `factor` times the steps, under another name and with a title that says so."""
+        if factor == 1:
+            return self
+        return replace(
+            self,
+            name=f"{self.name}.steps_x{factor}",
+            title=f"{self.title}, {factor} times the steps",
+            minutes=self.minutes * factor,
+            steps_factor=factor,
+        )
 
     @property
     def declaration(self) -> Declaration:
@@ -97,8 +111,25 @@ class PaperTable:
                 config = replace(config, training=replace(config.training, steps=self.steps))
             if row.settings:
                 config = apply_overrides(config, row.settings)
+            config = longer(config, self.steps_factor)
             found[row.name] = shortened(config) if quick else config
         return found
+
+
+def longer(config: RunConfig, factor: int) -> RunConfig:
+    """Return a configuration with `factor` times the steps.
+
+    Its learning rate falls as much more slowly; the warm-up and the number of evaluations stay.
+    """
+    training, optim = config.training, config.optim
+    training = replace(training, steps=factor * training.steps, eval_every=factor * training.eval_every)
+    drops, restarts = optim.drops, optim.restarts
+    if drops is not None:
+        drops = replace(drops, steps=tuple(factor * step for step in drops.steps))
+    if restarts is not None:
+        restarts = replace(restarts, cycle_steps=factor * restarts.cycle_steps)
+    optim = replace(optim, epoch_steps=factor * optim.epoch_steps, drops=drops, restarts=restarts)
+    return replace(config, training=training, optim=optim)
 
 
 def shortened(config: RunConfig, steps: int = 8) -> RunConfig:

@@ -93,6 +93,13 @@ def tables(commands) -> None:
         help="number of trainings at a time, which share the cores (default 1; with --quick, one for each of 2 cores)",
     )
     parser.add_argument(
+        "--steps-factor",
+        metavar="N",
+        type=int,
+        default=1,
+        help="train every run N times as long, into a folder of its own (TABLE.steps_xN)",
+    )
+    parser.add_argument(
         "--cores",
         metavar="N",
         type=int,

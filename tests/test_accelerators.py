@@ -1,0 +1,116 @@
+"""Which GPUs a process takes: of a cluster's job, and as one of several workers."""
+
+import os
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from tflane_jax import accelerators, processes
+from tflane_jax.ablations.workers import worker_threads
+from tflane_jax.accelerators import devices_of_task, gpus, leave_to_workers, of_worker
+from tflane_jax.training import provenance
+
+EIGHT = "0,1,2,3,4,5,6,7"
+
+
+def slurm(visible=EIGHT, tasks="1(x4)", place=0, host=0, **further):
+    variables = {"SLURM_LOCALID": str(place), "SLURM_NODEID": str(host), "SLURM_STEP_TASKS_PER_NODE": tasks}
+    return variables | ({} if visible is None else {"CUDA_VISIBLE_DEVICES": visible}) | further
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"),
+    [
+        (slurm(), list(range(8))),  # srun --ntasks 4 --gpus-per-task 8, a task on each host
+        (slurm(tasks="2(x2)", place=1, visible="0,1,2,3", SLURM_GPUS_PER_TASK="4"), [0, 1, 2, 3]),
+        (slurm(tasks="2(x2)", place=1, visible="0,1", SLURM_TRES_PER_TASK="cpu:4,gres/gpu:2"), [0, 1]),
+        (slurm(tasks="2(x2)", place=1, host=1), [4, 5, 6, 7]),  # both see all
+        (slurm(tasks="8", place=3), [3]),
+        (slurm(tasks="8(x2),1", place=0, host=2), list(range(8))),
+        (slurm(tasks="8", place=3, visible="5"), [0]),  # bound in another way
+        (slurm(tasks="3", place=1), None),
+        (slurm(visible=None), None),
+        (slurm(visible=""), None),
+        ({"CUDA_VISIBLE_DEVICES": "GPU-a,GPU-b", "OMPI_COMM_WORLD_LOCAL_RANK": "1"}, [0, 1]),
+        (
+            {"CUDA_VISIBLE_DEVICES": "0,1", "OMPI_COMM_WORLD_LOCAL_RANK": "1", "OMPI_COMM_WORLD_LOCAL_SIZE": "2"},
+            [1],
+        ),
+    ],
+)
+def test_a_task_of_a_cluster_takes_the_gpus_that_are_its_own(environment, expected):
+    assert devices_of_task(environment) == expected
+
+
+@pytest.fixture
+def joined(monkeypatch):
+    """Stand in for JAX's joining inside a Slurm job of which every task sees eight GPUs; return what it is told."""
+    for name, value in slurm().items():
+        monkeypatch.setenv(name, value)
+    asked = {}
+
+    def initialize(coordinator, processes, process, local_device_ids, **settings):
+        asked.update(settings, place=(coordinator, processes, process), devices=local_device_ids)
+
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    return asked
+
+
+def test_a_process_that_asks_the_cluster_names_its_gpus(joined, monkeypatch):
+    processes.join(None, None, None)
+    assert joined["devices"] == list(range(8))
+    assert joined["cluster_detection_method"] is None
+    monkeypatch.setenv("JAX_LOCAL_DEVICE_IDS", "5")
+    processes.join(None, None, None)
+    assert joined["devices"] is None  # JAX reads the variable
+
+
+def test_a_process_that_is_given_its_place_ignores_the_cluster(joined):
+    processes.join("host:1", 2, 1)
+    assert joined["place"] == ("host:1", 2, 1)
+    assert (joined["devices"], joined["cluster_detection_method"]) == (None, "deactivate")
+
+
+@pytest.mark.parametrize(
+    ("visible", "parallel", "expected"),
+    [
+        ("", 2, [{}, {}]),
+        ("0,1", 2, [{"CUDA_VISIBLE_DEVICES": "0"}, {"CUDA_VISIBLE_DEVICES": "1"}]),
+        ("GPU-a", 1, [{"CUDA_VISIBLE_DEVICES": "GPU-a"}]),
+        ("3", 2, [{"CUDA_VISIBLE_DEVICES": "3", "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.450"}] * 2),
+        (
+            "6,7",
+            3,
+            [{"CUDA_VISIBLE_DEVICES": name, "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.450"} for name in ("6", "7", "6")],
+        ),
+    ],
+)
+def test_workers_take_gpus_in_turn_and_share_their_memory(visible, parallel, expected, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_MEM_FRACTION", raising=False)
+    assert [of_worker(slot, parallel) for slot in range(parallel)] == expected
+
+
+def test_gpus_are_found_without_a_variable_and_a_chosen_fraction_stays(tmp_path, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(accelerators, "Path", lambda path: tmp_path)
+    assert gpus() == []
+    for name in ("nvidia4", "nvidia6", "nvidiactl"):
+        (tmp_path / name).touch()
+    assert gpus() == ["0", "1"]  # CUDA numbers those that it sees
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.2")
+    assert of_worker(2, 3) == {"CUDA_VISIBLE_DEVICES": "0"}
+
+
+def test_a_process_with_workers_reserves_no_memory(monkeypatch):
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "")
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_PREALLOCATE")
+    leave_to_workers()
+    assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
+
+
+def test_the_setting_of_a_worker_has_one_gpu(monkeypatch):
+    monkeypatch.setattr(provenance.jax, "devices", lambda: [SimpleNamespace(platform="gpu", device_kind="H100")] * 8)
+    monkeypatch.setattr(provenance.jax, "device_count", lambda: 8)
+    assert [worker_threads(parallel)["device"] for parallel in (1, 2)] == ["gpu: H100 x 8", "gpu: H100 x 1"]

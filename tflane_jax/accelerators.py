@@ -1,0 +1,85 @@
+"""Which GPUs a process may use: chosen by environment variables and flags, before JAX looks for its devices.
+
+JAX takes every GPU that it sees, and reserves three quarters of its memory. Under Slurm and Open MPI it takes one for
+each process, however many the job gave it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+_VISIBLE = "CUDA_VISIBLE_DEVICES"
+_FRACTION = "XLA_PYTHON_CLIENT_MEM_FRACTION"
+_SHARED_FRACTION = 0.9
+
+
+def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
+    """Return the GPUs, by their place among the visible ones, that are this process's own in a cluster's job.
+
+    All of them where the process is alone on its host, or where the cluster shows each process its own (`srun
+    --gpus-per-task`). Several processes that see the same GPUs get equal parts, in order.
+
+    Args:
+        environment: variables of the process.
+
+    Returns:
+        None where the variables do not tell; JAX then takes one for each process.
+    """
+    if (visible := environment.get(_VISIBLE)) is None:
+        return None
+    seen = len([name for name in visible.split(",") if name.strip()])
+    tasks, place = _tasks_on_host(environment)
+    bound = any(name in environment for name in ("SLURM_GPUS_PER_TASK", "SLURM_NTASKS_PER_GPU"))
+    bound = bound or "gpu" in environment.get("SLURM_TRES_PER_TASK", "")
+    if tasks == 1 or bound or seen < tasks:
+        return list(range(seen)) or None
+    if seen % tasks:
+        return None
+    each = seen // tasks
+    return list(range(place * each, (place + 1) * each))
+
+
+def _tasks_on_host(environment: Mapping[str, str]) -> tuple[int, int]:
+    """Return how many processes of the job are on this host, and the number of this one among them."""
+    if "SLURM_LOCALID" in environment:
+        counts: list[int] = []
+        written = environment.get("SLURM_STEP_TASKS_PER_NODE", environment.get("SLURM_TASKS_PER_NODE", "1"))
+        for count, repeats in re.findall(r"(\d+)(?:\(x(\d+)\))?", written):  # "2(x3),1": 2, 2, 2 and 1
+            counts += [int(count)] * int(repeats or 1)
+        host = int(environment.get("SLURM_NODEID", 0))
+        return counts[host] if host < len(counts) else 1, int(environment["SLURM_LOCALID"])
+    if "OMPI_COMM_WORLD_LOCAL_RANK" in environment:
+        return int(environment.get("OMPI_COMM_WORLD_LOCAL_SIZE", 1)), int(environment["OMPI_COMM_WORLD_LOCAL_RANK"])
+    return 1, 0
+
+
+def gpus() -> list[str]:
+    """Return the names of the GPUs that this process may use, as `CUDA_VISIBLE_DEVICES` takes them; [] for none.
+
+    JAX is not asked, because it would reserve their memory.
+    """
+    if (visible := os.environ.get(_VISIBLE)) is not None:
+        return [name.strip() for name in visible.split(",") if name.strip()]
+    return [str(place) for place, _ in enumerate(Path("/dev").glob("nvidia[0-9]*"))]
+
+
+def of_worker(slot: int, parallel: int) -> dict[str, str]:
+    """Return environment variables that give one GPU to one of `parallel` processes that train side by side.
+
+    Processes that share a GPU divide its memory. Without GPUs there are none. The process sets them before JAX looks
+    for its devices.
+    """
+    if not (names := gpus()):
+        return {}
+    found = {_VISIBLE: names[slot % len(names)]}
+    if (sharing := -(-parallel // len(names))) > 1 and _FRACTION not in os.environ:
+        found[_FRACTION] = f"{_SHARED_FRACTION / sharing:.3f}"
+    return found
+
+
+def leave_to_workers() -> None:
+    """Let this process, and those that it starts to train, reserve no memory of GPUs in advance."""
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

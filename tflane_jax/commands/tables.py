@@ -23,6 +23,12 @@ def run(options: argparse.Namespace) -> int:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         return 0
     configure_jax()
+    if options.search:
+        from tflane_jax.ablations.rate_search import search_rates
+
+        for table in chosen:
+            search_rates(table, options.out, jobs=jobs, quick=options.quick)
+        return 0
     from tflane_jax.ablations.table_run import plan_table, run_table
 
     seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}

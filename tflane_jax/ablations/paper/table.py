@@ -41,6 +41,23 @@ class Quoted:
 
 
 @dataclass(frozen=True)
+class RateSearch:
+    """A search for learning rates that precedes a table, see `ablations.rate_search`.
+
+    Attributes:
+        rows: names of the rows that are searched.
+        rates: that are tried for each of them.
+        score: on validation data, at the last step; the highest one wins.
+        seed: of the trainings, none of the table's.
+    """
+
+    rows: tuple[str, ...]
+    rates: tuple[float, ...]
+    score: str
+    seed: int = 1000
+
+
+@dataclass(frozen=True)
 class PaperTable:
     """A table of a paper.
 
@@ -59,6 +76,7 @@ class PaperTable:
         hosts: models that rows start from. They are trained first and are no rows.
         minutes: what a run takes on one core of the machine of docs/benchmarks.md, for estimates.
         note: a sentence of the table's text, such as why a column of the paper is missing.
+        search: by which the learning rates of the rows were chosen; None where they were not searched for.
     """
 
     name: str
@@ -75,6 +93,7 @@ class PaperTable:
     hosts: tuple[TableRow, ...] = ()
     minutes: float = 6.0
     note: str = ""
+    search: RateSearch | None = None
 
     @property
     def declaration(self) -> Declaration:

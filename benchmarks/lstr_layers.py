@@ -168,6 +168,7 @@ def run(out: Path, seconds: float = 2.0, batch: int = TRAINING_BATCH, layers: Se
     results: dict[str, dict[str, dict[str, Any]]] = {}
     for layer in layers:
         name = f"{layer.count} x {layer.name}" if layer.count > 1 else layer.name
+        print(name, flush=True)
         results[name] = {part: measure(ways, seconds) for part, ways in programs(layer, batch).items()}
     text = table(results)
     print(text)

@@ -23,6 +23,7 @@ from jax import lax
 
 from benchmarks.lstr import TRAINING_BATCH, with_torch
 from benchmarks.timing import Compiled, compile_jax, machine, markdown_table, measure, save
+from benchmarks.torch_fitting import import_torch
 
 XLA, FIRST, PRODUCTS, IM2COL, TORCH = "XLA", "channels first", "a product for each position", "im2col", "PyTorch"
 PARTS = ("forward", "kernel gradient", "input gradient")
@@ -138,8 +139,7 @@ def programs(layer: Layer, batch: int) -> dict[str, dict[str, Compiled]]:
 
 def torch_programs(layer: Layer, x: Any, kernel: Any, gradient: Any) -> dict[str, Compiled]:
     """Return PyTorch's programs with channels last in memory."""
-    import torch
-
+    torch = import_torch()
     last = torch.channels_last
     x, kernel, gradient = (torch.from_numpy(a).contiguous(memory_format=last) for a in (x, kernel, gradient))
     options = {"stride": layer.stride, "padding": layer.k // 2}

@@ -15,6 +15,7 @@ between them.
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.training.adaptive import AdaptiveConfig
@@ -44,8 +45,9 @@ def ablations() -> dict[str, RunConfig]:
 def longer(file: str) -> RunConfig:
     """Return a configuration of this folder with more, and faster, steps."""
     config = load_config(str(FOLDER / file))
-    backbone = dataclasses.replace(config.task.model.backbone, blocks=(1, 2, 2, 1), channels=(16, 32, 64, 64))
-    model = dataclasses.replace(config.task.model, backbone=backbone)
+    network: Any = config.task.model
+    backbone = dataclasses.replace(network.backbone, blocks=(1, 2, 2, 1), channels=(16, 32, 64, 64))
+    model = dataclasses.replace(network, backbone=backbone)
     # Often enough for the adaptive rule to judge the first cycle.
     training = dataclasses.replace(config.training, steps=STEPS, eval_every=500)
     return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model), training=training)

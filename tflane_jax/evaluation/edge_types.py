@@ -79,4 +79,5 @@ def _layers(model: LstrConfig, params: Params, images: Any, valid: Any) -> list[
         layers = seen["intermediates"]["encoder"]
         return [layers[f"layer_{i}"]["graph"]["relations"][0] for i in range(model.encoder.layers)]
 
-    return jax.vmap(one)(images, valid)
+    by_image: Any = jax.vmap(one)
+    return by_image(images, valid)

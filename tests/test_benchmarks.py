@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import collectives, loading, marker_occlusion, marker_scenes, metrics, paper_sizes
+from benchmarks import collectives, loading, lstr_layers, marker_occlusion, marker_scenes, metrics, paper_sizes
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 from tests.models.cases import CAMERA_TOPONET, make_camera_example
@@ -59,6 +59,15 @@ def test_compiled_program_sees_its_arguments():
     entry = compile_jax(lambda x, y: x @ y, np.eye(3, dtype=np.float32), np.full((3, 3), 2.0, np.float32))
     np.testing.assert_array_equal(entry.program(), np.full((3, 3), 2.0))
     assert entry.seconds > 0
+
+
+@pytest.mark.parametrize(("stride", "k"), [(2, 3), (1, 4)])
+def test_every_way_to_compute_a_convolution_gives_the_same_numbers(stride, k):
+    """The benchmark compares them before it times them."""
+    ways = lstr_layers.programs(lstr_layers.Layer("small", 6, 5, 3, 4, stride, k), 2)
+    assert set(ways) == set(lstr_layers.PARTS)
+    assert {lstr_layers.XLA, lstr_layers.FIRST} <= set(ways["forward"])
+    assert (lstr_layers.IM2COL in ways["kernel gradient"]) == (k == 3)
 
 
 def test_frames_of_the_metrics_hold_hits_and_misses(tmp_path):

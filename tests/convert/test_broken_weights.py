@@ -186,16 +186,16 @@ def test_an_auxiliary_head_is_not_missed(path):
     ],
 )
 def test_encoders_without_a_place_for_the_weights_are_named(encoder, message, path):
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(UserError, match=rf"w.npz: .*{message}"):
         load_lstr(write(path, lstr_state()), replace(TINY, encoder=encoder))
 
 
 def test_edge_weights_are_checked(path):
     write(path, lstr_state())
     for weight in (0.0, -1.0, 1.5, float("nan")):
-        with pytest.raises(UserError, match="must be above 0 and at most 1"):
+        with pytest.raises(UserError, match=r"w.npz: .*must be above 0 and at most 1"):
             load_lstr(path, replace(TINY, encoder=GTN), edge_weight=weight)
-    with pytest.raises(UserError, match="selects no edge types"):
+    with pytest.raises(UserError, match=r"w.npz: .*selects no edge types"):
         load_weights(path, LaneShapeTask(TINY), edge_weight=0.5)
     with pytest.raises(UserError, match=r"w.npz: an edge weight is of GTN encoders"):
         load_weights(path, LaneGraphTask(TopoNetConfig()), edge_weight=0.5)

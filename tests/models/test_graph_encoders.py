@@ -13,11 +13,13 @@ from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph_transformer import GTN_2022, meta_path_graphs
+from tflane_jax.layers.image_graph import SIDES
 from tflane_jax.layers.masks import key_mask
 from tflane_jax.models.graph_encoders import (
     GcnEncoderConfig,
     GtnEncoderConfig,
     HanEncoderConfig,
+    HeterogeneousAttention,
     MetaPathConvolution,
 )
 
@@ -30,6 +32,7 @@ CONFIGS = {
     "gtn similarity alone": dataclasses.replace(GTN, similarity="every_hop", relations=()),
     "gcn": GcnEncoderConfig(hidden=16),
     "han": HanEncoderConfig(hidden=16, semantic=8),
+    "han meta-paths": HanEncoderConfig(1, hidden=16, semantic=8, relations=("near", "near+row", "row+column")),
 }
 PARAMETERS = {"gtn": 23_360, "gcn": 19_072, "han": 22_016}
 
@@ -123,6 +126,63 @@ def test_a_gtn_that_selects_similarity_is_the_transformers_attention(heads):
     asking, mask = (x + position).reshape(-1, DIM), key_mask(valid.reshape(-1))
     expected = attention.apply({"params": shared}, asking, asking, x.reshape(-1, DIM), mask).reshape(x.shape)
     np.testing.assert_allclose(out[valid], expected[valid], rtol=1e-4, atol=1e-5)
+
+
+def dense_edge(edge, weights, heads):
+    """One edge's attention weights as matrices (heads, n, n), destinations as rows."""
+    height, width = SHAPE
+    cells = list(np.ndindex(SHAPE))
+    dense = np.zeros((heads, height * width, height * width))
+    for i, (row, column) in enumerate(cells):
+        if edge == "near":
+            for weight, (down, right) in zip(weights[:, row, column], [(0, 0), *SIDES.values()], strict=True):
+                if 0 <= row + down < height and 0 <= column + right < width:
+                    dense[:, i, (row + down) * width + column + right] = weight
+            continue
+        for j, (other_row, other_column) in enumerate(cells):
+            if edge == "row" and row == other_row:
+                dense[:, i, j] = weights[row, column, other_column]
+            if edge == "column" and column == other_column:
+                dense[:, i, j] = weights[column, row, other_row]
+    return dense
+
+
+@pytest.mark.parametrize("scores", ["learned", "zero"])
+def test_a_composed_meta_path_is_the_product_of_its_edges(scores):
+    """Of attention matrices, with rows that sum to 1; with scores of zero, of the relations' D^-1 A."""
+    relations = ("near+row", "column+near", "row+column")
+    config = HanEncoderConfig(1, relations=relations, semantic=4)
+    x, position, valid = scene()
+    x, position = jnp.where(valid[..., None], x, 0.0), jnp.where(valid[..., None], position, 0.0)
+    module = HeterogeneousAttention(config)
+    params = random_params(module.init, x, position, valid)["params"]
+    if scores == "zero":
+        params["scores"] = jax.tree.map(jnp.zeros_like, params["scores"])
+    out, state = jax.jit(partial(module.apply, mutable="intermediates"))({"params": params}, x, position, valid)
+    value = np.asarray(x @ params["value"]["kernel"] + params["value"]["bias"][None, None]).reshape(-1, 2, DIM // 2)
+    shown, (shares,) = np.asarray(valid).reshape(-1), state["intermediates"]["relations"]
+    expected = 0.0
+    for share, relation in zip(np.asarray(shares)[0, 0], relations, strict=True):
+        path = relation.split("+")
+        weights = [np.asarray(edge) for edge in state["intermediates"][f"{relation}_probabilities"]]
+        dense = [dense_edge(edge, weight, 2) for edge, weight in zip(path, weights, strict=True)]
+        if scores == "zero":
+            first, second = (given_edge(edge, np.asarray(valid)) for edge in path)
+            dense = [np.stack([graph] * 2) for graph in (first, second)]
+        product = dense[1] @ (dense[0] * shown[None, :, None])
+        np.testing.assert_allclose(product.sum(-1)[:, shown], 1.0, rtol=1e-5)
+        heard = np.einsum("hnm,mhd->nhd", product, value).reshape(-1, DIM)
+        expected = expected + share * np.asarray(jax.nn.elu(heard))
+    np.testing.assert_allclose(np.asarray(out).reshape(-1, DIM)[shown], expected[shown], rtol=1e-4, atol=1e-5)
+
+
+def given_edge(edge, valid):
+    """D^-1 A of one edge type (n, n), by the definition of the neighbourhood."""
+    cells = np.argwhere(np.ones_like(valid))
+    down, right = np.moveaxis(cells[:, None] - cells, -1, 0)
+    linked = {"near": (abs(down) < 2) & (abs(right) < 2), "row": down == 0, "column": right == 0}[edge]
+    linked = linked * valid.reshape(1, -1)
+    return linked / np.maximum(linked.sum(1, keepdims=True), 1)
 
 
 @every_config

@@ -100,9 +100,19 @@ def test_lanes_without_paint_are_a_warning(network):
     bare = np.repeat(np.tile(np.linspace(60, 200, 1600).astype(np.uint8), (900, 1))[..., None], 3, -1)
     found = reader().read(bare)
     assert found.lanes == ()
-    assert found.warning.startswith("no lanes: what was found in any part of the photo")
+    assert found.warning.startswith("no lanes: no part of the photo shows any that meet")
     assert "--horizon" in found.warning
     assert reader().find_view([bare]) is None
+
+
+def test_photos_in_which_the_network_sees_nothing_are_a_warning(network):
+    """As are frames of a video, in their one view; with a known camera no lane is an answer."""
+    network["scores"] = 0.1
+    for found in (reader().read(photo()), reader().read_view(photo(), TRUE)):
+        assert found.lanes == ()
+        assert found.warning.startswith("no lanes: no part of the photo shows any")
+    known = reader().read(photo(), PhotoCamera(horizon=449))
+    assert (known.lanes, known.warning) == ((), "")
 
 
 def test_the_threshold_chooses_the_lanes(network):

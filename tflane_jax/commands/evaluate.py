@@ -10,11 +10,18 @@ from typing import Any
 from tflane_jax.commands.sources import chosen_source, limited_task, opened, with_chosen_topology, with_chosen_traffic
 from tflane_jax.config_io import to_json
 from tflane_jax.datasets.overlap import Nearness
-from tflane_jax.datasets.sources import source_name
+from tflane_jax.datasets.sources import open_dataset, source_name
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import Run, evaluate_run, training_nearness
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.base import Model, spread
+from tflane_jax.tasks.edge_types import save_edge_types
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
+
+_IMAGES = 8  # over which a HAN's weights are averaged
 
 
 def run(options: argparse.Namespace) -> int:
@@ -51,9 +58,21 @@ def run(options: argparse.Namespace) -> int:
         "near_training": None if near is None else near.sentence(),
     }
     folder = Path("runs" if options.config else trained.name) / "evaluations"
-    paths = save_table(options.out or folder / name, rows, meta, title=title)
-    print(f"\nwritten to {paths[0]} and {paths[1]}")
+    stem = options.out or folder / name
+    paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
+    print(f"\nwritten to {', '.join(map(str, paths[:-1]))} and {paths[-1]}")
     return 0
+
+
+def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:
+    """Write which edge types the graph encoder of each seed uses, for models that have one."""
+    task = run.config.task
+    if not isinstance(task, LaneShapeTask) or not weights_edge_types(task.model):
+        return []
+    dataset, seeds = open_dataset(source), run.config.training.seeds
+    examples = stack_examples([dataset.example(index) for index in spread(len(dataset), _IMAGES)])
+    models = {f"seed {seed}": Model(task, params) for seed, params in zip(seeds, run.params, strict=True)}
+    return save_edge_types(models, examples, stem.with_name(f"{stem.name}-edge_types"))
 
 
 def _nearness(run: Run, source: Any, root: Path | None) -> Nearness | None:

@@ -1,18 +1,22 @@
 """`tflane predict` for lane lines in photos and videos of any size and camera.
 
 predictions.json, and one picture or video (MP4) for each input:
-    {"model", "step", "threshold",
+    {"model", "step", "threshold", "complete",
      "photos": [{"file", "width", "height", "picture", "view", "value", "warning", "lanes": LANES}, ...],
-     "videos": [{"file", "width", "height", "rate", "video", "view", "warning", "frames": [LANES, ...]}, ...]}
+     "videos": [{"file", "width", "height", "rate", "video", "view", "warning", "frames": [LANES, ...]}, ...],
+     "faults": [{"file", "error"}, ...]}
     LANES is [{"score", "paint", "points": [[column, row], ...]}, ...]: pixels, from the upper end of a lane to the
     lower end; lanes are in order from left to right. `paint` is the fraction of the lane that lies on paint, `view` the
-    part of the photo that the network saw ({"left", "top", "width", "height"}), `value` its plausibility.
+    part of the photo that the network saw ({"left", "top", "width", "height"}), `value` its plausibility. `faults` are
+    files that could not be read or that the camera does not fit; `complete` is false until all others are done.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +25,9 @@ from tqdm import tqdm
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo
+from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
-from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, read_image
+from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
 from tflane_jax.plots.images import lanes_drawn, save_photo
 from tflane_jax.runs import Run
@@ -30,10 +35,16 @@ from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
 
 # Frames of a video in which its view is searched, and points of a lane in its record.
 _SEARCHED_FRAMES, _VIDEO_POINTS = 4, 20
+# Seconds between two states of predictions.json: a run of hours that is killed keeps almost all of its answers.
+_SAVED_EVERY = 10.0
 
 
 def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
-    """Predict the lane lines in photos and videos; write a picture or video of each, and the points of all."""
+    """Predict the lane lines in photos and videos; write a picture or video of each, and the points of all.
+
+    A file that cannot be read is recorded and told, the others are predicted, and the result is 2.
+    """
+    opencv()  # without it every file would be a fault
     inputs = list_photos(paths, (*PHOTO_SUFFIXES, *VIDEO_SUFFIXES))
     videos = [path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES]
     photos = [path for path in inputs if path not in videos]
@@ -41,19 +52,53 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
     reader = PhotoReader(trained.config.task, trained.params[0], options.threshold)
     make_folder(options.out)
     names = dict(zip(inputs, _names(inputs), strict=True))
-    bar = tqdm(photos, desc="predict", unit="photo", disable=not photos)
-    records = [_photo(reader, path, options.out / names[path], camera) for path in bar]
-    clips = [_video(reader, path, options.out / names[path], camera) for path in videos]
     head = {"model": trained.name, "step": trained.step, "threshold": options.threshold}
-    write_json(options.out / "predictions.json", head | {"photos": records, "videos": clips})
+    report = _Report(options.out / "predictions.json", head)
+    try:
+        for path in tqdm(photos, desc="predict", unit="photo", disable=not photos):
+            report.add("photos", path, lambda path=path: _photo(reader, path, options.out / names[path], camera))
+        for path in videos:
+            report.add("videos", path, lambda path=path: _video(reader, path, options.out / names[path], camera))
+        report.content["complete"] = True
+    finally:
+        report.save()
+    records, clips, faults = (report.content[kind] for kind in ("photos", "videos", "faults"))
     for record in (*records, *clips):
         if record["warning"]:
             print(f"tflane: {record['file']}: {record['warning']}", file=sys.stderr)
     lanes = sum(len(record["lanes"]) for record in records)
-    found = [f"{lanes} lane lines in {len(photos)} photos"] * bool(photos)
+    found = [f"{lanes} lane lines in {len(records)} photos"] * bool(records)
     found += [f"{sum(map(len, clip['frames']))} in {len(clip['frames'])} frames of {clip['file']}" for clip in clips]
-    print(f"{'; '.join(found)}; pictures and predictions.json written to {options.out}")
-    return 0
+    if found:
+        print(f"{'; '.join(found)}; pictures and predictions.json written to {options.out}")
+    for fault in faults:
+        file = "" if fault["file"] in fault["error"] else f"{fault['file']}: "
+        print(f"tflane: {file}{fault['error']}", file=sys.stderr)
+    if faults:
+        print(f"tflane: {len(faults)} of {len(inputs)} files have no answer, see above", file=sys.stderr)
+    return 2 if faults else 0
+
+
+class _Report:
+    """The content of predictions.json, written now and then, so that a run that is stopped keeps its answers."""
+
+    def __init__(self, path: Path, head: dict[str, Any]) -> None:
+        self.content: dict[str, Any] = head | {"complete": False, "photos": [], "videos": [], "faults": []}
+        self._path, self._saved = path, time.monotonic()
+
+    def add(self, kind: str, path: Path, read: Callable[[], dict[str, Any]]) -> None:
+        """Append what `read` returns, or the fault of its UserError."""
+        try:
+            self.content[kind].append(read())
+        except UserError as error:
+            self.content["faults"].append({"file": str(path), "error": str(error)})
+        if time.monotonic() - self._saved > _SAVED_EVERY:
+            self.save()
+
+    def save(self) -> None:
+        """Write the file."""
+        write_json(self._path, self.content)
+        self._saved = time.monotonic()
 
 
 def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:

@@ -32,6 +32,12 @@ def run(options: argparse.Namespace) -> int:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         return 0
     configure_jax()
+    if options.search:
+        from tflane_jax.ablations.rate_search import search_rates
+
+        for table in chosen:
+            search_rates(table, options.out, jobs=jobs, quick=options.quick)
+        return 0
     from tflane_jax.ablations.reuse import find_archive
     from tflane_jax.ablations.table_plan import plan_table
     from tflane_jax.ablations.table_run import run_table

@@ -116,8 +116,9 @@ def load_lstr(
         UserError: the file cannot be read, its tensors are not exactly those of the model, or the encoder has other
             sizes than LSTR's.
     """
-    check_encoder(model, edge_weight)
     path, published = find_weights(path)
+    with naming(path):
+        check_encoder(model, edge_weight)
     unmapped = UNMAPPED.get(type(model.encoder), "(?!)")
     if missing != "fresh" and unmapped != "(?!)":
         raise UserError(

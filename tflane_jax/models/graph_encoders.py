@@ -114,6 +114,20 @@ class GcnEncoderConfig:
         return NeighbourConvolution(name=name)
 
 
+HanRelation = Literal[
+    "near",
+    "row",
+    "column",
+    "near+near",
+    "near+row",
+    "near+column",
+    "row+near",
+    "row+column",
+    "column+near",
+    "column+row",
+]
+
+
 @dataclass(frozen=True)
 class HanEncoderConfig:
     """Heterogeneous graph attention network (Wang et al. 2019).
@@ -121,7 +135,8 @@ class HanEncoderConfig:
     Attributes:
         layers: encoder layers.
         heads: of node-level attention.
-        relations: edge types: `near` is the cell and its 8 neighbours, `row` and `column` lie along an axis.
+        relations: meta-paths: `near` is the cell and its 8 neighbours, `row` and `column` lie along an axis; `near+row`
+            is composed of two edges, of which the first one acts first.
         semantic: channels of semantic-level attention.
         hidden: hidden channels of the feed-forward network.
         dropout: probability for hidden channels and each residual branch.
@@ -129,7 +144,7 @@ class HanEncoderConfig:
 
     layers: Count = 2
     heads: Count = 2
-    relations: Annotated[tuple[Literal["near", "row", "column"], ...], NOT_EMPTY, DIFFERENT] = ("near", "row", "column")
+    relations: Annotated[tuple[HanRelation, ...], NOT_EMPTY, DIFFERENT] = ("near", "row", "column")
     semantic: Count = 32
     hidden: Count = 128
     dropout: FractionBelowOne = 0.1
@@ -272,7 +287,11 @@ class NeighbourConvolution(nn.Module):
 
 
 class HeterogeneousAttention(nn.Module):
-    """Attention within the neighbourhoods of each edge type, and attention over the edge types."""
+    """Attention within the neighbourhoods of each meta-path, and attention over the meta-paths.
+
+    A composed meta-path is the product of its edges' attention matrices, as the GTN composes: its rows sum to 1, and
+    no product is formed. HAN's one softmax over all nodes that a path reaches is the same for a single edge.
+    """
 
     config: HanEncoderConfig
 
@@ -286,19 +305,23 @@ class HeterogeneousAttention(nn.Module):
         transform = nn.Dense(dim, name="value")
         value = full(transform(x)).reshape(height, width, config.heads, dim // config.heads)
         placed = (x + position).reshape(height * width, dim)
-        # a^T [W h_i || W h_j] of every edge type and head in one product (Eq. 2-3).
-        halves = nn.Dense(2 * len(config.relations) * config.heads, use_bias=False, name="scores")(placed)
-        halves = full(halves).reshape(height, width, len(config.relations), 2, config.heads)
+        paths = [relation.split("+") for relation in config.relations]
+        edges = sum(map(len, paths))
+        # a^T [W h_i || W h_j] of every edge and head in one product (Eq. 2-3).
+        halves = nn.Dense(2 * edges * config.heads, use_bias=False, name="scores")(placed)
+        scores = iter(jnp.moveaxis(full(halves).reshape(height, width, edges, 2, config.heads), (2, 3), (0, 1)))
         by_type = []
-        for i, relation in enumerate(config.relations):
-            destination, source = halves[:, :, i, 0], halves[:, :, i, 1]
-            if relation == "near":
-                out, weights = attend_near(destination, source, value, valid)
-            else:
-                out, weights = attend_along(AXES[relation], destination, source, value, valid)
+        for relation, path in zip(config.relations, paths, strict=True):
+            out = value
+            for edge in path:
+                destination, source = next(scores)
+                if edge == "near":
+                    out, weights = attend_near(destination, source, out, valid)
+                else:
+                    out, weights = attend_along(AXES[edge], destination, source, out, valid)
+                if self.is_mutable_collection("intermediates"):
+                    self.sow("intermediates", f"{relation}_probabilities", weights)
             by_type.append(nn.elu(out.reshape(height, width, dim)))  # Eq. (4)
-            if self.is_mutable_collection("intermediates"):
-                self.sow("intermediates", f"{relation}_probabilities", weights)
         # beta = softmax of mean_i q^T tanh(W z_i + b) (Eq. 7-9), over valid cells.
         summary, question = nn.Dense(config.semantic, name="semantic"), nn.Dense(1, use_bias=False, name="question")
         count = jnp.maximum(valid.sum(), 1).astype(x.dtype)

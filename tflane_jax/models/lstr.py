@@ -238,6 +238,8 @@ def shrink(
 ) -> tuple[Float[Array, "hs ws 3"], Bool[Array, "hs ws"]]:
     """Return means of blocks of side x side pixels, valid where all pixels are.
 
+    Sums of slices: on a CPU, XLA's own reduction over blocks takes 8 times as long, an eighth of a small step.
+
     Raises ValueError if `side` does not divide the image size.
     """
     if side == 1:
@@ -246,7 +248,9 @@ def shrink(
     if height % side or width % side:
         raise ValueError(f"an image of {height} x {width} does not shrink by blocks of {side} x {side}")
     blocks = (height // side, side, width // side, side)
-    return image.reshape(*blocks, 3).mean((1, 3)), valid.reshape(blocks).all((1, 3))
+    pixels = image.reshape(height // side, side, width // side, side * 3)
+    parts = [pixels[:, i, :, 3 * j : 3 * j + 3] for i in range(side) for j in range(side)]
+    return sum(parts[1:], parts[0]) / side**2, valid.reshape(blocks).all((1, 3))
 
 
 def nearest(mask: Bool[Array, "h w"], rows: int, columns: int) -> Bool[Array, "rows columns"]:

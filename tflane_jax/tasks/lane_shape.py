@@ -37,6 +37,7 @@ from tflane_jax.models.lstr_init import lstr_init
 from tflane_jax.models.parameters import Params, joined_statistics, split_statistics
 from tflane_jax.scene import CurvePrediction, LaneLines, Prediction, RoadImage, shapes_of, stack_examples
 from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
+from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 
 # Image size of TuSimple's metric: rows and columns.
@@ -166,10 +167,11 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
     def draw_comparison(
         self, models: Mapping[str, Model], source: ImageSource, data: LabelledImages, path: Path
     ) -> Path:
-        """Draw a few test images, every model beside the ground truth."""
+        """Draw a few test images, every model beside the ground truth, and the edge types of graph encoders."""
         from tflane_jax.plots.images import save_road_images
 
         examples = chosen_examples(data.images, spread(count(data.images), _COMPARED_EXAMPLES))
+        save_edge_types(models, examples, path.with_name("edge_types"))
         answers = {name: predict_curves(model.task, model.params, examples) for name, model in models.items()}
         return save_road_images(path, examples, answers)
 

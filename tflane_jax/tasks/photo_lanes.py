@@ -8,7 +8,7 @@ and lie on paint (`evaluation.photo_lanes`).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -34,8 +34,8 @@ _SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
 _POINTS = 100
 _EMPTY = "the photo is empty: it has one brightness almost everywhere"
 _NOTHING = (
-    "no lanes: what was found in any part of the photo crosses, does not meet in one point, or lies on no paint. If it "
-    "shows a road, give --horizon (row) and --focal (pixels)"
+    "no lanes: no part of the photo shows any that meet in one point, do not cross, and lie on paint. If it shows a "
+    "road, give --horizon (row) and --focal (pixels)"
 )
 
 
@@ -150,13 +150,10 @@ class PhotoReader:
     def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _Seen, *, known: bool) -> PhotoLanes:
         """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing."""
         judged, (height, width) = seen.judged, photo.shape[:2]
-        nothing = PhotoLanes(seen.view, (), (), (), judged.value, "")
         searched = not known and seen.view != fit_photo(photo).placement
         worth_of_view = judged.rank if searched else judged.value
         if not known and worth_of_view < _LEAST:
-            if not seen.lanes:
-                return nothing
-            return replace(nothing, warning=_NOTHING)
+            return PhotoLanes(seen.view, (), (), (), judged.value, _NOTHING)
         top = seen.view.top + HORIZON * seen.view.height
         if judged.meeting is not None and not judged.crossed and judged.meeting[1] < height:
             top = min(top, judged.meeting[1])

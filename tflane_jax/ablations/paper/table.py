@@ -41,6 +41,23 @@ class Quoted:
 
 
 @dataclass(frozen=True)
+class RateSearch:
+    """A search for learning rates that precedes a table, see `ablations.rate_search`.
+
+    Attributes:
+        rows: names of the rows that are searched.
+        rates: that are tried for each of them.
+        score: on validation data, at the last step; the highest one wins.
+        seed: of the trainings, none of the table's.
+    """
+
+    rows: tuple[str, ...]
+    rates: tuple[float, ...]
+    score: str
+    seed: int = 1000
+
+
+@dataclass(frozen=True)
 class PaperTable:
     """A table of a paper.
 
@@ -61,6 +78,7 @@ class PaperTable:
         minutes: that a run takes on one core, for estimates; the mean over rows in docs/results where it is recorded.
         note: a sentence of the table's text, such as why a column of the paper is missing.
         steps_factor: how many times as long every run is, see `lengthened`.
+        search: by which the learning rates of the rows were chosen; None where they were not searched for.
     """
 
     name: str
@@ -79,6 +97,7 @@ class PaperTable:
     minutes: float = 6.0
     note: str = ""
     steps_factor: int = 1
+    search: RateSearch | None = None
 
     def lengthened(self, factor: int) -> PaperTable:
         """Return the table with `factor` times the steps, under another name and with a title that says so."""

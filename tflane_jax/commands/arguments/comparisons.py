@@ -107,6 +107,11 @@ def tables(commands) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
     parser.add_argument(
+        "--search",
+        action="store_true",
+        help="instead of the table, its declared search for learning rates, on validation data",
+    )
+    parser.add_argument(
         "--record",
         metavar="DIR",
         type=Path,

@@ -1,0 +1,80 @@
+"""`tflane predict` on many photos: one that cannot be read, and a run that is stopped, lose nothing else."""
+
+import json
+from argparse import Namespace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tflane_jax.commands import predict_photos
+from tflane_jax.datasets.photos import fit_photo
+from tflane_jax.tasks.photo_lanes import PhotoLanes
+
+cv2 = pytest.importorskip("cv2")
+
+
+class Reader:
+    """Sees one lane in every photo that the camera fits; the user presses Ctrl-C at a photo 77 pixels wide."""
+
+    def __init__(self, task, params, threshold):
+        del task, params, threshold
+
+    def read(self, photo, camera):
+        lane = np.array([[1.0, 10.0], [2.0, 20.0]])
+        if photo.shape[1] == 77:
+            raise KeyboardInterrupt
+        return PhotoLanes(fit_photo(photo, camera).placement, (lane,), (0.9,), (0.5,), 0.3, "")
+
+
+@pytest.fixture
+def predict(tmp_path, monkeypatch):
+    monkeypatch.setattr(predict_photos, "PhotoReader", Reader)
+    trained = SimpleNamespace(config=SimpleNamespace(task=None), params=[None], name="model", step=3)
+
+    def run(*files, horizon=None):
+        options = Namespace(focal=None, horizon=horizon, threshold=0.5, out=tmp_path / "out")
+        return predict_photos.predict(trained, [tmp_path / file for file in files], options)
+
+    return run
+
+
+def photo(path, size=(40, 60)):
+    cv2.imwrite(str(path), np.zeros((*size, 3), np.uint8))
+
+
+def report(tmp_path):
+    return json.loads((tmp_path / "out" / "predictions.json").read_text())
+
+
+def test_files_that_cannot_be_read_are_recorded_and_the_others_predicted(predict, tmp_path, capsys):
+    for name in ("a.png", "z.png"):
+        photo(tmp_path / name)
+    photo(tmp_path / "low.png", (20, 60))
+    (tmp_path / "bad.jpg").write_bytes(b"no image")
+    (tmp_path / "drive.mp4").write_bytes(b"no video")
+    files = ["a.png", "bad.jpg", "low.png", "z.png", "drive.mp4"]
+    assert predict(*files, horizon=30.0) == 2
+    found = report(tmp_path)
+    assert [record["file"] for record in found["photos"]] == [str(tmp_path / name) for name in ("a.png", "z.png")]
+    faults = {record["file"]: record["error"] for record in found["faults"]}
+    assert list(faults) == [str(tmp_path / name) for name in ("bad.jpg", "low.png", "drive.mp4")]
+    assert "row 30, is below a photo 20 pixels high" in faults[str(tmp_path / "low.png")]
+    assert (found["videos"], found["complete"]) == ([], True)
+    told = capsys.readouterr()
+    assert "2 lane lines in 2 photos" in told.out
+    assert "3 of 5 files have no answer" in told.err
+    for name in ("bad.jpg", "low.png", "drive.mp4"):
+        assert told.err.count(str(tmp_path / name)) == 1
+    assert predict("a.png") == 0
+    assert report(tmp_path)["faults"] == []
+
+
+def test_a_run_that_is_stopped_keeps_its_answers(predict, tmp_path):
+    photo(tmp_path / "a.png")
+    photo(tmp_path / "b.png", (40, 77))
+    with pytest.raises(KeyboardInterrupt):
+        predict("a.png", "b.png")
+    found = report(tmp_path)
+    assert [record["file"] for record in found["photos"]] == [str(tmp_path / "a.png")]
+    assert not found["complete"]

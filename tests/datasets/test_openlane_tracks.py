@@ -14,7 +14,7 @@ from tflane_jax.cli import main
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
-from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
@@ -115,8 +115,13 @@ def test_missing_logs_are_named_and_can_be_dropped_or_left_empty(written, tmp_pa
     shutil.rmtree(gone)
     with pytest.raises(UserError, match=rf"lacks 1 of the logs .*{gone.name}.*2 of 4 frames"):
         opened(frames, fewer)
-    assert len(opened(frames, fewer, without_tracks="drop")) == 2
-    kept = opened(frames, fewer, without_tracks="empty")
+    with pytest.warns(MissingTracksWarning, match=rf"2 of 4 frames are left out .* 1 of their logs \({gone.name}\)"):
+        assert len(opened(frames, fewer, without_tracks="drop")) == 2
+    with pytest.warns(MissingTracksWarning, match="2 of 4 frames have an empty traffic flow"):
+        kept = opened(frames, fewer, without_tracks="empty")
+    found = check_openlane_v2(frames, fewer, progress=False)
+    assert (found.rows[0]["with log"], found.rows[0]["without log"], found.faults) == (2, 2, [])
+    assert f"2 of 4 val frames have no log in {fewer}, so no traffic flow: it lacks {gone.name}" in found.skipped
     assert [bool(kept.example(i).traffic_flow.valid.any()) for i in range(4)] == [False, False, True, True]
     shutil.rmtree(sorted((fewer / "sensor" / "val").iterdir())[0])
     with pytest.raises(UserError, match="holds no Argoverse 2 log"):
@@ -168,7 +173,8 @@ def test_subset_b_takes_the_tracks_of_nuscenes(tmp_path, scene):
     tracks = SourceTracks(write_nuscenes(tmp_path), "B", {("val", "11000"): scene, ("val", "11001"): "scene-0001"})
     key = FrameKey("val", "11000", str(START + 1_500_000 + 10_000))
     other = FrameKey("val", "11001", key.timestamp)
-    assert tracks.known([key, other], "drop") == [key]
+    with pytest.warns(MissingTracksWarning, match="scene-0001"):
+        assert tracks.known([key, other], "drop") == [key]
     with pytest.raises(UserError, match=r"lacks 1 of the logs of these frames \(scene-0001\)"):
         tracks.known([key, other], "refuse")
     pitched = np.array([[np.cos(PITCH), 0, np.sin(PITCH)], [0, 1, 0], [-np.sin(PITCH), 0, np.cos(PITCH)]])

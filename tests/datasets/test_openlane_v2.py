@@ -1,7 +1,6 @@
 """OpenLane-V2's reader: images and boxes, capacity, errors, training on it, real frames."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,6 @@ from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
-from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_frames import MAP_CHANGES, list_frames
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
@@ -232,40 +230,6 @@ def test_faults_are_named(folder, damage, said):
     damage(folder)
     with pytest.raises(UserError, match=said):
         list(map(opened(folder).example, range(FRAMES)))
-
-
-def _lanes(function):
-    """Return the damage of the annotation's lanes by a function."""
-    return lambda folder: change(
-        info(folder, 0, "-ls"), lambda content: function(content["annotation"]["lane_segment"], content["annotation"])
-    )
-
-
-def swap(lanes, _):
-    lanes[1]["left_laneline"], lanes[1]["right_laneline"] = lanes[1]["right_laneline"], lanes[1]["left_laneline"]
-
-
-@pytest.mark.parametrize(
-    ("damage", "said"),
-    [
-        (lambda lanes, _: lanes[0].update(is_intersection_or_connector="False"), r"lane_segment\[0\].is_.*'False'"),
-        (lambda lanes, _: lanes[0].update(is_intersection_or_connector=2), "is 2, expected true or false"),
-        (lambda lanes, _: [lane.update(id=7) for lane in lanes], "two of lane_segment have the id '7'"),
-        (lambda _, whole: whole["topology_lsls"][2].__setitem__(2, 1), r"lane_segment\[2\] is its own successor"),
-        (swap, r"lane_segment\[1\]: the left boundary is to the right"),
-        (lambda lanes, _: [swap(lanes, _), swap(lanes, _)], None),
-    ],
-)
-def test_lanes_that_cannot_be_true_are_refused_and_reported(folder, damage, said):
-    _lanes(damage)(folder)
-    data = opened(folder, None, flavour="lane_segment")
-    if said is None:
-        assert data.example(0).segments.valid.sum() == 3
-        return
-    with pytest.raises(UserError, match=said):
-        data.example(0)
-    (fault,) = check_openlane_v2(folder, progress=False).faults
-    assert re.search(said, fault)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.datasets.nuscenes_small import PITCH, START, write_nuscenes
-from tests.models.cases import CAMERA_TOPONET, WITH_TRAFFIC
+from tests.models.cases import CAMERA_TOPONET, SEGMENTS, WITH_TRAFFIC
 from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.config import OpenLaneV2Data, RunConfig
@@ -24,6 +24,8 @@ from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import yaw_pose
+from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.runs import open_run, train_run
@@ -191,26 +193,40 @@ def test_subset_b_takes_the_tracks_of_nuscenes(tmp_path, scene):
 
 
 @pytest.mark.slow
-def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path):
+@pytest.mark.parametrize("host", ["toponet", "lanesegnet"])
+def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path, host):
     """The whole chain: both layouts, workers, prior, camera model, update, evaluation with and without traffic."""
     frames, tracks = written
+    flavour, weights, score, small, example = "centerline", TopoNetLossConfig(), "DET_l", CAMERA_TOPONET, EXAMPLE
+    if host == "lanesegnet":
+        flavour, weights, score = "lane_segment", LaneSegNetLossConfig(), "mAP"
+        decoder = replace(SEGMENTS.decoder, points=EXAMPLE.segment_points)
+        small = replace(SEGMENTS, encoder=CAMERA_TOPONET.encoder, decoder=decoder)
+        example = replace(EXAMPLE, crossings="sides")
     loading = StreamingConfig(threads=1, ahead=2)
     image = ImageConfig(divisor=16)
     data = OpenLaneV2Data(
-        frames, "val", example=EXAMPLE, image=image, loading=loading, tracks=tracks, augmentation=None
+        frames,
+        "val",
+        flavour=flavour,
+        example=example,
+        image=image,
+        loading=loading,
+        tracks=tracks,
+        augmentation=None,
     )
     traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=EXAMPLE.history))
     encoder = replace(CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=7))
-    model = replace(CAMERA_TOPONET, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
-    training = TrainingConfig(steps=2, batch_size=2, eval_every=2)
-    run = RunConfig(LaneGraphTask(model), data, OptimConfig(warmup_steps=0), training)
+    model = replace(small, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
+    training = TrainingConfig(steps=2, batch_size=2, eval_every=2, best_metric=f"all/{score}")
+    run = RunConfig(LaneGraphTask(model, weights), data, OptimConfig(warmup_steps=0), training)
     result = train_run(run, tmp_path / "run", progress=False)
     assert result.step == 2
     flows = {name: replace(run.evaluation, traffic=name) for name in ("own", "none")}
     trained = open_run(tmp_path / "run", "last")
     examples = run.task.load(data.source("val"), progress=False)
     answers = {name: run.task.evaluate(trained.params[0], examples, config) for name, config in flows.items()}
-    assert all(np.isfinite(answer.groups["all"]["DET_l"]) for answer in answers.values())
+    assert all(np.isfinite(answer.groups["all"][score]) for answer in answers.values())
 
 
 def test_a_real_log_and_the_frames_of_its_segment():

@@ -15,6 +15,7 @@ from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
 from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
+from tflane_jax.datasets.nuscenes_export import export_scenes
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
@@ -33,7 +34,7 @@ from tflane_jax.scene import shapes_of
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
-from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
 from tflane_jax.world.simulate import WorldConfig
 
 feather = pytest.importorskip("pyarrow.feather")
@@ -44,13 +45,26 @@ EXAMPLE = ExampleConfig(sensor=None, cameras=RIG, history=6, history_hz=5.0)
 WORLD = ProceduralConfig("val", scenes=2, world=WorldConfig(keyframes=2), example=EXAMPLE)
 
 
+# Six cameras, as subset B has them, and boxes at nuScenes' 2 Hz.
+EXAMPLE_B = replace(EXAMPLE, cameras=CameraRigConfig(NUSCENES_RING, scale=0.04), history=4, history_hz=2.0)
+WORLD_B = replace(WORLD, scenes=1, example=EXAMPLE_B)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Return the folders of frames and tracks, as one command writes them."""
-    root = tmp_path_factory.mktemp("export")
+    return export(tmp_path_factory.mktemp("export"), "WORLD")
+
+
+@pytest.fixture(scope="module")
+def written_b(tmp_path_factory):
+    return export(tmp_path_factory.mktemp("export"), "WORLD_B")
+
+
+def export(root, name):
+    """Return the folders of frames and tracks of a world, as one command writes them."""
     config = root / "world.py"
     config.write_text(
-        "from tests.datasets.test_openlane_tracks import WORLD\n"
+        f"from tests.datasets.test_openlane_tracks import {name} as WORLD\n"
         "from tflane_jax.config import RunConfig, WorldData\n"
         "def get_config():\n"
         "    return RunConfig(data=WorldData(val=WORLD.scenes, world=WORLD.world, example=WORLD.example))\n"
@@ -75,9 +89,14 @@ def by_place(flow):
     return [np.asarray(leaf)[order] for leaf in (flow.valid, flow.position, flow.yaw, flow.size, flow.category)]
 
 
-@pytest.mark.parametrize("index", [0, 3])
-def test_frames_get_the_tracks_that_they_had(written, index):
-    made, read = ProceduralDataset(WORLD).example(index), opened(*written).example(index)
+@pytest.mark.parametrize(("subset", "index"), [("A", 0), ("A", 3), ("B", 1)])
+def test_frames_get_the_tracks_that_they_had(subset, index, request):
+    if subset == "A":
+        made, read = ProceduralDataset(WORLD).example(index), opened(*request.getfixturevalue("written")).example(index)
+    else:
+        folders = request.getfixturevalue("written_b")
+        made = ProceduralDataset(WORLD_B).example(index)
+        read = opened(*folders, subset="B", example=EXAMPLE_B).example(index)
     read.validate()
     expected, got = by_place(made.traffic_flow), by_place(read.traffic_flow)
     assert len(expected[0]) > 5
@@ -157,16 +176,14 @@ def test_the_check_counts_frames_with_traffic(written, capsys):
     assert main(["data", "check", "--format", "tusimple", str(frames), "--tracks", str(tracks)]) == 2
 
 
-def test_tracks_are_written_once_and_only_beside_seven_cameras(written, tmp_path):
+def test_tracks_are_written_once_and_are_those_of_one_subset(written):
     _, tracks = written
     with pytest.raises(UserError, match="is not empty"):
         export_tracks([], tracks)
     with pytest.raises(UserError, match="holds no nuScenes tables"):
         SourceTracks(tracks, "B", {})
-    out = tmp_path / "six"
-    arguments = ["data", "export", "--config", "camera/toponet", "--splits", "val", "--out", str(out)]
-    assert main([*arguments, "--tracks", str(tmp_path / "t"), "--data.val", "1"]) == 2
-    assert not out.exists()
+    with pytest.raises(UserError, match="is not empty"):
+        export_scenes([], tracks)
 
 
 @pytest.mark.parametrize("scene", ["scene-0061", "scene-a"])
@@ -193,11 +210,17 @@ def test_subset_b_takes_the_tracks_of_nuscenes(tmp_path, scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("host", ["toponet", "lanesegnet"])
-def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path, host):
+@pytest.mark.parametrize(("host", "subset"), [("toponet", "A"), ("toponet", "B"), ("lanesegnet", "A")])
+def test_a_camera_model_trains_on_frames_with_tracks(tmp_path, host, subset, request):
     """The whole chain: both layouts, workers, prior, camera model, update, evaluation with and without traffic."""
-    frames, tracks = written
-    flavour, weights, score, small, example = "centerline", TopoNetLossConfig(), "DET_l", CAMERA_TOPONET, EXAMPLE
+    frames, tracks = request.getfixturevalue("written" if subset == "A" else "written_b")
+    flavour, weights, score, small, example = (
+        "centerline",
+        TopoNetLossConfig(),
+        "DET_l",
+        CAMERA_TOPONET,
+        EXAMPLE if subset == "A" else EXAMPLE_B,
+    )
     if host == "lanesegnet":
         flavour, weights, score = "lane_segment", LaneSegNetLossConfig(), "mAP"
         decoder = replace(SEGMENTS.decoder, points=EXAMPLE.segment_points)
@@ -208,6 +231,7 @@ def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path, host):
     data = OpenLaneV2Data(
         frames,
         "val",
+        subset=subset,
         flavour=flavour,
         example=example,
         image=image,
@@ -215,8 +239,10 @@ def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path, host):
         tracks=tracks,
         augmentation=None,
     )
-    traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=EXAMPLE.history))
-    encoder = replace(CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=7))
+    traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=example.history))
+    encoder = replace(
+        CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=len(example.cameras.cameras))
+    )
     model = replace(small, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
     training = TrainingConfig(steps=2, batch_size=2, eval_every=2, best_metric=f"all/{score}")
     run = RunConfig(LaneGraphTask(model, weights), data, OptimConfig(warmup_steps=0), training)

@@ -239,7 +239,9 @@ def test_a_camera_model_trains_on_frames_with_tracks(tmp_path, host, subset, req
         tracks=tracks,
         augmentation=None,
     )
-    traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=example.history))
+    traffic = replace(
+        WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=example.history, min_valid_frames=2)
+    )
     encoder = replace(
         CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=len(example.cameras.cameras))
     )

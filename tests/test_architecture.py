@@ -13,7 +13,7 @@ from tests.shared import ROOT
 FLOORS = (
     "errors",
     "limits",
-    "config_io config_files migrations processes startup",
+    "config_io config_files migrations processes startup child_processes",
     "devices",
     "geometry",
     "files",

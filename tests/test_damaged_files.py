@@ -287,11 +287,11 @@ def test_damaged_scores_are_measured_again(tmp_path, content):
 @pytest.mark.parametrize("content", CONTENTS)
 def test_a_damaged_declaration_is_named(tmp_path, content):
     declaration = Declaration("all/recall", (Claim("a"),))
-    declare(declaration, {"a": []}, [0], tmp_path)
-    assert declare(declaration, {"a": []}, [0], tmp_path).seeds == (0,)
+    declare(declaration, {"a": []}, {}, [0], tmp_path)
+    assert declare(declaration, {"a": []}, {}, [0], tmp_path).seeds == (0,)
     damage(tmp_path / "declaration.json", CONTENTS[content])
     with pytest.raises(UserError, match=r"declaration\.json"):
-        declare(declaration, {"a": []}, [0], tmp_path)
+        declare(declaration, {"a": []}, {}, [0], tmp_path)
 
 
 def test_run_folders_that_cannot_be_used_are_told_before_any_work(tmp_path, capsys, monkeypatch):

@@ -6,8 +6,8 @@ from functools import partial
 from tests.shared import ROOT
 from tests.test_cli import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax import demo
+from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import Measured
 from tflane_jax.cli import main
 from tflane_jax.config import load_ablations, load_config
 from tflane_jax.evaluation.results import SceneRatio

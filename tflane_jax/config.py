@@ -32,7 +32,9 @@ from tflane_jax.datasets.sources import data_classes
 from tflane_jax.datasets.tusimple import TuSimpleData
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.layers.precision import Precision
 from tflane_jax.limits import Rules, SettingError, check_settings
+from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.loop import TrainingConfig
@@ -121,6 +123,19 @@ def with_priors_of(other: RunConfig, config: RunConfig) -> RunConfig:
     if not isinstance(other.task, LaneGraphTask) or not isinstance(config.task, LaneGraphTask):
         raise UserError("only models of lanes around the vehicle have priors")
     model = dataclasses.replace(config.task.model, priors=other.task.model.priors)
+    return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
+
+
+def with_remat(config: RunConfig, precision: Precision = "float32") -> RunConfig:
+    """Return a configuration whose camera encoder recomputes activations in the backward pass, in some precision."""
+    if not isinstance(config.task, LaneGraphTask) or not isinstance(config.task.model.encoder, CameraEncoderConfig):
+        raise UserError("only models with a camera encoder have its settings remat and precision")
+    model = config.task.model
+    parts = {
+        name: dataclasses.replace(getattr(model.encoder, name), remat=True, precision=precision)
+        for name in ("images", "bev")
+    }
+    model = dataclasses.replace(model, encoder=dataclasses.replace(model.encoder, **parts))
     return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
 
 

@@ -6,12 +6,13 @@
         --training.init-from runs/imagenet --training.init-partly
 
 Encoder and training are those of `toponet_r50.py`; control points, loss weights and image sizes are the baseline's.
+`:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config, with_remat
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.models.bevformer_detr import paper_config
@@ -27,3 +28,8 @@ def get_config() -> RunConfig:
         replace(paper_config(control_points=5), encoder=toponet.task.model.encoder), BevFormerDetrLossConfig()
     )
     return replace(toponet, task=task, data=replace(toponet.data, image=BASELINE_LARGE))
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return variants of the encoder."""
+    return {"remat": with_remat(get_config()), "bfloat16": with_remat(get_config(), "bfloat16")}

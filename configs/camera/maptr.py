@@ -25,8 +25,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 # Stride 16: 15 x 9 cells of an image. Stride 32, as in the paper, would leave 8 x 5.
 IMAGES = ImageEncoderConfig(stages=(2,), pyramid=FeaturePyramidConfig(64, 1))
 DECODER = LineDecoderConfig(layers=2, queries=24, points=20, heads=4, anchors="spread", output="metric")
-# The world's crossings turn either way.
-LOSSES = MapTrLossConfig(class_target="quality", rings="both", least_step=0.1)
+LOSSES = MapTrLossConfig(class_target="quality", least_step=0.1)
 
 
 def get_config() -> RunConfig:

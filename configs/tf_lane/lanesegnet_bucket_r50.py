@@ -7,12 +7,13 @@
 
 Six encoder layers, images times 0.33, no photometric distortion, only the GridMask. Crossings are areas, no
 segments. `:published_fault` predicts areas as the published code does, without the reference that its decoder refines.
+`:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config
+from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config, with_remat
 from tflane_jax.datasets.photometric import LANESEGNET_BUCKET_PHOTOMETRIC
 from tflane_jax.datasets.view_images import LANESEGNET_BUCKET
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER
@@ -28,9 +29,13 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the variant of the published area head."""
-    model = paper_bucket_config()
-    return {"published_fault": _bucket(replace(model, areas=replace(PAPER_AREA_DECODER, output="raw")))}
+    """Return variants of the encoder, and that of the published area head."""
+    config, model = get_config(), paper_bucket_config()
+    return {
+        "remat": with_remat(config),
+        "bfloat16": with_remat(config, "bfloat16"),
+        "published_fault": _bucket(replace(model, areas=replace(PAPER_AREA_DECODER, output="raw"))),
+    }
 
 
 def _bucket(model: LaneSegNetConfig) -> RunConfig:

@@ -22,8 +22,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 # update grows with the square of queries times points, and with the heads.
 DECODER = LineDecoderConfig(layers=2, queries=16, points=20, heads=4, anchors="spread", output="metric")
 CITY_QUERIES = 28
-# The world's crossings turn either way.
-LOSSES = MapTrLossConfig(class_target="quality", rings="both", least_step=0.1)
+LOSSES = MapTrLossConfig(class_target="quality", least_step=0.1)
 
 
 def get_config() -> RunConfig:
@@ -40,10 +39,9 @@ def ablations() -> dict[str, RunConfig]:
     assert isinstance(street.task, LaneGraphTask)
     decoder = LineDecoderConfig(queries=DECODER.queries, points=DECODER.points)
     model = replace(street.task.model, decoder=decoder, denoising=None)
-    losses = MapTrLossConfig(rings=LOSSES.rings)
     return {
         "street": street,
-        "street_published": replace(street, task=replace(street.task, model=model, losses=losses)),
+        "street_published": replace(street, task=replace(street.task, model=model, losses=MapTrLossConfig())),
     }
 
 

@@ -8,19 +8,23 @@ The cameras are nuScenes' ring with images of 800 x 480 pixels, as the paper has
 28,130 frames on eight GPUs, four frames each. `:bevformer` has BEVFormer's attention to the cameras instead of the
 kernel, `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 
+    tflane train --config tf_lane/maptr_r50:published_weights --data.root PATH \\
+        --training.init-from runs/imagenet --training.init-partly
     tflane convert --config tf_lane/maptr_r50:published_weights --weights maptr_tiny_r50_24e.pth --out runs/maptr
     tflane eval runs/maptr --data nuscenes --root PATH
 
-`:published_weights` reads nuScenes as the published code does, in the lidar's axes, with the vehicle's CAN bus.
+`:published_weights` reads nuScenes as the published code does, in the lidar's axes, with the vehicle's CAN bus, and
+trains as it does, with photometric distortion and GridMask.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import NuScenesData, RunConfig, WorldData
+from tflane_jax.config import NuScenesData, RunConfig, WorldData, with_remat
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
+from tflane_jax.datasets.photometric import MAPTR_PHOTOMETRIC
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B
 from tflane_jax.geometry import BevGrid
 from tflane_jax.losses.maptr import MapTrLossConfig
@@ -44,7 +48,7 @@ def get_config() -> RunConfig:
         map_lines=MapLinesConfig(),
     )
     return RunConfig(
-        task=LaneGraphTask(paper_config(), MapTrLossConfig(rings="both")),
+        task=LaneGraphTask(paper_config(), MapTrLossConfig(), empty_frames="skip"),
         data=WorldData(example=example),
         optim=OptimConfig(
             lr=6e-4,
@@ -67,12 +71,10 @@ def ablations() -> dict[str, RunConfig]:
         task = replace(config.task, model=replace(paper_config(), encoder=encoder))
         return replace(config, task=task)
 
-    images, bev = replace(encoder.images, remat=True), replace(encoder.bev, remat=True)
-    half = replace(images, precision="bfloat16"), replace(bev, precision="bfloat16")
     return {
         "bevformer": with_encoder(replace(encoder, bev=replace(encoder.bev, attention="deformable"))),
-        "remat": with_encoder(CameraEncoderConfig(images, bev)),
-        "bfloat16": with_encoder(CameraEncoderConfig(*half)),
+        "remat": with_remat(config),
+        "bfloat16": with_remat(config, "bfloat16"),
         "published_weights": _published(with_encoder(replace(encoder, bev=LIDAR_BEV))),
     }
 
@@ -92,6 +94,7 @@ NUSCENES = NuScenesData(
     can_bus="reference",
     image=TOPONET_SUBSET_B,
     example=replace(NUSCENES_SIZES, range=PAPER_RANGE, sensor=None, map_lines=MapLinesConfig()),
+    augmentation=MAPTR_PHOTOMETRIC,
 )
 
 

@@ -5,13 +5,17 @@
 
 Same data, encoder and optimizer as `maptr.py`, with the decoupled decoder, the one-to-many group in place of denoising
 queries, and the mask of lines in BEV. There are no cameras, so that depth and the masks in the images are absent.
-`:street_published` has the decoder's published forms and losses instead.
+
+`:street_published` has the decoder's published forms and losses instead, `:street_centerlines` the fourth class.
+`:argoverse2` learns lines with heights, as MapTRv2 does on Argoverse 2, from the two logs of `argoverse2.py`; one log
+of 32 frames shows that the program runs and says nothing about accuracy.
 """
 
 from dataclasses import fields, replace
 from pathlib import Path
 
-from tflane_jax.config import RunConfig, load_config
+from tflane_jax.config import LogData, RunConfig, WorldData, load_config
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.maptr import MapTrConfig
@@ -20,6 +24,8 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 # As many lines in the second group as in the first; MapTRv2 has six times as many, and repeats lines six times.
 REPEATS = 2
+# Of 48 frames of `street`, those with the most lines have 9 without centerlines and 16 with them.
+CENTERLINE_QUERIES = 24
 
 
 def get_config() -> RunConfig:
@@ -28,8 +34,35 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the baseline on the preset `street`, and the same with the published decoder and losses."""
-    return {name: _second_version(f"maptr.py:{name}") for name in ("street", "street_published")}
+    """Return the baseline on the preset `street`, variants of it, and heights on Argoverse 2."""
+    rows = {name: _second_version(f"maptr.py:{name}") for name in ("street", "street_published")}
+    return rows | {"street_centerlines": _with_centerlines(rows["street"]), "argoverse2": _with_heights()}
+
+
+def _with_centerlines(config: RunConfig) -> RunConfig:
+    assert isinstance(config.data, WorldData)
+    assert config.data.example.map_lines is not None
+    lines = replace(config.data.example.map_lines, centerlines="include")
+    data = replace(config.data, example=replace(config.data.example, map_lines=lines))
+    return replace(_with_decoder(config, classes=4, queries=CENTERLINE_QUERIES), data=data)
+
+
+def _with_heights() -> RunConfig:
+    config, logs = get_config(), load_config(str(Path(__file__).with_name("argoverse2.py")))
+    assert isinstance(logs.data, LogData)
+    example = replace(logs.data.example, map_lines=MapLinesConfig())
+    training = replace(logs.training, best_metric=config.training.best_metric)
+    config = replace(config, data=replace(logs.data, example=example), training=training)
+    return replace(_with_decoder(config, coordinates=3, queries=48), optim=replace(config.optim, warmup_steps=10))
+
+
+def _with_decoder(config: RunConfig, *, queries: int, **changes: int) -> RunConfig:
+    """Return a configuration with another decoder, and as many queries in the second group as in the first."""
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.task.model, MapTrV2Config)
+    decoder = replace(config.task.model.decoder, queries=queries, **changes)
+    model = replace(config.task.model, decoder=decoder, many=queries)
+    return replace(config, task=replace(config.task, model=model))
 
 
 def _second_version(file: str) -> RunConfig:

@@ -5,22 +5,28 @@
         --optim.epoch_steps 0 --optim.warmup_steps 0 --task.model.encoder.images.frozen-stages 0
 
 Cameras, schedule and batch are those of `maptr_r50.py`; the built-in world gives the depth of every image cell.
+`:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision. `:centerlines` has the
+fourth class and 70 lines.
 
+    tflane train --config tf_lane/maptrv2_r50:published_weights --data.root PATH \\
+        --training.init-from runs/imagenet --training.init-partly
     tflane convert --config tf_lane/maptrv2_r50:published_weights --weights maptrv2_nusc_r50_24e.pth --out runs/maptrv2
     tflane eval runs/maptrv2 --data nuscenes --root PATH
 
 `:published_weights` reads nuScenes as the published code does: in the lidar's axes, with the lift's border, and with
-cameras as calibrated, without the vehicle's motion between exposure and sweep.
+cameras as calibrated, without the vehicle's motion between exposure and sweep. It trains as that code does, but for the
+depth, with photometric distortion and GridMask.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import NuScenesData, RunConfig, WorldData, load_config
+from tflane_jax.config import NuScenesData, RunConfig, WorldData, load_config, with_remat
+from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.geometry import BevGrid
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.lidar_axes import range_in_lidar_axes
-from tflane_jax.models.maptrv2 import PAPER_LIFT_ENCODER, paper_config
+from tflane_jax.models.maptrv2 import PAPER_LIFT_ENCODER, MapTrV2Config, paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 MAPTR = str(Path(__file__).with_name("maptr_r50.py"))
@@ -34,11 +40,36 @@ def get_config() -> RunConfig:
     assert example.cameras is not None
     # Cells of the feature maps: stride 32.
     data = replace(config.data, example=replace(example, cameras=replace(example.cameras, depth_cell=32)))
-    return replace(config, task=LaneGraphTask(paper_config(), MapTrV2LossConfig(rings="both")), data=data)
+    assert isinstance(config.task, LaneGraphTask)
+    task = replace(config.task, model=paper_config(), losses=MapTrV2LossConfig())
+    return replace(config, task=task, data=data)
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return the published weights' inputs."""
+    """Return variants of the encoder and of the classes, and the published weights' inputs."""
+    config = get_config()
+    return {
+        "remat": with_remat(config),
+        "bfloat16": with_remat(config, "bfloat16"),
+        "centerlines": _with_centerlines(config),
+        "published_weights": _published(),
+    }
+
+
+def _with_centerlines(config: RunConfig) -> RunConfig:
+    """Return the published variant with the fourth class."""
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.task.model, MapTrV2Config)
+    assert isinstance(config.data, WorldData)
+    model = config.task.model
+    model = replace(model, decoder=replace(model.decoder, classes=4, queries=70))
+    example = replace(config.data.example, map_lines=MapLinesConfig(centerlines="include"))
+    task, data = replace(config.task, model=model), replace(config.data, example=example)
+    return replace(config, task=task, data=data)
+
+
+def _published() -> RunConfig:
+    """Return the published weights' configuration on nuScenes."""
     config = load_config(f"{MAPTR}:published_weights")
     assert isinstance(config.task, LaneGraphTask)
     assert isinstance(config.data, NuScenesData)
@@ -48,5 +79,5 @@ def ablations() -> dict[str, RunConfig]:
     lift = replace(lift, grid=grid, border="published", supervised=False)
     model = replace(paper_config(), encoder=replace(PAPER_LIFT_ENCODER, bev=lift), axes="lidar")
     data = replace(config.data, camera_poses="calibration", can_bus="none")
-    task = LaneGraphTask(model, MapTrV2LossConfig(rings="both"))
-    return {"published_weights": replace(config, task=task, data=data)}
+    task = replace(config.task, model=model, losses=MapTrV2LossConfig())
+    return replace(config, task=task, data=data)

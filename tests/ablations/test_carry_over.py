@@ -122,11 +122,47 @@ def test_the_same_command_trains_nothing_again(folder, monkeypatch, capsys):
         ({"logs": ("scene-9",)}, "has no recorded log scene-9, only scene-1"),
         ({"rows": ("best",)}, "there is no model best: choose of generated, mixed"),
         ({"rows": ("mixed",), "seeds": (0, 1)}, "holds another declaration"),
+        ({"logs": ("scene-1",), "steps": 8}, r"another declaration \(generated: training\.steps: 4 there, 8 here\)"),
+        ({"logs": ("scene-1",), "scenes": 5}, r"another declaration \(generated: data\.train: 2000 there, 5 here\)"),
+        ({"logs": ("scene-1", "scene-2")}, "log scene-2 was not declared"),
+        ({"logs": ("scene-1", "scene-3"), "seeds": (0, 1)}, "seed 1 was not declared"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_trained(folder, change, message):
     with pytest.raises(UserError, match=message):
         carry_over(Settings(folder / "maps", **{"steps": 4, **change}), folder / "out")
+
+
+def test_fewer_logs_are_an_interim_look(folder, capsys):
+    out = folder / "out"
+    names = ("carry_over.md", "logs.md", "effects.md")
+    before = [(out / name).read_bytes() for name in names]
+    assert not any(b"Interim" in text for text in before)
+    carry_over(Settings(folder / "maps", logs=("scene-3",), steps=4), out)
+    for name in names:
+        assert "**Interim**: 1 of 2 declared logs (scene-3)." in (out / name).read_text()
+    assert "3 runs, 3 complete" in capsys.readouterr().out
+    carry_over(settings(folder), out)
+    assert [(out / name).read_bytes() for name in names] == before
+
+
+def test_other_files_of_the_maps_are_other_runs(folder):
+    declared = json.loads((folder / "out" / "declaration.json").read_text())
+    assert declared["logs"] == ["scene-1", "scene-3"]
+    assert sorted(declared["content"]) == ["scene-1", "scene-2", "scene-3"]
+    path = folder / "maps" / "scene-2.npz"
+    kept = path.read_bytes()
+    np.savez(path, **content(), more=np.zeros(1))
+    try:
+        with pytest.raises(UserError, match=r"another declaration \(content of scene-2: \w+ there, \w+ here\)"):
+            carry_over(settings(folder), folder / "out")
+        configs = subject._configs(settings(folder))
+        plan = subject._planned(
+            subject._logs(settings(folder)), settings(folder), configs, folder / "out", {"cores": 1}
+        )
+        assert not any(job.exists() for job in plan.flat())
+    finally:
+        path.write_bytes(kept)
 
 
 def test_a_single_log_cannot_be_left_out(tmp_path, capsys):

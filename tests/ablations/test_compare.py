@@ -70,6 +70,15 @@ def test_all_workers_have_the_same_number_of_cores(monkeypatch, available, paral
     assert len(set(used)) == min(len(used), available)
 
 
+def test_each_training_can_be_given_a_number_of_cores(monkeypatch):
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(10, 14)))
+    assert [_cores(slot, 2, 1) for slot in range(2)] == [[10], [11]]
+    assert worker_threads(1, 1) == worker_threads(4) == worker_threads(2, 1)
+    assert worker_threads(1, 4) == worker_threads(1)
+    with pytest.raises(UserError, match="--cores 5: a training can have 1 to 4 cores here"):
+        worker_threads(1, 5)
+
+
 @pytest.mark.slow
 def test_two_workers_train_all_runs_and_name_the_one_that_failed(tmp_path, monkeypatch):
     monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))

@@ -2,15 +2,17 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
 from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence
+from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import Measured
 from tflane_jax.ablations.statistics import holm, paired_difference, scene_weights
+from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio
 
 SCENES, SEEDS = 40, (0, 1, 2, 3)
@@ -124,6 +126,7 @@ def test_scores_that_are_no_ratio_have_no_interval(results):
     found = effects(results, Declaration("all/AP_l", (Claim("+TFM"),)), "", "last")
     assert all(math.isnan(e.low) and math.isnan(e.high) and not math.isnan(e.p) for e in found)
     assert "95 %" not in sentence(found[:1])
+    assert "seeds, no interval over scenes: decided by seeds alone)" in sentence(found[:1])
 
 
 def test_rows_of_other_scenes_are_refused():
@@ -131,7 +134,7 @@ def test_rows_of_other_scenes_are_refused():
     for model, lanes in (("baseline", (4, 4)), ("+TFM", (4, 5))):
         ratio = SceneRatio((1, 2), lanes)
         found.add("", "last", model, 0, Measured(1, "a protocol", {"": {PRIMARY: 0.3}}, {"": {PRIMARY: ratio}}))
-    with pytest.raises(ValueError, match="not measured on the same lanes"):
+    with pytest.raises(UserError, match="not measured on the same lanes"):
         effects(found, Declaration(PRIMARY, (Claim("+TFM"),)), "", "last")
 
 
@@ -180,3 +183,26 @@ def test_claims_about_pairs_are_corrected_together(results):
     assert [e.finding for e in found] == ["shown", "contradicted", "contradicted"]
     assert found[0].difference == pytest.approx(-found[2].difference)
     assert sentence(found[:1]).endswith("Claim: it helps")
+
+
+def test_a_secondary_measure_is_corrected_apart(results):
+    more = replace(DECLARED, secondary="all/AP_l")
+    found, plain = effects(results, more, "", "last"), effects(results, DECLARED, "", "last")
+    assert repr(found[: len(plain)]) == repr(plain)  # nan too
+    extra = found[len(plain) :]
+    assert [(e.measure, e.row) for e in extra] == [
+        ("secondary measure all/AP_l", row) for row in ("baseline", "+TFM, none", "matched")
+    ]
+    assert [e.p_holm for e in extra] == holm([e.p for e in extra])
+    text = sentence([e for e in found if e.row == "baseline"])
+    assert text.startswith(f"**shown**: +TFM is better than *baseline* in {PRIMARY}, +")
+    assert "; not shown in the secondary measure all/AP_l, " in text
+    # Read as errors, its sign alone turns.
+    as_errors = effects(results, more, "", "last", ["all/AP_l"])
+    assert repr(as_errors[: len(plain)]) == repr(plain)
+    assert [e.better for e in as_errors[len(plain) :]] == [len(SEEDS) - e.better for e in extra]
+
+
+def test_a_score_that_was_not_measured_is_named(results):
+    with pytest.raises(UserError, match="the run of seed 0 has no all/mAP: an earlier state of the code"):
+        effects(results, Declaration("all/mAP", (Claim("+TFM"),)), "", "last")

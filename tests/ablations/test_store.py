@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from tflane_jax.ablations.jobs import Job
-from tflane_jax.ablations.store import remaining_seconds, run_key, stored_jobs
+from tflane_jax.ablations.jobs import Job, check_rows
+from tflane_jax.ablations.store import remaining_seconds, run_key, runs_elsewhere, stored_jobs
 from tflane_jax.config import RunConfig
+from tflane_jax.config_io import to_json
+from tflane_jax.errors import UserError
+from tflane_jax.training import provenance
 from tflane_jax.training.loop import TrainingConfig
 
 THREADS = {"cores": 1}
@@ -56,7 +59,7 @@ def test_a_row_starts_from_the_run_of_its_own_seed_wherever_the_store_is():
 @pytest.mark.parametrize(("recorded", "expected"), [({}, (240.0, 2)), ({0: (10, 30.0)}, (60.0 + 90.0, 0))])
 def test_remaining_time_is_measured_where_it_can_be(tmp_path, monkeypatch, recorded, expected):
     monkeypatch.setattr(Job, "is_complete", lambda self: False)
-    monkeypatch.setattr(Job, "_exists", lambda self: True)
+    monkeypatch.setattr(Job, "exists", lambda self: True)
     plan = stored_jobs({"row": changed(steps=30)}, [0, 1], tmp_path, threads=THREADS)
     for i, (step, seconds) in recorded.items():
         folder = plan["row"][i].folder
@@ -91,3 +94,59 @@ def test_a_new_setting_with_its_default_finds_earlier_runs():
     assert run_key(Config(TrainingConfig(steps=3), part=Part(2)), THREADS) == earlier
     for changed in (Part(3), Part(), Part(2, (1,))):
         assert run_key(Config(TrainingConfig(steps=3), part=changed), THREADS) != earlier
+
+
+def test_keys_are_those_of_earlier_versions():
+    """Runs on disk are found by them."""
+    assert run_key(CONFIG, THREADS) == "8cb75c728c1b62d8"
+    assert run_key(CONFIG, THREADS, content="files") != run_key(CONFIG, THREADS)
+
+
+def begun(job, threads, device="cpu: cpu x 1"):
+    """Write what tells that a run began."""
+    job.folder.mkdir(parents=True)
+    (job.folder / "config.json").write_text(json.dumps(to_json(job.config)))
+    (job.folder / "provenance.json").write_text(json.dumps([{"threads": threads, "device": device}]))
+
+
+def test_runs_of_another_thread_setting_are_told_with_the_option_that_uses_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(Job, "is_complete", Job.exists)
+
+    def planned(threads):
+        return stored_jobs({"row": CONFIG}, [0, 1, 2], tmp_path, threads=threads)["row"]
+
+    two = {"cores": 2, "OMP_NUM_THREADS": "3"}
+    for threads, count in ((THREADS, 2), (two, 1)):
+        for job in planned(threads)[:count]:
+            begun(job, threads)
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "provenance.json").write_text('[{"threads": {}}]')
+    told = sorted(runs_elsewhere(planned({"cores": 2}), tmp_path, planned))
+    assert [line.partition(", but")[0] for line in told] == [
+        "1 of these runs exist with cores 2, OMP_NUM_THREADS 3 (1 complete)",
+        "2 of these runs exist with cores 1 (2 complete)",
+    ]
+    assert "environment" in told[0]
+    assert told[1].endswith("add --cores 1 to use them")
+    # Only what is missing here is told: one run of this setting is, and that one nobody has.
+    assert runs_elsewhere(planned(THREADS), tmp_path, planned) == []
+
+
+def test_a_run_of_an_accelerator_is_no_run_of_a_cpu(tmp_path, monkeypatch):
+    gpu = "gpu: NVIDIA H100 x 1"
+    (job,) = stored_jobs({"row": CONFIG}, [0], tmp_path, threads=THREADS)["row"]
+    begun(job, THREADS)
+    assert job.difference() == ""
+    # Earlier versions gave it the same key, and recorded the device beside the threads.
+    (job.folder / "provenance.json").write_text(json.dumps([{"threads": THREADS, "device": gpu}]))
+    assert job.difference() == f"device: {gpu} there, None here"
+    with pytest.raises(UserError, match=r"row: \S+ holds another run \(device: gpu: NVIDIA H100 x 1 there"):
+        check_rows({"row": [job]})
+    monkeypatch.setattr(provenance, "_device", lambda: gpu)
+    setting = provenance.thread_setting(1)
+    assert setting == {"cores": 1, "device": gpu} | {
+        name: setting[name] for name in setting.keys() - {"cores", "device"}
+    }
+    (other,) = stored_jobs({"row": CONFIG}, [0], tmp_path, threads=setting)["row"]
+    assert other.folder != job.folder
+    assert Job(CONFIG, job.folder, {"cores": 1, "device": gpu}).difference() == ""

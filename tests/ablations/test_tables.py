@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -146,6 +147,9 @@ def test_fewer_seeds_are_an_interim_look_and_equal_rows_are_trained_once(tiny, t
     assert "Declared before any run" in text
     with pytest.raises(UserError, match="seed 3 was not declared"):
         run_table(table, range(4), tmp_path)
+    # After the results were seen, no row may become another one.
+    with pytest.raises(UserError, match=r"another declaration \(base: training\.steps: 4 there, 6 here\)"):
+        run_table(replace(table, steps=6), range(3), tmp_path)
 
 
 def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
@@ -157,6 +161,12 @@ def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
     starts = {c["training"]["init_from"]: c["training"]["seeds"] for c in configs if c["training"]["init_from"]}
     hosts = {path.parent for path in (tmp_path / "runs").glob("*/config.json")}
     assert len(starts) == 2
+    declared = json.loads((tmp_path / "paper.9" / "declaration.json").read_text())["configurations"]
+    assert declared["base"]["training"]["init_from"] == "host host"
+    assert declared["host host"]["optim"]["lr"] == 0.1
+    other = (replace(table.hosts[0], settings=("--optim.lr", "0.2")),)
+    with pytest.raises(UserError, match=r"host host: optim\.lr: 0\.1 there, 0\.2 here"):
+        run_table(replace(table, hosts=other), range(2), tmp_path)
     for start, seeds in starts.items():
         assert tmp_path / "runs" in [*(tmp_path / "runs" / "x").parents]
         assert next(host for host in hosts if str(host) == start)
@@ -180,9 +190,18 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
         (["tf_lane1"], "no table tf_lane1: there is tf_lane.1"),
         (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),
         (["tf_lane.1", "--jobs", "0"], "at least one training"),
+        (["tf_lane.1", "--cores", "0"], "--cores 0: at least one"),
     ):
         assert main(["tables", *arguments]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_estimates_are_what_was_recorded():
+    from tests.shared import ROOT
+
+    for path in (ROOT / "docs" / "results").glob("*.json"):
+        minutes = json.loads(path.read_text())["core minutes of a run"].values()
+        assert TABLES[path.stem].minutes == pytest.approx(sum(minutes) / len(minutes), abs=1.0)
 
 
 def test_the_page_of_results_is_what_its_summaries_give():

@@ -10,6 +10,7 @@ from tflane_jax.ablations.training_queue import LOOK_SECONDS, Queue, choose
 from tflane_jax.config import RunConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.run_folder import claimed
 
 TASKS = [LaneGraphTask(TopoNetConfig(), clip=clip) for clip in (1, 2, 3)]
 
@@ -80,3 +81,18 @@ def test_a_job_that_another_process_has_just_finished_is_not_trained_again():
     complete.append(jobs[0].folder)
     assert queue.take() is jobs[1]
     assert reservations.released == [jobs[0].folder]
+
+
+def test_a_run_that_a_process_still_trains_is_waited_for(tmp_path, monkeypatch):
+    """Its reservation is void, as after a kill, but its lock is held."""
+    now = [0.0]
+    monkeypatch.setattr("tflane_jax.ablations.training_queue.time.monotonic", lambda: now[0])
+    run, reservations = replace(job(0, 0), folder=tmp_path), Everything([])
+    queue = Queue([run], reservations, lambda each: False)
+    (tmp_path / "config.json").touch()
+    with claimed(tmp_path, "resume"):
+        assert queue.take() is None
+        assert list(queue.elsewhere) == [run]
+        assert reservations.released == [tmp_path]
+    now[0] += 2 * LOOK_SECONDS
+    assert queue.take() is run

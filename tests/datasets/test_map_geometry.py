@@ -73,6 +73,46 @@ def test_crossings_that_touch_are_merged_and_others_are_not():
     assert merged[merged[:, 0] > 4.0, 2].tolist() == [1.0] * (merged[:, 0] > 4.0).sum()
 
 
+ISLAND = line((2, 1), (9, 1), (9, 3), (5, 6), (2, 1))
+HOUSE = line((2, 1), (9, 1), (9, 6), (5, 9), (2, 6), (2, 1))
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3])
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("elements", "category"),
+    [
+        ({"crossings": [[HOUSE]]}, LineClass.CROSSING),  # whole
+        ({"crossings": [[HOUSE + np.array([25, 0, 0])]]}, LineClass.CROSSING),  # cut
+        ({"crossings": [[HOUSE], [HOUSE + np.array([7, 0, 0])]]}, LineClass.CROSSING),  # merged
+        ({"roads": [[box(-20, 20, -9, 14), ISLAND]]}, LineClass.BOUNDARY),
+    ],
+)
+def test_neither_the_start_nor_the_direction_of_a_source_ring_matters(elements, category, turned, steps):
+    def changed(ring):
+        corners = np.roll(ring[:-1], steps, 0)
+        ring = np.concatenate([corners, corners[:1]])
+        return ring[::-1] if turned else ring
+
+    ((name, polygons),) = elements.items()
+    other = {name: [[changed(ring) for ring in polygon] for polygon in polygons]}
+    expected, found = (cut(MapGeometry.of(**each), category) for each in (elements, other))
+    expected, found = (sorted(pieces, key=lambda p: p.points[0].tolist()) for pieces in (expected, found))
+    assert len(expected) == len(found) == len(polygons[0]) > 0
+    for one, two in zip(expected, found, strict=True):
+        assert one.closed
+        np.testing.assert_allclose(two.points, one.points, atol=1e-9)
+    # The outer rings run clockwise, the island the other way.
+    assert [area(p.points) < 0 for p in found].count(False) == len(polygons[0]) - 1
+
+
+def test_the_start_of_a_whole_boundary_does_not_matter():
+    corners = np.roll(ISLAND[:-1], 1, 0)
+    rings = ISLAND, np.concatenate([corners, corners[:1]])
+    (one,), (two,) = (cut(MapGeometry.of(boundaries=[ring]), LineClass.BOUNDARY) for ring in rings)
+    np.testing.assert_allclose(one.points, two.points)
+
+
 def test_a_crossing_is_closed_along_the_border_that_cuts_it():
     (piece,) = cut(MapGeometry.of(crossings=[[box(28, 34, -20, 4)]]), LineClass.CROSSING)
     assert piece.closed
@@ -189,4 +229,4 @@ def test_nothing_is_merged_without_polygons_that_meet():
     assert merge_polygons([]) == []
     alone = [box(0, 1, 0, 1, z=3.0)]
     (polygon,) = merge_polygons([alone])
-    np.testing.assert_array_equal(polygon[0], alone[0])
+    np.testing.assert_array_equal(polygon[0], alone[0][::-1])  # clockwise

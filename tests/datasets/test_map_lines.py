@@ -10,10 +10,10 @@ from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
-from tflane_jax.datasets.map_lines import MapLinesConfig, crop_map_lines
+from tflane_jax.datasets.map_lines import DENSE_POINTS, MapLinesConfig, crop_map_lines
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.procedural import STREET_EXAMPLE, ProceduralConfig, ProceduralDataset, WorldData
-from tflane_jax.geometry import PerceptionRange, relative_pose, transform_points
+from tflane_jax.geometry import PerceptionRange, relative_pose, resample, transform_points
 from tflane_jax.scene import LineClass
 from tflane_jax.world.presets import STREET
 
@@ -54,6 +54,23 @@ def test_lines_of_every_class_are_cut_and_resampled():
     assert three.category[three.valid].tolist() == classes[:4]
 
 
+def test_the_dense_form_has_every_corner_of_the_lines():
+    step = np.array([[-20.0, -9, 0], [0, -9, 1], [0, 9, 2], [20, 9, 3]])
+    lines, _ = crop(
+        MapLinesConfig(lines=4, points=3), vector_map=lane_map(road_boundaries=(step,), crossings=(CROSSING,))
+    )
+    lines.validate()
+    assert lines.dense.shape == (4, DENSE_POINTS, 3)
+    (boundary,) = np.flatnonzero(lines.valid & (lines.category == LineClass.BOUNDARY))
+    np.testing.assert_allclose(lines.dense[boundary], resample(step, DENSE_POINTS), atol=1e-5)
+    assert np.linalg.norm(lines.dense[boundary, :, :2] - [0, -9], axis=-1).min() < 0.3
+    np.testing.assert_array_equal(lines.dense[:, 0][lines.closed], lines.dense[:, -1][lines.closed])
+    assert not lines.dense[~lines.valid].any()
+    nothing, _ = crop(MapLinesConfig(lines=4), vector_map=lane_map())
+    assert nothing.dense.shape == lines.dense.shape  # so that examples of one data set stack
+    assert not nothing.dense.any()
+
+
 def test_visibility_is_the_fraction_in_line_of_sight():
     wall = [10.0, 0.0, 2.0, 100.0, 0.0]  # hides everything beyond x = 9
     lines, _ = crop(MapLinesConfig(), buildings=[wall])
@@ -81,6 +98,7 @@ def test_lines_are_left_out_by_default_and_change_nothing_else():
     back = example_from_leaves(leaves).map_lines
     assert back is not None
     np.testing.assert_array_equal(back.identity, made.map_lines.identity)
+    np.testing.assert_array_equal(back.dense, made.map_lines.dense)
 
 
 def test_identities_of_the_world_stay_with_their_lines():

@@ -304,9 +304,13 @@ def test_recall_of_lines_is_the_ratio_of_counts_by_scene():
 
 def test_groups_of_frames_are_measured_on_their_own():
     arrays = stack_examples([labelled(i) for i in range(3)])
-    oracle = Oracle(("centerlines", "segments"))
+    oracle = Oracle(("centerlines", "segments", "lines"))
     metrics = evaluate_lanes(oracle, {}, arrays, BOTH, frame_groups=("near", "far", "near"))
     found = metrics.compute()
     assert [found[group]["frames"] for group in ("all", "near", "far")] == [3, 2, 1]
     assert [found[f"segments {group}"]["frames"] for group in ("all", "near", "far")] == [3, 2, 1]
     assert found["near"]["lanes"] + found["far"]["lanes"] == found["all"]["lanes"]
+    assert [found[f"lines{group}"]["frames"] for group in ("", " near", " far")] == [3, 2, 1]
+    assert [found[f"lines{group}"]["lines"] for group in ("", " near", " far")] == [15, 10, 5]
+    assert found["lines far"]["mAP"] == 1.0
+    assert {"lines near/recall", "lines far/recall"} <= set(metrics.ratios())

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from tests.fakes import fake_example
-from tflane_jax.datasets.map_lines import MapLinesConfig
+from tflane_jax.datasets.map_geometry import MapGeometry
+from tflane_jax.datasets.map_lines import MapLinesConfig, crop_map_lines
 from tflane_jax.datasets.procedural import STREET_EXAMPLE, ProceduralDataset, WorldData
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS, line_groups
 from tflane_jax.evaluation.map_metrics import MapLineMetrics
 from tflane_jax.evaluation.vector_maps import detections_of_lines
-from tflane_jax.geometry import BevGrid
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.metrics.vector_map import LINE_CLASSES
 from tflane_jax.scene import BevChannel, LineClass, LinePrediction, MapLines
 
@@ -35,8 +36,31 @@ def perfect(lines, *, classes=4, score=4.0):
     """Return the valid lines as predictions."""
     kind = np.eye(4, dtype=bool)[lines.category] & lines.valid[:, None]
     return LinePrediction(
-        np.where(lines.valid[:, None, None], lines.points, 0.0), np.where(kind, score, -9.0)[:, :classes]
+        np.where(lines.valid[:, None, None], lines.dense, 0.0), np.where(kind, score, -9.0)[:, :classes]
     )
+
+
+def winding(points=2000):
+    """Return a line with twelve bends, whose chords between 20 points miss most of it."""
+    x = np.linspace(-28.0, 28.0, points)
+    return np.column_stack([x, 4.0 * np.sin(x * 12.0 * np.pi / 56.0), 0.1 * x])
+
+
+@pytest.mark.parametrize("dims", [2, 3])
+def test_the_original_line_is_the_truth_and_not_its_few_points(dims):
+    geometry = MapGeometry.of(dividers=[winding()])
+    nothing = {"boxes": np.zeros((0, 7)), "buildings": np.zeros((0, 5))}
+    range_ = PerceptionRange((-30.0, 30.0), (-15.0, 15.0))
+    lines, _ = crop_map_lines(geometry, np.eye(4), range_, MapLinesConfig(lines=3), **nothing)
+    logits, found = np.array([[4.0, -9.0, -9.0]]), []
+    for drawn in (winding(), lines.points[0]):
+        for truth in (lines, lines.replace(dense=None)):
+            metrics = MapLineMetrics(labels=LABELS, dims=dims)
+            example = fake_example().replace(map_lines=truth)
+            metrics.update(LinePrediction(drawn[None, :, :dims], logits), example)
+            found.append(metrics.compute()["lines"]["AP_divider@0.5"])
+    # The original line, then its 20 points, each against the original line and against the 20 points.
+    assert found == [1.0, 0.0, 0.0, 1.0]
 
 
 def score(predict, **options):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.shared import shared_path
+from tests.golden import case_id, golden_modules, load_module_case
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import list_photos, read_image, resize
 
@@ -25,10 +25,15 @@ def photo(height, width):
 
 
 @pytest.mark.golden
-@pytest.mark.parametrize(("name", "height", "width"), [("half_u8", 72, 128), ("odd_u8", 90, 150), ("up_u8", 200, 300)])
-def test_resizing_has_the_rounding_of_the_reference(name, height, width):
-    case = np.load(shared_path("golden/modules/lstr_preprocess.npz"))
-    np.testing.assert_array_equal(resize(case["in/crop_bgr_u8"], height, width), case[f"out/{name}"])
+@pytest.mark.parametrize("path", golden_modules("lstr_preprocess*"), ids=case_id)
+def test_resizing_has_the_rounding_of_the_reference(path):
+    case = load_module_case(path)
+    names = [name for name in case.outputs if name.endswith("_u8")]
+    assert names
+    for name in names:
+        expected = case.outputs[name]
+        found = resize(case.inputs["crop_bgr_u8"], *expected.shape[:2])
+        np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".webp"])

@@ -12,8 +12,10 @@ from tests.golden_compare import compare
 from tests.models.cases import LINES, make_line_example
 from tests.models.golden_maps import line_targets as golden_targets
 from tests.models.golden_maps import perception_range
+from tflane_jax.datasets.map_geometry import MapGeometry
+from tflane_jax.datasets.map_lines import MapLinesConfig, crop_map_lines
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import PerceptionRange
+from tflane_jax.geometry import PerceptionRange, resample
 from tflane_jax.losses.costs import focal_cost
 from tflane_jax.losses.maptr import (
     LineTargets,
@@ -136,6 +138,30 @@ def test_a_ring_may_start_anywhere_and_a_line_at_either_end(rings, coordinates, 
     points[:, 0] = points[:, 0, ::-1]
     assert not np.array_equal(points[:2, 1], lines.points[:2, 1])
     same_loss(prediction, lines, lines.replace(points=points), config)
+
+
+HOUSE = np.array([[3, -4, 0], [11, -5, 0], [12, 3, 0], [7, 8, 0], [2, 4, 0], [3, -4, 0]], float)
+
+
+def cropped(ring):
+    """Return the map lines of a map with one crossing, as a batch of one."""
+    geometry, nothing = MapGeometry.of(crossings=[[ring]]), {"boxes": np.zeros((0, 7)), "buildings": np.zeros((0, 5))}
+    lines, _ = crop_map_lines(geometry, np.eye(4), RANGE, MapLinesConfig(lines=6, points=POINTS), **nothing)
+    return jax.tree.map(lambda leaf: leaf[None], lines)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_the_source_may_start_a_ring_at_any_corner_and_turn_it_either_way(steps):
+    """Rings are resampled from their first corner and run clockwise, so that one direction is enough."""
+    prediction, config = make_prediction(batch=1), MapTrLossConfig()
+    corners = np.roll(HOUSE[:-1], steps, 0)
+    ring = np.concatenate([corners, corners[:1]])
+    for other in (ring, ring[::-1]):
+        same_loss(prediction, cropped(HOUSE), cropped(other), config)
+    # Resampled as the source has them, the rings have other points and another loss.
+    plain = [cropped(HOUSE).replace(points=resample(one, POINTS)[None, None].repeat(6, 1)) for one in (HOUSE, ring)]
+    one, two = (float(jitted(prediction, lines, config)[0]) for lines in plain)
+    assert abs(one - two) > 1e-4 * one
 
 
 def test_a_ring_may_turn_either_way_only_if_the_configuration_says_so():

@@ -161,6 +161,19 @@ def test_sampling_of_detections():
         assert {sampling: evaluate([one], sampling)["AP_divider@0.5"] for sampling in KEYS} == hits
 
 
+def test_truth_that_is_sampled_stays_as_it_is():
+    # 100 points bunched at both ends: as they are, they leave the middle of the detection alone.
+    bunched = line(0, np.concatenate([np.linspace(0, 0.1, 50), np.linspace(9.9, 10, 50)]))
+    for sampled, found in ((False, 1.0), (True, 0.0)):
+        detections, truth = frame([bunched], [line(0)], [0.9])
+        assert evaluate([(detections, dataclasses.replace(truth, sampled=sampled))])["AP_divider@0.5"] == found
+    detections, truth = frame([line(0)], [line(0)], [0.9])
+    with pytest.raises(UserError, match="sampled lines have 100 points, not 2"):
+        evaluate([(detections, dataclasses.replace(truth, sampled=True))])
+    nothing, truth = frame([], [], [])
+    assert evaluate([(nothing, dataclasses.replace(truth, sampled=True))])["lines"] == 0
+
+
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6), sampling=st.sampled_from(list(KEYS)))
 def test_order_is_free_and_parts_merge(seed, sampling):

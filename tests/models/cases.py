@@ -17,8 +17,10 @@ from tflane_jax.models.image_encoder import ImageEncoderConfig
 from tflane_jax.models.lane_queries import LaneDecoderConfig
 from tflane_jax.models.lane_segments import SegmentDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
+from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig, TrafficFlowModuleConfig
@@ -162,6 +164,17 @@ CAMERA_TOPONET = dataclasses.replace(
     elements=ELEMENTS,
     decoder=dataclasses.replace(BASELINE.decoder, refine="fixed", dropout=0.1),
 )
+LIFTED_LINES = MapTrV2Config(
+    encoder=CameraEncoderConfig(
+        dataclasses.replace(CAMERA.images, stages=(3,), pyramid=FeaturePyramidConfig(16, 1)),
+        LiftConfig(CAMERA.bev.grid, dim=16, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, supervised=True),
+        line_masks=True,
+    ),
+    decoder=SMALL_LINES.decoder,
+    many=4,
+    line_mask=True,
+)
+"""MapTRv2 behind two cameras."""
 CAMERA_DETR = BevFormerDetrConfig(
     encoder=CAMERA,
     decoder=dataclasses.replace(CAMERA_TOPONET.decoder, points=11),

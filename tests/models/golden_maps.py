@@ -57,6 +57,7 @@ def encoder_inputs(case):
 
 
 def decoder_config(case):
+    """Return the decoder; the coordinates of a point are those of the initial points."""
     sizes = options(case, "dim", "heads", "layers", "hidden", "points", "classes", num_vec=None, one2one=None)
     return LineDecoderConfig(
         dim=sizes.dim,
@@ -64,6 +65,7 @@ def decoder_config(case):
         layers=sizes.layers,
         queries=sizes.num_vec or sizes.one2one,
         points=sizes.points,
+        coordinates=len(case.params["transformer.reference_points.bias"]),
         classes=sizes.classes,
         hidden=sizes.hidden,
     )
@@ -95,9 +97,9 @@ def line_targets(orders, labels, capacity):
 
 
 def lines_by_name(lines, range_):
-    """Return predictions (B, D, ...) by the reference's names, (D, B, ...); boxes are (cx, cy, w, h)."""
+    """Return predictions (B, D, ...) by the reference's names, (D, B, ...); boxes are (cx, cy, w, h) of x and y."""
     unit = range_.normalise(lines.points)
-    low, high = unit.min(-2), unit.max(-2)
+    low, high = unit[..., :2].min(-2), unit[..., :2].max(-2)
     out = {
         "all_cls_scores": lines.logits,
         "all_pts_preds": unit,

@@ -10,8 +10,9 @@ from tflane_jax.scene import stack_examples
 
 
 def decoder_config(case):
-    sizes = options(case, "dim", "layers", "queries", "lane_points", "hidden", "lane_attn_heads", "lane_attn_points")
-    implemented(case, classes=[2], self_attn_heads=[sizes.lane_attn_heads])
+    needed = ("dim", "layers", "queries", "lane_points", "hidden", "lane_attn_heads", "lane_attn_points")
+    sizes = options(case, *needed, classes=2)
+    implemented(case, classes=[2, 1], self_attn_heads=[sizes.lane_attn_heads])
     along = np.linspace(0, sizes.lane_points - 1, sizes.lane_attn_heads // 2).round().astype(int).tolist()
     implemented(case, sample_idx=[along])
     return SegmentDecoderConfig(
@@ -22,6 +23,7 @@ def decoder_config(case):
         points=sizes.lane_points,
         sampling_points=sizes.lane_attn_points,
         hidden=sizes.hidden,
+        classes=sizes.classes,
     )
 
 

@@ -22,9 +22,11 @@ from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.maptrv2 import MapTrV2Config
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import TrafficFlow
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -43,9 +45,16 @@ MODELS = {
     "segments, traffic": SMALL_SEGMENTS,
     "lines": LINES,
     "lines, traffic": SMALL_LINES,
+    "lines v2, traffic": MapTrV2Config(
+        encoder=LINES.encoder, decoder=SMALL_LINES.decoder, priors=SMALL_LINES.priors, many=4, line_mask=True
+    ),
 }
 WITH_PRIOR = [name for name, config in MODELS.items() if config.priors.traffic_flow is not None]
-LOSSES = {LaneSegNetConfig: LaneSegNetLossConfig(), MapTrConfig: MapTrLossConfig()}
+LOSSES = {
+    LaneSegNetConfig: LaneSegNetLossConfig(),
+    MapTrConfig: MapTrLossConfig(),
+    MapTrV2Config: MapTrV2LossConfig(many_repeats=2),
+}
 
 
 def make_task(config):
@@ -120,7 +129,7 @@ def test_baseline_does_not_depend_on_traffic(name):
     same(predict(params, make_line_example(5)), predict(params, make_line_example(5).replace(traffic_flow=None)))
 
 
-@pytest.mark.parametrize("name", ["traffic", "segments, traffic", "lines, traffic"])
+@pytest.mark.parametrize("name", with_slow(WITH_PRIOR, QUICK))
 def test_lanes_do_not_depend_on_the_order_of_instances(name):
     _, params, predict = fit(name)
     example = make_line_example(6)

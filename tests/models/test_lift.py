@@ -14,6 +14,8 @@ from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.losses.map_masks import depth_targets
 from tflane_jax.losses.maptrv2 import depth_loss
 from tflane_jax.models.lift import LiftConfig, LiftEncoder, cell_numbers, collect, ray_points
+from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
+from tflane_jax.priors.traffic_raster import CHANNELS, TrafficRaster
 from tflane_jax.scene import CameraViews
 
 
@@ -98,6 +100,7 @@ def targets_of(depth, shape, bounds):
 
 
 GRID = BevGrid(PerceptionRange((-8.0, 8.0), (-4.0, 4.0), (-3.0, 3.0)), 4, 8)
+RASTER = TrafficRasterConfig(hidden=8)
 CONFIG = LiftConfig(GRID, fine=1, dim=8, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, dropout=0.0, image_scale=1.0)
 
 
@@ -164,3 +167,24 @@ def test_cameras_may_change_places_and_a_missing_one_may_hold_anything():
     one = run(features, gone)
     np.testing.assert_array_equal(run(features.at[1].set(jnp.nan), dirty), one)
     assert np.abs(one - bev).max() > 1e-3
+
+
+def test_a_prior_without_data_changes_no_bit_of_the_features():
+    views, features = make_views(), jax.random.normal(jax.random.key(0), (2, 4, 6, 8))
+    model, noise = LiftEncoder(CONFIG), jax.random.normal(jax.random.key(1), (32, CHANNELS))
+
+    def fuse_of(touched):
+        raster = TrafficRaster(noise, touched)
+        return lambda layer, places, bev, position: TrafficRasterFusion(RASTER, name="prior")(bev, raster)
+
+    start = lambda key: model.init(key, [features], views, train=False, fuse=fuse_of(jnp.ones(32, bool)))  # noqa: E731
+    fresh = jax.eval_shape(start, jax.random.key(0))
+    variables = {name: jax.tree.map(lambda leaf: jnp.ones(leaf.shape), x) for name, x in fresh.items()}
+    variables["params"] = random_params(lambda key: start(key)["params"])
+    run = lambda features, fuse: model.apply(variables, [features], views, train=False, fuse=fuse)  # noqa: E731
+    plain = jax.jit(lambda features: run(features, None))(features)
+    hooked = jax.jit(lambda features, touched: run(features, fuse_of(touched)))
+    np.testing.assert_array_equal(hooked(features, jnp.zeros(32, bool)), plain)
+    some = jnp.arange(32) % 3 == 0
+    changed = (np.asarray(hooked(features, some)) != np.asarray(plain)).any(-1)
+    np.testing.assert_array_equal(changed.ravel(), some)

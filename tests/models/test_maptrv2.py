@@ -7,14 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import CAMERA, LINES, SMALL_LINES, make_camera_example, make_line_example
+from tests.models.cases import LIFTED_LINES, LINES, SMALL_LINES, make_camera_example, make_line_example
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
-from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
-from tflane_jax.models.lift import LiftConfig
 from tflane_jax.models.maptrv2 import DecoupledLayer, MapTrV2Config
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -101,11 +99,7 @@ def make_depth_example(seed):
 
 @pytest.mark.slow
 def test_with_cameras_it_learns_depth_and_masks_in_the_images_too():
-    images = replace(CAMERA.images, stages=(3,), pyramid=replace(CAMERA.images.pyramid, levels=1))
-    lift = LiftConfig(CAMERA.bev.grid, dim=16, cameras=2, depth=(1.0, 9.0, 1.0), pyramid=4, supervised=True)
-    encoder = CameraEncoderConfig(images, lift, line_masks=True)
-    model = replace(MODEL, encoder=encoder, priors=replace(MODEL.priors, traffic_flow=None))
-    task = LaneGraphTask(model, MapTrV2LossConfig(many_repeats=2))
+    task = LaneGraphTask(LIFTED_LINES, MapTrV2LossConfig(many_repeats=2))
     batch = stack_examples([make_depth_example(seed) for seed in (0, 1)])
     params = random_params(task.init, make_depth_example(0))
     run = jax.jit(jax.value_and_grad(task.loss, has_aux=True))

@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.models.cases import BASELINE, CAMERA_TOPONET, WITH_TRAFFIC, make_camera_example, make_example
+from tests.models.cases import (
+    BASELINE,
+    CAMERA_TOPONET,
+    LIFTED_LINES,
+    WITH_TRAFFIC,
+    make_camera_example,
+    make_example,
+)
 from tests.parameters import random_params
 from tflane_jax.errors import UserError
 from tflane_jax.models.priors import PriorsConfig, bev_hook
@@ -41,15 +48,20 @@ def restricted(params, shapes):
 
 @pytest.mark.parametrize(
     ("host", "make"),
-    [(BASELINE, make_example), pytest.param(CAMERA_TOPONET, make_camera_example, marks=pytest.mark.slow)],
-    ids=["evidence", "cameras"],
+    [
+        (BASELINE, make_example),
+        pytest.param(CAMERA_TOPONET, make_camera_example, marks=pytest.mark.slow),
+        pytest.param(LIFTED_LINES, make_camera_example, marks=pytest.mark.slow),
+    ],
+    ids=["evidence", "cameras", "lift"],
 )
 def test_absent_traffic_gives_the_host_without_the_prior(host, make):
     task, example = LaneGraphTask(with_flow(host, INTO_BEV)), make(0)
     params = random_params(task.init, example, spread=0.2)
     predict = jax.jit(task.predict)
     absent, present = predict(params, without_flow(example)), predict(params, example)
-    assert not np.array_equal(absent.centerlines.points, present.centerlines.points)
+    points = [(answer.lines or answer.centerlines).points for answer in (absent, present)]
+    assert not np.array_equal(*points)
     flow = example.traffic_flow
     garbage = flow.replace(position=np.full_like(flow.position, np.nan), valid=np.zeros_like(flow.valid))
     same(absent, predict(params, example.replace(traffic_flow=garbage)))

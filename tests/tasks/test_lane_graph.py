@@ -19,6 +19,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
@@ -51,10 +52,36 @@ def test_a_raster_of_another_range_is_named():
     [(TopoNetConfig(), "lane_points"), (LaneSegNetConfig(), "segment_points"), (LaneSegNetConfig(), "area_points")],
 )
 def test_truth_of_other_points_is_named(model, setting):
-    task = LaneGraphTask(model)
-    task.check(WorldData(), EXAMPLES)
+    task, forms = LaneGraphTask(model), {name: value for name, (value, _) in model.example_forms.items()}
+    task.check(WorldData(example=ExampleConfig(**forms)), EXAMPLES)
     with pytest.raises(UserError, match=rf"data\.example\.{setting}=\d+, .*not 7"):
         task.check(WorldData(example=ExampleConfig(**{setting: 7})), EXAMPLES)
+
+
+def test_crossings_in_the_form_of_another_host_are_named():
+    segments = LaneSegNetConfig()
+    areas = LaneSegNetConfig(decoder=replace(segments.decoder, classes=1), areas=AreaDecoderConfig())
+    for model, own, other in ((segments, "sides", "ring"), (areas, "ring", "sides")):
+        task = LaneGraphTask(model)
+        task.check(WorldData(example=ExampleConfig(crossings=own)), EXAMPLES)
+        with pytest.raises(UserError, match=rf"data\.example\.crossings={own}, not {other}: it learns a crossing as"):
+            task.check(WorldData(example=ExampleConfig(crossings=other)), EXAMPLES)
+    for form in ("ring", "sides"):  # TopoNet learns no crossings
+        LaneGraphTask(TopoNetConfig()).check(WorldData(example=ExampleConfig(crossings=form)), EXAMPLES)
+
+
+def test_a_class_of_lines_without_labels_is_named():
+    examples = stack_examples([make_line_example()])
+    four = LaneGraphTask(MapTrConfig(decoder=LineDecoderConfig(points=20, classes=4)))
+    three = LaneGraphTask(MapTrConfig(decoder=LineDecoderConfig(points=20)))
+    include, exclude = (
+        WorldData(example=ExampleConfig(map_lines=MapLinesConfig(centerlines=form))) for form in ("include", "exclude")
+    )
+    four.check(include, examples)
+    with pytest.raises(UserError, match=r"map_lines\.centerlines=include, not exclude: it learns four classes"):
+        four.check(exclude, examples)
+    for data in (include, exclude):  # more labels than classes do no harm
+        three.check(data, examples)
 
 
 def test_map_lines_of_other_points_or_none_at_all_are_named():

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from tests.world.road_networks import case_networks, crossings_of, inside_boxes
+from tflane_jax.datasets.map_geometry import MapGeometry
 from tflane_jax.geometry.polylines import arc_length, resample
+from tflane_jax.geometry.rings import signed_area
 from tflane_jax.scene import LineType
 
 
@@ -25,6 +27,23 @@ def test_kerbs_do_not_cross_themselves_or_each_other():
         for k, a in enumerate(kerbs):
             for b in kerbs[: k + 1]:
                 assert not crossings_of(a, b).any()
+
+
+def test_rings_of_a_vector_map_run_as_maptr_has_them():
+    """Crossings clockwise and islands the other way, so that MapTR's loss needs one direction (`rings="one"`)."""
+    islands = crossings = 0
+    for net in case_networks():
+        geometry = MapGeometry.of(
+            crossings=[[ring] for ring in net.map.crossings], boundaries=list(net.map.road_boundaries)
+        )
+        lines = [geometry.boundaries.line(i) for i in range(len(geometry.boundaries.ends))]
+        rings = [line for line in lines if np.array_equal(line[0], line[-1])]
+        assert all(signed_area(ring) > 0.0 for ring in rings)
+        islands += len(rings)
+        crossings += len(geometry.polygon)
+        assert all(signed_area(geometry.crossings.line(i)) < 0.0 for i in range(len(geometry.polygon)))
+    assert islands > 0
+    assert crossings > 0
 
 
 def test_pedestrians_walk_behind_the_kerbs():

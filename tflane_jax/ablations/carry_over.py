@@ -14,6 +14,8 @@ without them, and with the tracks of another log. Models that see no map are tra
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +31,7 @@ from tflane_jax.ablations.jobs import Failure, Job, check_rows
 from tflane_jax.ablations.paper.table import shortened
 from tflane_jax.ablations.scores import measure
 from tflane_jax.ablations.statistics import holm, paired_difference
-from tflane_jax.ablations.store import remaining_seconds, stored_jobs
+from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, stored_jobs
 from tflane_jax.ablations.workers import noted, train_all, worker_threads
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.datasets.real_maps import RealMapData
@@ -75,6 +77,7 @@ class Settings:
         seeds: of training.
         steps, scenes: updates and training scenes of each run; None for those of the configurations.
         jobs: trainings at a time.
+        cores: of each training; None shares all between the trainings.
         quick: few updates on few scenes: a smoke test, no result.
     """
 
@@ -85,15 +88,23 @@ class Settings:
     steps: int | None = None
     scenes: int | None = None
     jobs: int = 1
+    cores: int | None = None
     quick: bool = False
 
 
 @dataclass
 class _Plan:
-    """The trainings: by model, by the log that it leaves out ("" for none), one for each seed."""
+    """The trainings: by model, by the log that it leaves out ("" for none), one for each seed.
+
+    Attributes:
+        logs: that are left out and tested on.
+        every: all recorded logs.
+        content: hash of the files of each map in the folder, on which every run depends.
+    """
 
     logs: tuple[str, ...]
     every: tuple[str, ...]
+    content: Mapping[str, str]
     jobs: dict[str, dict[str, list[Job]]] = field(default_factory=dict)
 
     def of(self, row: str, log: str) -> list[Job]:
@@ -117,18 +128,19 @@ def carry_over(settings: Settings, out: Path) -> Path:
         The file of the main table.
 
     Raises:
-        UserError: fewer than two logs, an unknown log or row, another declaration in `out`, or trainings that failed,
-            after the tables of the others were written.
+        UserError: fewer than two logs, an unknown log or row, another declaration in `out` (further logs or seeds,
+            other maps, steps, scenes or models), or trainings that failed, after the tables of the others were written.
     """
     out = out / "quick" if settings.quick else out
     configs = _configs(settings)
     claims = tuple(claim for claim in CLAIMS if {claim.treatment, str(claim.control).split(",")[0]} <= set(configs))
     declaration = Declaration(PRIMARY, claims)
     check(declaration, configs)
-    plan = _planned(settings, configs, out)
+    folder = _logs(settings)
+    plan = _planned(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
     by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
     check_rows(by_row)
-    declared = declare(declaration, by_row, settings.seeds, out)
+    declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=plan.content)
     complete = sum(job.is_complete() for job in plan.flat())
     seconds, guesses = remaining_seconds(by_row, _MINUTES)
     basis = "a guess" if guesses else "by the runs so far"
@@ -137,11 +149,17 @@ def carry_over(settings: Settings, out: Path) -> Path:
         f"({settings.jobs} at a time; {basis})",
         flush=True,
     )
-    failures = train_all(plan.flat(), settings.jobs)
-    found, protocol = _evaluated(plan, failures)
+
+    def replan(threads: Mapping[str, Any]) -> list[Job]:
+        return _planned(folder, settings, configs, out, threads).flat()
+
+    for line in runs_elsewhere(plan.flat(), out / "runs", replan):
+        print(line, flush=True)
+    failures = train_all(plan.flat(), settings.jobs, settings.cores)
+    found, seeds, protocol = _evaluated(plan, failures)
     if not found:
         raise UserError(summary_of(failures, len(plan.flat())))
-    path = _save(found, declared, protocol, settings, out)
+    path = _save(found, seeds, declared, protocol, out, quick=settings.quick)
     _draw(plan, failures, out)
     print(f"\nwritten to {out}")
     if failures:
@@ -173,20 +191,30 @@ def _data(config: RunConfig) -> RealMapData:
     return config.data
 
 
-def _planned(settings: Settings, configs: Mapping[str, RunConfig], out: Path) -> _Plan:
-    names = tuple(one.name for one in find_maps(settings.maps) if one.recorded)
+def _logs(settings: Settings) -> _Plan:
+    """Return the plan without trainings; raise UserError where logs are missing."""
+    maps = find_maps(settings.maps)
+    names = tuple(one.name for one in maps if one.recorded)
     if len(names) < 2:
         raise UserError(f"{settings.maps} has {len(names)} recorded logs: to leave one out, there must be two or more")
     if unknown := set(settings.logs) - set(names):
         raise UserError(f"{settings.maps} has no recorded log {min(unknown)}, only {', '.join(names)}")
-    plan = _Plan(settings.logs or names, names)
-    threads, store = worker_threads(settings.jobs), out / "runs"
+    return _Plan(tuple(sorted(settings.logs or names)), names, {one.name: one.content() for one in maps})
+
+
+def _planned(
+    folder: _Plan, settings: Settings, configs: Mapping[str, RunConfig], out: Path, threads: Mapping[str, Any]
+) -> _Plan:
+    """Return the plan of a folder with its trainings."""
+    plan, store = replace(folder, jobs={}), out / "runs"
+    content = hashlib.sha256(json.dumps(plan.content, sort_keys=True).encode()).hexdigest()
     for row, config in configs.items():
         data = _data(config)
         logs = ("",) if data.generated == 1.0 else plan.logs
         left = {log: replace(config, data=replace(data, test_logs=(log,) if log else ())) for log in logs}
         labelled = {log: f"{row}, without {log[:12]}" if log else row for log in logs}
-        jobs = stored_jobs({labelled[log]: left[log] for log in logs}, settings.seeds, store, threads=threads)
+        named = {labelled[log]: left[log] for log in logs}
+        jobs = stored_jobs(named, settings.seeds, store, threads=threads, content=content)
         plan.jobs[row] = {log: jobs[labelled[log]] for log in logs}
     return plan
 
@@ -196,9 +224,12 @@ def _tested(config: RunConfig, log: str, traffic: str = "") -> RunConfig:
     return replace(config, data=replace(_data(config), test_logs=(log,), test_on="recordings", test_traffic=traffic))
 
 
-def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, str]:
-    """Return the scores of all finished runs on the logs that they have not seen, and the protocol."""
-    found: dict[str, dict[str, list[Scores]]] = {}
+def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, set[int]], str]:
+    """Return the scores of all finished runs on the logs that they have not seen, seeds by log, and the protocol.
+
+    The seeds of a log are those of which every model was tested on it.
+    """
+    found: dict[str, dict[str, dict[int, Scores]]] = {}
     protocol, failed = "", {failure.job.folder for failure in failures}
     pairs = [(row, log) for row in plan.jobs for log in plan.logs]
     for row, log in tqdm(pairs, desc="test on recorded logs", unit="log"):
@@ -214,24 +245,37 @@ def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, str]:
                     assert swapped is not None
                     ways |= {f"{row}, {NONE}": own.ways[NONE], f"{row}, {OTHER}": swapped.ways[""]}
                 for name, scores in ways.items():
-                    found.setdefault(name, {}).setdefault(log, []).append(scores)
-    means = {
-        name: {log: {key: float(np.mean([s[key] for s in seeds])) for key in seeds[0]} for log, seeds in by_log.items()}
-        for name, by_log in found.items()
+                    of_log = found.setdefault(name, {}).setdefault(log, {})
+                    of_log[job.config.training.seeds[0]] = scores
+    means = {name: {log: _mean(list(each.values())) for log, each in by_log.items()} for name, by_log in found.items()}
+    seeds = {
+        log: {job.config.training.seeds[0] for row in plan.jobs for job in plan.of(row, log)}.intersection(
+            *(by_log.get(log, {}) for by_log in found.values())
+        )
+        for log in plan.logs
     }
-    return means, protocol
+    return means, seeds, protocol
 
 
-def _save(found: ByLog, declared: Declared, protocol: str, settings: Settings, out: Path) -> Path:
+def _mean(scores: Sequence[Scores]) -> Scores:
+    return {key: float(np.mean([each[key] for each in scores])) for key in scores[0]}
+
+
+def _save(
+    found: ByLog, seeds_by_log: Mapping[str, set[int]], declared: Declared, protocol: str, out: Path, *, quick: bool
+) -> Path:
     """Print and write the tables; only logs that every row was tested on count in means and tests."""
     logs = [log for log in next(iter(found.values())) if all(log in by_log for by_log in found.values())]
     if not logs:
         raise UserError("no log has been tested with every model yet: run the same command again")
-    note = "SMOKE TEST, a few updates on a few scenes: no result. " if settings.quick else ""
-    meta = {"logs": logs, "seeds": list(settings.seeds), "protocol": protocol, "quick": settings.quick}
+    seeds = sorted(set.intersection(*(seeds_by_log[log] for log in logs)))
+    note = "SMOKE TEST, a few updates on a few scenes: no result. " if quick else ""
+    interim = declared.interim(seeds, logs)
+    ending = f". {interim}" if interim else ""
+    meta = {"logs": logs, "seeds": list(seeds), "protocol": protocol, "quick": quick}
     columns = [key for key in COLUMNS if all(key in found[row][log] for row in found for log in logs)]
     rows = compact([Variant(row, tuple(by_log[log] for log in logs)) for row, by_log in found.items()], columns)
-    title = f"{note}{protocol}; logs that were never seen, percent (mean ± std over {len(logs)} logs)"
+    title = f"{note}{protocol}; logs that were never seen, percent (mean ± std over {len(logs)} logs){ending}"
     path, _ = save_table(out / "carry_over", rows, meta, title=title)
     print("\n" + format_table(rows, title=title))
     each: list[dict[str, Any]] = [
@@ -239,9 +283,11 @@ def _save(found: ByLog, declared: Declared, protocol: str, settings: Settings, o
         for log in logs
         for row in found
     ]
-    save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent (mean over {len(settings.seeds)} seeds)")
+    save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent (mean over {len(seeds)} seeds){ending}")
     tests = _tests(found, logs, declared)
-    title = f"{note}{declared.sentence()} Paired over {len(logs)} logs, points."
+    title = " ".join(
+        filter(None, [note.strip(), declared.sentence(), interim, f"Paired over {len(logs)} logs, points."])
+    )
     save_table(out / "effects", tests, meta, title=title)
     print("\n" + format_table(tests, title=title))
     return path

@@ -73,7 +73,7 @@ def compare(
         check(declaration, configs)
     plan = plan_jobs(configs, seeds, out, threads=worker_threads(jobs), tests=tests, retrain=retrain)
     check_rows(plan)
-    declared = None if declaration is None else declare(declaration, plan, seeds, out)
+    declared = None if declaration is None else declare(declaration, plan, configs, seeds, out)
     # Seed by seed, so that a comparison stopped early has pairs.
     every = [plan[name][i] for i in range(len(seeds)) for name in plan]
     failures = train_all(every, jobs)
@@ -135,11 +135,12 @@ def evaluate_runs(trained: Mapping[str, Sequence[Job]], results: Results) -> lis
 
 
 def first_models(trained: Mapping[str, Sequence[Job]], results: Results) -> dict[str, Model]:
-    """Return the model of each row's first seed at its last checkpoint."""
+    """Return the model of each row's first seed at its last checkpoint; no recorded run whose folder is not at hand."""
     models = {}
     for name, done in trained.items():
-        if results.has(name):
-            run = open_run(done[0].folder, "last")
+        job = next((job for job in done if job.recorded is None or job.is_at_hand()), None)
+        if results.has(name) and job is not None:
+            run = open_run(job.folder, "last")
             models[name] = Model(run.config.task, run.params[0])
     return models
 

@@ -1,26 +1,30 @@
 """What a comparison tests, written down in its folder before the runs.
 
-The file is never changed. A comparison with another declaration needs another folder; one that was declared when runs
-existed already says so in its report.
+The file is never changed. It holds the configuration of every row, so that a comparison of other ones needs another
+folder, as does one with another declaration. One that was declared when runs existed already says so in its report.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.config import RunConfig
-from tflane_jax.config_io import first_difference
+from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.fields import load_json
+from tflane_jax.runs import current_form
 from tflane_jax.training.provenance import provenance
 
 FILE = "declaration.json"
+
+# What files of earlier versions lack.
+_SECONDARY, _CONFIGURATIONS = "secondary", "configurations"
 
 
 @dataclass(frozen=True)
@@ -47,17 +51,19 @@ class Declaration:
         claims: what is claimed; Holm's correction is over all of them.
         negative_control: score on which no treatment should change anything; None for none.
         alpha: significance level of the corrected tests.
+        secondary: score that is tested as well, corrected apart from the primary one; None for none.
     """
 
     primary: str
     claims: tuple[Claim, ...]
     negative_control: str | None = None
     alpha: float = 0.05
+    secondary: str | None = None
 
     @property
     def scores(self) -> tuple[str, ...]:
         """The scores that are tested."""
-        return (self.primary,) if self.negative_control is None else (self.primary, self.negative_control)
+        return tuple(score for score in (self.primary, self.secondary, self.negative_control) if score is not None)
 
 
 @dataclass(frozen=True)
@@ -69,24 +75,43 @@ class Declared:
         seeds: that were declared; the comparison may have fewer so far.
         time: when it was written, ISO 8601.
         begun: number of runs that existed in the folder at that time.
+        logs: recorded logs that were declared; the comparison may have fewer so far.
+        missing: what a file of an earlier version does not hold, of "secondary" and "configurations".
     """
 
     declaration: Declaration
     seeds: tuple[int, ...]
     time: str
     begun: int
+    logs: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
 
     def sentence(self) -> str:
         """Return what was declared, and when."""
         what = f"primary measure {self.declaration.primary}"
+        if self.declaration.secondary is not None:
+            late = " (added later, not declared)" if _SECONDARY in self.missing else ""
+            what += f", secondary measure {self.declaration.secondary}{late}"
         if self.declaration.negative_control is not None:
             what += f", negative control {self.declaration.negative_control}"
         when = "before any run" if self.begun == 0 else f"when {self.begun} runs had begun already"
         treatments = ", ".join(dict.fromkeys(claim.treatment for claim in self.declaration.claims))
-        return (
+        text = (
             f"Declared {when} ({self.time}): {what}, treatment {treatments}, "
             f"level {self.declaration.alpha:g}, {len(self.seeds)} seeds."
         )
+        if _CONFIGURATIONS in self.missing:
+            text += " This declaration of an earlier version holds no configurations: those of the rows may be later."
+        return text
+
+    def interim(self, seeds: Sequence[int], logs: Sequence[str] = ()) -> str:
+        """Return a sentence for a comparison of fewer seeds or logs than were declared; "" for one of all."""
+        parts = []
+        if set(seeds) != set(self.seeds):
+            parts.append(f"{len(seeds)} of {len(self.seeds)} declared seeds ({', '.join(map(str, seeds))})")
+        if set(logs) != set(self.logs):
+            parts.append(f"{len(logs)} of {len(self.logs)} declared logs ({', '.join(logs)})")
+        return f"**Interim**: {' and '.join(parts)}." if parts else ""
 
 
 def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
@@ -101,6 +126,8 @@ def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
                 raise UserError(f"{name} is not measured by {score}, only by {listed}")
     if declaration.primary == declaration.negative_control:
         raise UserError(f"{declaration.primary} cannot be primary measure and negative control")
+    if declaration.secondary in (declaration.primary, declaration.negative_control) and declaration.secondary:
+        raise UserError(f"{declaration.secondary} cannot be the secondary measure: it is tested already")
     if not 0.0 < declaration.alpha < 1.0:
         raise UserError(f"--alpha {declaration.alpha:g} is no significance level between 0 and 1")
 
@@ -119,30 +146,90 @@ def _check_claim(claim: Claim, models: Sequence[str]) -> None:
             raise UserError(f"a claim is about {row}, which is none of the models ({', '.join(models)})")
 
 
-def declare(declaration: Declaration, plan: Mapping[str, Sequence[Job]], seeds: Sequence[int], out: Path) -> Declared:
+def declare(
+    declaration: Declaration,
+    plan: Mapping[str, Sequence[Job]],
+    configs: Mapping[str, RunConfig],
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    logs: Sequence[str] = (),
+    content: Mapping[str, str] | None = None,
+) -> Declared:
     """Write the declaration into the comparison's folder, unless it is there already, and return it.
 
+    Args:
+        declaration: what is tested.
+        plan: the trainings of each row.
+        configs: of the rows, and of what they start from, by name; the seeds in them do not matter.
+        seeds: of the comparison; fewer than were declared are an interim look.
+        out: folder of the comparison.
+        logs: recorded logs that it is about, fewer as for seeds.
+        content: hashes of files that the runs depend on beyond their configurations, by name.
+
     Raises:
-        UserError: the folder holds another declaration, or one of other models or without some of the seeds.
+        UserError: the folder holds another declaration, or one of other models or configurations, or without some of
+            the seeds or logs.
     """
-    claims = [asdict(claim) for claim in declaration.claims]
-    path, wanted = out / FILE, asdict(declaration) | {"claims": claims, "models": list(plan)}
-    found: dict[str, Any] = {}
+    path = out / FILE
+    wanted = asdict(declaration) | {"claims": _tested(declaration.claims), "models": list(plan)}
+    rows, files = {name: _identity(config) for name, config in configs.items()}, dict(content or {})
     if path.exists():
         found = _read(path)
-    if not found:
+    else:
         source = provenance()
         begun = sum(job.start() == "resume" for planned in plan.values() for job in planned)
-        found = wanted | {"seeds": list(seeds), "begun": begun} | {name: source[name] for name in ("time", "git")}
+        found = wanted | {"claims": [asdict(claim) for claim in declaration.claims], "seeds": list(seeds)}
+        found |= {"begun": begun} | {name: source[name] for name in ("time", "git")}
+        found |= {"logs": sorted(logs), "content": files, _CONFIGURATIONS: rows}
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, found)
-    declared = Declared(declaration, tuple(found["seeds"]), found["time"], found["begun"])
-    difference = first_difference({name: found[name] for name in wanted}, wanted)
-    if not difference and (more := sorted(set(seeds) - set(declared.seeds))):
-        difference = f"seed {more[0]} was not declared"
+    missing = tuple(name for name in (_SECONDARY, _CONFIGURATIONS) if name not in found)
+    known = tuple(found.get("logs", sorted(logs)))  # earlier versions wrote down no logs
+    declared = Declared(declaration, tuple(found["seeds"]), found["time"], found["begun"], known, missing)
+    then = {name: found.get(name, wanted[name]) for name in wanted} | {"claims": _tested(_claims(found))}
+    difference = first_difference(then, wanted)
+    if _CONFIGURATIONS in found:
+        difference = difference or _other_rows(found, rows, files)
+    if more := sorted(set(seeds) - set(declared.seeds)):
+        difference = difference or f"seed {more[0]} was not declared"
+    if new := sorted(set(logs) - set(declared.logs)):
+        difference = difference or f"log {new[0]} was not declared"
     if difference:
         raise UserError(f"{path} holds another declaration ({difference}): choose another folder with --out")
     return declared
+
+
+def _identity(config: RunConfig) -> dict[str, Any]:
+    """Return a configuration as plain JSON, without seeds."""
+    return to_json(replace(config, training=replace(config.training, seeds=())))
+
+
+def _tested(claims: Sequence[Claim]) -> list[dict[str, Any]]:
+    """Return what claims test, as plain JSON; their words may be corrected later."""
+    return [{"treatment": claim.treatment, "control": claim.control} for claim in claims]
+
+
+def _claims(found: Mapping[str, Any]) -> list[Claim]:
+    return [Claim(claim["treatment"], claim["control"]) for claim in found["claims"]]
+
+
+def _other_rows(found: Mapping[str, Any], rows: Mapping[str, Any], files: Mapping[str, str]) -> str:
+    """Return which row has another configuration than was declared, or which files are others; "" for none."""
+    declared = found[_CONFIGURATIONS]
+    if changed := declared.keys() ^ rows.keys():
+        return f"{min(changed)} is {'declared' if min(changed) in declared else 'planned'} only"
+    for name, here in rows.items():
+        if (there := declared[name]) == here:
+            continue
+        try:
+            there, _ = current_form(there)
+        except UserError as error:
+            return f"{name}: {error}"
+        if difference := first_difference(there, here):
+            return f"{name}: {difference}"
+    changed = first_difference(found["content"], dict(files))
+    return f"content of {changed}" if changed else ""
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -152,10 +239,17 @@ def _read(path: Path) -> dict[str, Any]:
         found = _current_form(dict(load_json(path)))
     except (TypeError, ValueError) as error:
         raise UserError(f"{path} is damaged: it holds no declaration; {remedy}") from error
-    names = [field.name for field in dataclasses.fields(Declaration)]
-    kinds = {"seeds": list, "time": str, "begun": int, "models": list} | dict.fromkeys(names, object)
+    names = [field.name for field in dataclasses.fields(Declaration) if field.name != _SECONDARY]
+    kinds = {"seeds": list, "time": str, "begun": int, "models": list} | dict.fromkeys(names, object) | {"claims": list}
+    if _CONFIGURATIONS in found:
+        kinds |= {_CONFIGURATIONS: dict, "content": dict, "logs": list}
     if wrong := [name for name, kind in kinds.items() if name not in found or not isinstance(found[name], kind)]:
         raise UserError(f"{path} is damaged ({wrong[0]}); {remedy}")
+    for claim in found["claims"]:
+        if not isinstance(claim, dict) or not claim.keys() >= {"treatment", "control"}:
+            raise UserError(f"{path} is damaged (claims); {remedy}")
+    if not all(isinstance(config, dict) for config in found.get(_CONFIGURATIONS, {}).values()):
+        raise UserError(f"{path} is damaged ({_CONFIGURATIONS}); {remedy}")
     return found
 
 

@@ -7,7 +7,7 @@ measure and checkpoint) and between test scenes (bootstrap interval over scenes,
 the wrong direction, else *not shown*.
 
 The interval is exact for ratios of counts, such as recall. Scores that rank detections over all scenes (DET_l, AP_l,
-TOP_ll) have none.
+TOP_ll) have none: their findings stand on p alone, and say so.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
+from tflane_jax.ablations.recorded import Which
 from tflane_jax.ablations.report import listed
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import CHECKPOINTS, Which
+from tflane_jax.ablations.scores import CHECKPOINTS
 from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio, scene_weights
+from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 
 SAMPLES = 10_000
+HAS_INTERVAL = "95 %"
+NO_INTERVAL = "no interval over scenes: decided by seeds alone"
 Finding = Literal["shown", "not shown", "contradicted"]
 
 
@@ -79,13 +83,18 @@ class Effect:
 
 
 def measures(declaration: Declaration) -> tuple[Measure, ...]:
-    """Return the primary measure, the negative control, and their difference, which tests that the effect differs."""
-    primary, control = declaration.primary, declaration.negative_control
-    alone = Measure(primary, {primary: 1.0})
-    if control is None:
-        return (alone,)
-    difference = Measure("difference of the two", {primary: 1.0, control: -1.0})
-    return alone, Measure(f"negative control {control}", {control: 1.0}), difference
+    """Return the primary measure, the negative control, their difference, and the secondary measure.
+
+    The difference tests that the effect differs between primary measure and negative control.
+    """
+    primary, control, secondary = declaration.primary, declaration.negative_control, declaration.secondary
+    found = [Measure(primary, {primary: 1.0})]
+    if control is not None:
+        found.append(Measure(f"negative control {control}", {control: 1.0}))
+        found.append(Measure("difference of the two", {primary: 1.0, control: -1.0}))
+    if secondary is not None:
+        found.append(Measure(f"secondary measure {secondary}", {secondary: 1.0}))
+    return tuple(found)
 
 
 def effects(
@@ -102,8 +111,9 @@ def effects(
         which: checkpoint.
         errors: scores where lower is better.
     """
-    sign, found = -1.0 if declaration.primary in errors else 1.0, []
+    found = []
     for measure in measures(declaration):
+        sign = -1.0 if next(iter(measure.scores)) in errors else 1.0
         every = [e for claim in declaration.claims for e in _of_claim(results, claim, measure, test, which, sign)]
         for effect, corrected in zip(every, holm([effect.p for effect in every]), strict=True):
             judged = _finding(effect, corrected, declaration.alpha, sign)
@@ -153,6 +163,12 @@ def _compared(results: Results, table: Mapping[str, Any], treatment: str) -> lis
 
 
 def _values(by_seed: Mapping[int, Mapping[str, float]], measure: Measure, seeds: Sequence[int]) -> np.ndarray:
+    every = [(seed, score) for seed in seeds for score in measure.scores]
+    if missing := [(seed, score) for seed, score in every if score not in by_seed[seed]]:
+        raise UserError(
+            f"the run of seed {missing[0][0]} has no {missing[0][1]}: an earlier state of the code measured it; leave "
+            "out --earlier-scores to measure it again"
+        )
     return np.array([sum(weight * by_seed[seed][score] for score, weight in measure.scores.items()) for seed in seeds])
 
 
@@ -161,7 +177,7 @@ def _samples(
 ) -> dict[str, Float[np.ndarray, " b"]]:
     """Return bootstrap samples of the measure for each row, all of the same draws; empty if it is no ratio of counts.
 
-    Raises ValueError if rows count different lanes, so that they were not measured on the same scenes.
+    Raises UserError if rows count different lanes, so that they were not measured on the same scenes.
     """
     ratios = {row: [results.ratios[test, which][row][seed] for seed in seeds] for row in rows}
     if not all(score in of_seed for each in ratios.values() for of_seed in each for score in measure.scores):
@@ -172,7 +188,10 @@ def _samples(
         weights = scene_weights(len(denominator), SAMPLES)
         for row, each in ratios.items():
             if any(of_seed[score].denominator != denominator for of_seed in each):
-                raise ValueError(f"{row} and {rows[0]} were not measured on the same lanes ({score})")
+                raise UserError(
+                    f"{row} and {rows[0]} were not measured on the same lanes ({score}): a recorded run, or one that "
+                    "an earlier state of the code measured, saw other test data; train and measure it again"
+                )
             numerators = np.array([of_seed[score].numerator for of_seed in each])
             samples[row] = samples[row] + weight * resampled_ratio(numerators, np.array(denominator), weights)
     return samples
@@ -221,7 +240,7 @@ def findings(every: Sequence[Effect]) -> list[str]:
 
 
 def sentence(of_row: Sequence[Effect]) -> str:
-    """Return the effects against one row as a sentence: primary measure, then negative control and their difference."""
+    """Return the effects against one row as a sentence: primary measure, then the others, see `measures`."""
     primary, *others = of_row
     claim = primary.claim
     text = (
@@ -234,9 +253,10 @@ def sentence(of_row: Sequence[Effect]) -> str:
 
 def _numbers(effect: Effect) -> str:
     """Return a difference in points of percent, with its uncertainties."""
-    parts = [] if math.isnan(effect.low) else [f"95 % {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
     parts += [] if math.isnan(effect.p) else [_p_value(effect.p_holm)]
     parts.append(f"better in {effect.better} of {len(effect.seeds)} seeds")
+    parts += [NO_INTERVAL] if math.isnan(effect.low) else []
     return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
 
 

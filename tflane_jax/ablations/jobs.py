@@ -13,8 +13,9 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from tflane_jax.ablations.recorded import RecordedRun
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import first_difference, to_json
 from tflane_jax.errors import UserError
@@ -23,11 +24,14 @@ from tflane_jax.run_checks import check_run
 from tflane_jax.runs import check_origin, current_form
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.fine_tuning import origin_folders, origins
-from tflane_jax.training.provenance import read_provenance, thread_setting
+from tflane_jax.training.provenance import read_provenance, thread_setting, threads_of
 from tflane_jax.training.run_folder import Start, read_config
 
 Tests = Mapping[str, Sequence[str]]
 """Test sets by name: settings of the data, `--data.name value`, that differ from the configuration's test split."""
+
+ScoredBy = Literal["this code", "any code"]
+"""State of the code whose scores count where they are kept beside a run; others are measured again."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,9 @@ class Job:
         retrain: whether a run of another configuration in the folder is deleted.
         label: name for people.
         further: evaluations of the last checkpoint beside the configuration's own.
+        content: hash of files that the run depends on beyond its configuration; "" for none.
+        scored_by: which kept scores count.
+        recorded: the run in a record of scores, which takes the place of the folder; None for none.
     """
 
     config: RunConfig
@@ -51,6 +58,9 @@ class Job:
     retrain: bool = False
     label: str = ""
     further: tuple[EvaluationConfig, ...] = ()
+    content: str = ""
+    scored_by: ScoredBy = "this code"
+    recorded: RecordedRun | None = None
 
     @property
     def log(self) -> Path:
@@ -60,12 +70,12 @@ class Job:
     @property
     def key(self) -> str:
         """Hash of everything that identifies the run."""
-        text = json.dumps([to_json(self.config), dict(self.threads)], sort_keys=True)
+        text = json.dumps([to_json(self.config), dict(self.threads), *filter(None, [self.content])], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def difference(self) -> str:
         """Return how the run in the folder differs from this one; "" if it does not, or the folder holds none."""
-        if not self._exists():
+        if not self.exists():
             return ""
         try:
             saved, _ = current_form(read_config(self.folder))
@@ -75,7 +85,7 @@ class Job:
             return difference
         # A run that was started before these were recorded is taken as it is.
         for start in read_provenance(self.folder):
-            if difference := first_difference(start.get("threads", self.threads), dict(self.threads)):
+            if difference := first_difference(threads_of(start) or dict(self.threads), dict(self.threads)):
                 return difference
             if difference := self._other_origin(start.get("init_from", [])):
                 return difference
@@ -95,20 +105,29 @@ class Job:
 
     def start(self) -> Start:
         """Return how the training has to start."""
-        if not self._exists():
+        if self.recorded is not None:
+            return "resume"
+        if not self.exists():
             return "new"
         return "overwrite" if self.retrain and self.difference() else "resume"
 
     def is_complete(self) -> bool:
+        """Return whether nothing is left to train: the run is recorded, or at hand."""
+        return self.recorded is not None or self.is_at_hand()
+
+    def is_at_hand(self) -> bool:
         """Return whether the folder holds this very run with the checkpoint of its last step."""
         steps = Checkpoints(self.folder / "checkpoints").steps()
-        return self._exists() and steps[-1:] == [self.config.training.steps] and not self.difference()
+        return self.exists() and steps[-1:] == [self.config.training.steps] and not self.difference()
 
-    def _exists(self) -> bool:
+    def exists(self) -> bool:
+        """Return whether the folder holds a run."""
         return (self.folder / "config.json").is_file()
 
     def step(self) -> int:
         """Return the last step in the run's records, 0 without records; for progress bars."""
+        if self.recorded is not None:
+            return self.config.training.steps
         with contextlib.suppress(OSError, IndexError, ValueError, KeyError, TypeError, RecursionError):
             lines = (self.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
             return min(int(json.loads(lines[-1])["step"]), self.config.training.steps)
@@ -133,9 +152,11 @@ def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
     """
     wrong, folders = [], {job.folder for jobs in plan.values() for job in jobs}
     for name, jobs in plan.items():
-        if (job := next((job for job in jobs if not job.is_complete()), None)) is not None:
+        if waiting := [job for job in jobs if not job.is_complete()]:
+            job = waiting[0]
             try:
                 check_run(job.config)
+                _check_same(waiting)
                 training = job.config.training
                 starts = folders & set(origin_folders(training.init_from or "", training.seeds))
                 if job.start() != "resume" and not starts:
@@ -146,6 +167,13 @@ def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
         raise UserError(wrong[0])
     if wrong:
         raise UserError("\n  ".join([f"{len(wrong)} of {len(plan)} rows cannot be trained:", *wrong]))
+
+
+def _check_same(jobs: Sequence[Job]) -> None:
+    """Raise UserError for the first of these jobs whose folder holds another run, which it cannot resume."""
+    for job in jobs:
+        if job.start() == "resume" and (difference := job.difference()):
+            raise UserError(f"{job.folder} holds another run ({difference}): choose another folder with --out")
 
 
 def plan_jobs(

@@ -8,6 +8,9 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tflane_jax.ablations.archive import merged, read_archive, write_archive
+from tflane_jax.ablations.effects import HAS_INTERVAL, NO_INTERVAL
+from tflane_jax.ablations.reuse import FILE, archive_path
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_text
@@ -20,16 +23,20 @@ _WIDTH = 120
 def record(summaries: Sequence[Path], folder: Path) -> Path:
     """Copy summaries (see `table_run`) into the folder of results, write its page anew, and return the page.
 
-    The page lies beside the folder: `docs/results` has `docs/results.md`.
+    The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
+    `docs/results/scores`.
 
     Raises:
-        UserError: a summary is of a quick run.
+        UserError: a summary is of a quick run, or what was recorded before is damaged.
     """
     for path in summaries:
         content = load_json(path)
         if member(content, "quick", str(path)):
             raise UserError(f"{path} is of a quick run, which is a smoke test and no result")
-        write_text(folder / f"{member(content, 'table', str(path))}.json", json.dumps(content, indent=1) + "\n")
+        name = member(content, "table", str(path))
+        new, place = read_archive(path.with_name(FILE)), archive_path(folder, name)
+        write_archive(place, merged(read_archive(place), new) if place.exists() else new)
+        write_text(folder / f"{name}.json", json.dumps(content, indent=1) + "\n")
     return write_text(folder.with_name(f"{folder.name}.md"), page(folder))
 
 
@@ -41,8 +48,9 @@ def page(folder: Path) -> str:
         "",
         "Every table of the papers that was run here, in the built-in world. `tflane tables` writes this page from",
         "`docs/results/`; do not edit it. The papers' own numbers are of other data and stand there for orientation.",
-        "A claim is *shown* or *contradicted* if the corrected p and the interval say so, else *not shown*",
-        "([how](comparisons.md)).",
+        "A claim is *shown* or *contradicted* if the corrected p over seeds and the interval over scenes say so, else",
+        "*not shown* ([how](comparisons.md)). Scores that rank detections over all scenes, such as DET_l, have no",
+        "interval: there p alone decides.",
     ]
     for name in (*TABLES, *sorted(found.keys() - TABLES.keys())):
         if name in found:
@@ -88,6 +96,9 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         lines += [*_wrapped(note), ""]
     for finding in summary["findings"]:
         lines += _wrapped(f"{finding}.", first="- ", rest="  ")
+    told = any(text in finding for finding in summary["findings"] for text in (HAS_INTERVAL, NO_INTERVAL))
+    if summary["findings"] and not told:
+        lines += ["", f"{NO_INTERVAL[0].upper()}{NO_INTERVAL[1:]}."]  # earlier summaries do not say it
     quoted = summary["quoted"]
     if quoted["rows"]:
         lines += ["", *_wrapped(f"The paper's own numbers: {quoted['source']}."), ""]

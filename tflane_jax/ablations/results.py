@@ -8,7 +8,8 @@ from typing import Any
 
 from tflane_jax.ablations.comparison import Scores
 from tflane_jax.ablations.jobs import Tests
-from tflane_jax.ablations.scores import Measured, Which
+from tflane_jax.ablations.recorded import Measured, Which
+from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import SceneRatio
 
 Ratios = Mapping[str, SceneRatio]
@@ -26,6 +27,7 @@ class Results:
         scores: by (test set, checkpoint), by row of the table, by seed. Rows are models, or "model, intervention".
         ratios: parts of the scores that are ratios of counts over scenes, in the same order.
         owners: model of each row.
+        protocols: of each test set and model.
     """
 
     models: tuple[str, ...]
@@ -35,14 +37,17 @@ class Results:
     scores: dict[tuple[str, Which], dict[str, dict[int, Scores]]] = field(default_factory=dict)
     ratios: dict[tuple[str, Which], dict[str, dict[int, Ratios]]] = field(default_factory=dict)
     owners: dict[str, str] = field(default_factory=dict)
+    protocols: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def add(self, test: str, which: Which, model: str, seed: int, measured: Measured) -> None:
-        """Add what was measured of a run."""
-        self.protocol = measured.protocol
+        """Add what was measured of a run; raises UserError if it is not measured as the other runs of its row."""
+        self.protocol, first = measured.protocol, self.protocols.setdefault((test, model), measured.protocol)
+        if measured.protocol != first:
+            raise UserError(f"seed {seed} of {model} is measured by {measured.protocol}, earlier ones by {first}")
         for way, scores in measured.ways.items():
             row = f"{model}, {way}" if way else model
             self.owners[row] = model
-            self.scores.setdefault((test, which), {}).setdefault(row, {})[seed] = scores
+            self.scores.setdefault((test, which), {}).setdefault(row, {})[seed] = dict(scores)
             self.ratios.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.ratios[way]
 
     def has(self, model: str) -> bool:

@@ -1,7 +1,8 @@
 """Scores of trained runs on test sets, kept beside each run.
 
-A file of scores is valid for one checkpoint (its content), one data source, one evaluation setting and one state of the
-program's code. Whatever else is in the file is ignored.
+An entry of a file of scores is valid for one checkpoint (its content), one data source, one evaluation setting and one
+state of the program's code. Whatever else is in the file is ignored. Scores by an earlier state of the code count where
+`Job.scored_by` says so. Those of a recorded run are in its record.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tflane_jax
-from tflane_jax.ablations.comparison import Scores
 from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.recorded import Measured, Which, evaluation_name
 from tflane_jax.config import RunConfig, apply_overrides
 from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError
@@ -27,27 +28,9 @@ from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.loop import TrainingConfig
 
-Which = Literal["last", "best"]
 CHECKPOINTS: tuple[Which, ...] = ("last", "best")
 OWN_TEST = ""
 """Name of a configuration's own test split."""
-
-
-@dataclass(frozen=True)
-class Measured:
-    """Scores of one checkpoint on one test set.
-
-    Attributes:
-        step: of the checkpoint.
-        protocol: of the metrics, with its version.
-        ways: scores of each way to use the run: "" as trained, others as `Task.interventions` names them.
-        ratios: parts of the scores that are ratios of counts, by way and score.
-    """
-
-    step: int
-    protocol: str
-    ways: dict[str, Scores]
-    ratios: dict[str, dict[str, SceneRatio]]
 
 
 def with_test_set(config: RunConfig, settings: Sequence[str]) -> RunConfig:
@@ -71,20 +54,22 @@ def _changed(config: RunConfig, settings: tuple[str, ...]) -> RunConfig:
 
 def measure_all(job: Job) -> None:
     """Evaluate a finished run on all of its test sets, so that the scores are at hand afterwards."""
-    for config, which in _evaluations(job):
+    for config, which in evaluations(job):
         measure(job, config, which)
 
 
 def is_measured(job: Job) -> bool:
     """Return whether a run is complete and its file holds everything that `measure_all` would measure."""
+    if job.recorded is not None:
+        return True
     if not job.is_complete():
         return False
     kept = dict(_read(_file(job)))
-    checkpoints = (_checkpoint(job, config, which) for config, which in _evaluations(job))
-    return all(mark in kept for _, mark in filter(None, checkpoints))
+    checkpoints = (_checkpoint(job, config, which) for config, which in evaluations(job))
+    return all(_valid(kept, parts, job) is not None for _, parts in filter(None, checkpoints))
 
 
-def _evaluations(job: Job) -> Iterator[tuple[RunConfig, Which]]:
+def evaluations(job: Job) -> Iterator[tuple[RunConfig, Which]]:
     """Yield everything that a run is to be evaluated by: configuration and checkpoint."""
     for settings in ((), *job.tests.values()):
         for which in CHECKPOINTS:
@@ -104,56 +89,69 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
     Returns:
         None for "best" if no evaluation gave a finite best metric.
     """
+    if job.recorded is not None:
+        return job.recorded.measured[evaluation_name(which, config.evaluation, job.config.evaluation)]
     if (checkpoint := _checkpoint(job, config, which)) is None:
         return None
-    (step, mark), path = checkpoint, _file(job)
-    kept = {name: entry for name, entry in _read(path) if entry["code"] == code_digest()}
-    if mark not in kept:
+    (step, parts), path = checkpoint, _file(job)
+    kept = dict(_read(path))
+    if (entry := _valid(kept, parts, job)) is None:
         run = open_run(job.folder, step)
         task = run.config.task
         data = load_test_data(config)
         ways = {"": config.evaluation} | task.interventions(data, config.evaluation)
         found = {way: task.evaluate(run.params[0], data, evaluation) for way, evaluation in ways.items()}
-        kept[mark] = {
+        entry = {
             "code": code_digest(),
             "step": step,
             "protocol": found[""].protocol,
             "ways": {way: evaluation.scores() for way, evaluation in found.items()},
             "ratios": {way: _counts(evaluation.ratios) for way, evaluation in found.items()},
         }
-        write_json(path, kept)
-    entry = kept[mark]
+        if job.scored_by == "this code":
+            kept = {name: other for name, other in kept.items() if other["code"] == code_digest()}
+        write_json(path, kept | {_mark(parts, code_digest()): entry})
     ratios = {
         way: {name: SceneRatio(*map(tuple, counts)) for name, counts in of_way.items()}
         for way, of_way in entry["ratios"].items()
     }
-    return Measured(entry["step"], entry["protocol"], entry["ways"], ratios)
+    return Measured(entry["step"], entry["protocol"], entry["ways"], ratios, entry["code"])
 
 
 def _file(job: Job) -> Path:
     return job.folder.with_name(f"{job.folder.name}.scores.json")
 
 
-def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, str] | None:
-    """Return step and mark of an evaluation, the name of its entry; None if the run has no such checkpoint."""
+def _checkpoint(job: Job, config: RunConfig, which: Which) -> tuple[int, dict[str, Any]] | None:
+    """Return step and parts of the mark of an evaluation; None if the run has no such checkpoint."""
     checkpoints = Checkpoints(job.folder / "checkpoints", best_metric=config.training.best_metric)
     step = checkpoints.best_step() if which == "best" else checkpoints.find("last")
     if step is None:
         return None
-    return step, _mark(
-        checkpoint=checkpoints.content(step),
-        source=repr(config.data.source("test")),
-        evaluation=to_json(config.evaluation),
-        code=code_digest(),
-    )
+    return step, {
+        "checkpoint": checkpoints.content(step),
+        "source": repr(config.data.source("test")),
+        "evaluation": to_json(config.evaluation),
+        **({"content": job.content} if job.content else {}),
+    }
+
+
+def _valid(entries: dict[str, dict[str, Any]], parts: Mapping[str, Any], job: Job) -> dict[str, Any] | None:
+    """Return the entry of an evaluation that counts for a job: by this state of the code, or else the latest other."""
+    codes = [code_digest()]
+    if job.scored_by == "any code":
+        codes += dict.fromkeys(entry["code"] for entry in reversed(entries.values()))
+    found = ((entries.get(_mark(parts, code)), code) for code in codes)
+    return next((entry for entry, code in found if entry is not None and entry["code"] == code), None)
 
 
 def _counts(ratios: Mapping[str, SceneRatio]) -> dict[str, list[list[int]]]:
     return {name: [list(ratio.numerator), list(ratio.denominator)] for name, ratio in ratios.items()}
 
 
-def _mark(**parts: Any) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+def _mark(parts: Mapping[str, Any], code: str) -> str:
+    """Return the name of an entry: a hash of what is evaluated, and by which state of the code."""
+    return hashlib.sha256(json.dumps({**parts, "code": code}, sort_keys=True).encode()).hexdigest()
 
 
 def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.config import RunConfig
-from tflane_jax.config_io import to_json
+from tflane_jax.config_io import first_difference, to_json
+from tflane_jax.training.provenance import listed_setting, read_provenance, threads_of
 from tflane_jax.training.records import read_records
 
 NAME_LENGTH = 16
@@ -26,6 +27,7 @@ def stored_jobs(
     *,
     threads: Mapping[str, Any],
     origins: Mapping[str, Sequence[Job]] | None = None,
+    content: str = "",
 ) -> dict[str, list[Job]]:
     """Return the trainings of each configuration, one for each seed, in the folders of their identities.
 
@@ -35,6 +37,7 @@ def stored_jobs(
         store: folder of the runs.
         threads: thread setting of the processes that train.
         origins: for rows that start from another run, that run for each seed.
+        content: see `Job`.
     """
     plan: dict[str, list[Job]] = {}
     for name, config in configs.items():
@@ -42,11 +45,12 @@ def stored_jobs(
         for i, seed in enumerate(seeds):
             seeded = replace(config, training=replace(config.training, seeds=(seed,)))
             origin = (origins or {}).get(name, ())
-            key = run_key(seeded, threads, origin[i].folder.name if origin else None)
+            key = run_key(seeded, threads, origin[i].folder.name if origin else None, content)
             if origin:
                 seeded = replace(seeded, training=replace(seeded.training, init_from=str(origin[i].folder)))
             further = (replace(config.evaluation, topology="geometric"),) if predicts_topology(config) else ()
-            plan[name].append(Job(seeded, store / key, threads, label=f"{name}, seed {seed}", further=further))
+            job = Job(seeded, store / key, threads, label=f"{name}, seed {seed}", further=further, content=content)
+            plan[name].append(job)
     return plan
 
 
@@ -55,7 +59,7 @@ def predicts_topology(config: RunConfig) -> bool:
     return bool(TOPOLOGY & config.task.score_names(config.data, config.evaluation))
 
 
-def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = None) -> str:
+def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = None, content: str = "") -> str:
     """Return the name of a run's folder: a hash of its configuration, its thread setting and the run it starts from.
 
     Only settings that differ from their defaults count, so that a version with a new setting finds the runs of
@@ -66,10 +70,11 @@ def run_key(config: RunConfig, threads: Mapping[str, Any], origin: str | None = 
         threads: see `training.provenance.thread_setting`.
         origin: key of the run that this one starts from, in place of `training.init_from`, so that the name does not
             depend on where the store is.
+        content: see `Job`.
     """
     if origin is not None:
         config = replace(config, training=replace(config.training, init_from=origin))
-    text = json.dumps([_chosen(config), dict(threads)], sort_keys=True)
+    text = json.dumps([_chosen(config), dict(threads), *filter(None, [content])], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:NAME_LENGTH]
 
 
@@ -89,6 +94,40 @@ def _default(field: dataclasses.Field[Any]) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
+
+
+def runs_elsewhere(plan: Sequence[Job], store: Path, replan: Callable[[Mapping[str, Any]], Sequence[Job]]) -> list[str]:
+    """Return a line for each other thread setting with which runs began that a plan has not begun.
+
+    Args:
+        plan: every run once.
+        store: folder of the runs.
+        replan: returns the same runs, in the same order, as they are called with another thread setting.
+    """
+    lines, missing = [], [i for i, job in enumerate(plan) if not job.exists()]
+    for setting in _settings(store) if missing else ():
+        there, here = replan(setting), plan[0].threads
+        found = [there[i] for i in missing if there[i].exists()]
+        if found:
+            complete = sum(job.is_complete() for job in found)
+            same = first_difference({**setting, "cores": 0}, {**here, "cores": 0}) == ""
+            remedy = (
+                f"add --cores {setting['cores']} to use them" if same else "start in the same environment to use them"
+            )
+            lines.append(
+                f"{len(found)} of these runs exist with {listed_setting(setting)} ({complete} complete), but numbers "
+                f"depend on it, and here is {listed_setting(here)}: {remedy}"
+            )
+    return lines
+
+
+def _settings(store: Path) -> list[dict[str, Any]]:
+    """Return the thread settings with which runs in a store began, each once."""
+    starts = (read_provenance(path.parent)[:1] for path in sorted(store.glob("*/provenance.json")))
+    found = (threads_of(start) for first in starts for start in first)
+    return list(
+        {json.dumps(setting, sort_keys=True): setting for setting in found if setting and "cores" in setting}.values()
+    )
 
 
 def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: float) -> tuple[float, int]:

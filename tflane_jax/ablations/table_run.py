@@ -6,20 +6,23 @@
 <out>/TABLE/effects.md, .json     the claims: shown, not shown, or contradicted
 <out>/TABLE/curves.png            validation over training, mean and range over seeds
 <out>/TABLE/comparison.png        test frames in which the first claim's rows differ
+<out>/TABLE/scores.json.gz        the record of the runs' scores, from which the table can be made without them
 <out>/TABLE/summary.json          what docs/results.md is made of
 """
 
 from __future__ import annotations
 
 import importlib.util
+import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from tflane_jax.ablations.archive import Archive, write_archive
 from tflane_jax.ablations.compare import (
     draw_models,
     evaluate_runs,
@@ -29,26 +32,39 @@ from tflane_jax.ablations.compare import (
     without_failures,
 )
 from tflane_jax.ablations.comparison import Variant, compact
-from tflane_jax.ablations.declaration import Declared, check, declare
+from tflane_jax.ablations.declaration import FILE as DECLARATION
+from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects
-from tflane_jax.ablations.jobs import Job, check_rows
+from tflane_jax.ablations.facts import facts, row_minutes
+from tflane_jax.ablations.jobs import Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
-from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, measure
-from tflane_jax.ablations.store import TOPOLOGY, remaining_seconds, stored_jobs
-from tflane_jax.ablations.workers import train_all, worker_threads
+from tflane_jax.ablations.reuse import FILE, archive_of, unused
+from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
+from tflane_jax.ablations.store import TOPOLOGY
+from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.ablations.workers import train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.files.fields import load_json
 from tflane_jax.plots.tables import format_table, latex_table, save_table
-from tflane_jax.training.provenance import read_provenance
-from tflane_jax.training.records import read_records
 
 GEOMETRIC = ", geometric"
 """Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
 
 
-def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False) -> Path:
+def run_table(
+    table: PaperTable,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    jobs: int = 1,
+    cores: int | None = None,
+    quick: bool = False,
+    archive: Archive | None = None,
+    scored_by: ScoredBy = "this code",
+) -> Path:
     """Train what is missing, evaluate, test the claims, and write the table's folder.
 
     The same command resumes a table that was stopped. Several processes, also of several machines that share the
@@ -59,7 +75,10 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
         seeds: of training.
         out: folder of all tables and their runs.
         jobs: trainings at a time.
+        cores: of each training; None shares all between the trainings.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
+        archive: recorded runs, which are taken instead of trained; None for none.
+        scored_by: state of the code whose scores count where they are kept beside a run, see `Job`.
 
     Returns:
         The file of the table.
@@ -67,72 +86,65 @@ def run_table(table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int =
     Raises:
         UserError: trainings failed, after the files of the others were written.
     """
-    began, root = time.monotonic(), out / "quick" if quick else out
-    folder, (host_plan, plan) = root / table.name, plan_table(table, seeds, out, jobs=jobs, quick=quick)
-    configs = table.configs(table.rows, quick=quick)
+    began, folder = time.monotonic(), store_of(out, quick=quick).parent / table.name
+    how: dict[str, Any] = {"quick": quick, "archive": archive, "scored_by": scored_by}
+    planned = plan_table(table, seeds, out, jobs=jobs, cores=cores, **how)
+    configs, plan = planned.rows, planned.jobs
     # Fewer seeds than the table has are an interim look at it.
-    declared = declare(table.declaration, plan, range(max(len(seeds), 0 if quick else table.seeds)), folder)
-    _tell_work({**host_plan, **plan}, table, jobs)
+    every = range(max(len(seeds), 0 if quick else table.seeds))
+    if archive is not None:
+        _adopt_declaration(
+            archive, folder, lambda trial: declare(table.declaration, plan, planned.declared(), every, trial)
+        )
+        for line in unused(plan, archive, table.declaration.scores):
+            print(line)
+    declared = declare(table.declaration, plan, planned.declared(), every, folder)
+    tell_work(planned, seeds, store_of(out, quick=quick), jobs)
 
-    failures = train_all(_by_seed(host_plan), jobs)
-    failures += train_all(_by_seed(plan), jobs)
+    failures = train_all(seed_by_seed(planned.host_jobs), jobs, cores)
+    failures += train_all(seed_by_seed(plan), jobs, cores)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
-    _add_geometric(without_failures(plan, failures), results)
+    trained = without_failures(plan, failures)
+    _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
-        raise UserError(summary_of(failures, len(_by_seed(plan))))
+        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
+    scores = archive_of(table.name, load_json(folder / DECLARATION), trained, table.declaration.scores, _curves(table))
+    write_archive(folder / FILE, scores)
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
     save_effects(results, declared, OWN_TEST, first.task.errors, folder / "effects")
     pair = (table.claims[0].control or table.rows[0].name, table.claims[0].treatment)
-    draw_models(first, first_models(trained, results), pair, folder / "comparison.png")
+    models = first_models(trained, results)
+    if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters
+        draw_models(first, models, pair, folder / "comparison.png")
     _draw_curves(table, trained, folder / "curves.png")
     _save_summary(table, declared, results, trained, first, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
     if failures:
-        raise UserError(summary_of(failures, len(_by_seed(plan))))
+        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
     return path
 
 
-def plan_table(
-    table: PaperTable, seeds: Sequence[int], out: Path, *, jobs: int = 1, quick: bool = False
-) -> tuple[dict[str, list[Job]], dict[str, list[Job]]]:
-    """Return the trainings of the hosts that rows start from, and of the rows.
+def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path], Declared]) -> None:
+    """Let a table that was recorded keep its declaration, unless the folder has one or it is another one.
 
-    Raises UserError where one of them must fail. The arguments are those of `run_table`.
+    Args:
+        archive: of the table.
+        folder: of the table.
+        check_in: declares the table in a folder; raises UserError if that holds another declaration.
     """
-    configs, hosts = table.configs(table.rows, quick=quick), table.configs(table.hosts, quick=quick)
-    check(table.declaration, configs)
-    threads, store = worker_threads(jobs), (out / "quick" if quick else out) / "runs"
-    host_plan = stored_jobs(hosts, seeds, store, threads=threads)
-    origins = {row.name: host_plan[row.start] for row in table.rows if row.start}
-    plan = stored_jobs(configs, seeds, store, threads=threads, origins=origins)
-    check_rows({f"host {name}": jobs for name, jobs in host_plan.items()} | plan)
-    return host_plan, plan
-
-
-def _by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
-    """Return every run once, seed by seed, so that a table stopped early has pairs."""
-    every = [job for of_seed in zip(*plan.values(), strict=True) for job in of_seed]
-    return list({job.folder: job for job in every}.values())
-
-
-def _tell_work(plan: Mapping[str, Sequence[Job]], table: PaperTable, jobs: int) -> None:
-    """Print how many runs are complete, and how long the others will take."""
-    every = _by_seed(plan)
-    complete = sum(job.is_complete() for job in every)
-    text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
-    if complete < len(every):
-        seconds, guesses = remaining_seconds(plan, table.minutes)
-        basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
-        text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
-    print(text, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    minutes = max(1, round(seconds / 60))
-    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
+    if archive.declaration is None or (folder / DECLARATION).exists():
+        return
+    with tempfile.TemporaryDirectory() as trial:
+        write_json(Path(trial) / DECLARATION, archive.declaration)
+        try:
+            check_in(Path(trial))
+        except UserError:
+            print("the recorded declaration is another one, so that the table is declared anew")
+            return
+    write_json(folder / DECLARATION, archive.declaration)
 
 
 def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
@@ -187,10 +199,13 @@ def _draw_curves(table: PaperTable, trained: Mapping[str, Sequence[Job]], path: 
         return
     from tflane_jax.plots.curves import save_comparison_curves
 
-    records = {
-        name: [read_records(job.folder / "metrics.jsonl") for job in jobs] for name, jobs in trained.items() if jobs
-    }
-    save_comparison_curves(path, records, list(dict.fromkeys((table.primary, *table.columns))))
+    records = {name: [facts(job).validation for job in jobs] for name, jobs in trained.items() if jobs}
+    save_comparison_curves(path, records, _curves(table))
+
+
+def _curves(table: PaperTable) -> list[str]:
+    """Return the scores whose validation curves are drawn."""
+    return list(dict.fromkeys((table.primary, *table.columns)))
 
 
 def _save_summary(
@@ -207,8 +222,8 @@ def _save_summary(
     every = [
         e for which in CHECKPOINTS for e in effects(results, declared.declaration, OWN_TEST, which, first.task.errors)
     ]
-    starts = [start for jobs in trained.values() for job in jobs for start in read_provenance(job.folder)]
-    threads = [job.threads for jobs in trained.values() for job in jobs]
+    runs = [job for jobs in trained.values() for job in jobs]
+    commits = {commit for job in runs for commit in facts(job).commits}
     write_json(
         folder / "summary.json",
         {
@@ -219,11 +234,11 @@ def _save_summary(
             "declared": declared.sentence(),
             "note": table.note,
             "seeds": list(results.seeds),
-            "steps": sorted({job.config.training.steps for jobs in trained.values() for job in jobs}),
-            "cores of a run": sorted({setting["cores"] for setting in threads}),
-            "commits": sorted({start["git"]["commit"][:9] for start in starts if start.get("git")}),
-            "devices": sorted({start["device"] for start in starts}),
-            "core minutes of a run": _minutes(trained),
+            "steps": sorted({job.config.training.steps for job in runs}),
+            "cores of a run": sorted({job.threads["cores"] for job in runs}),
+            "commits": sorted(commits) + sorted({text for job in runs for text in _measured_elsewhere(job)}),
+            "devices": sorted({device for job in runs for device in facts(job).devices}),
+            "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),
             "findings": findings(every),
             "quoted": asdict(table.quoted),
@@ -231,12 +246,10 @@ def _save_summary(
     )
 
 
-def _minutes(trained: Mapping[str, Sequence[Job]]) -> dict[str, float]:
-    """Return the training time of each row, in minutes, mean over runs."""
-    found = {}
-    for name, jobs in trained.items():
-        ends = [read_records(job.folder / "metrics.jsonl") for job in jobs]
-        seconds = [[r["seconds"] for r in records if "seconds" in r][-1] for records in ends if records]
-        if seconds:
-            found[name] = round(sum(seconds) / len(seconds) / 60, 1)
-    return found
+def _measured_elsewhere(job: Job) -> set[str]:
+    """Return by which other states of the code a run was measured, in words; by which ones a recorded run was."""
+    found = [measure(job, config, which) for config, which in evaluations(job)]
+    codes = {measured.code[:9] for measured in found if measured is not None}
+    if job.recorded is not None:
+        return {f"recorded by code {code}" for code in codes}
+    return {f"measured by code {code}" for code in codes - {code_digest()[:9]}}

@@ -8,6 +8,7 @@ from typing import Any
 
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.reservations import Reservations
+from tflane_jax.training.run_folder import is_locked
 
 LOOK_SECONDS = 10.0
 
@@ -15,7 +16,7 @@ LOOK_SECONDS = 10.0
 class Queue:
     """Jobs in the order in which they are to be done.
 
-    A job that another process has reserved is set aside and looked at again, until it is done or free.
+    A job that another process has reserved, or trains, is set aside and looked at again, until it is done or free.
     """
 
     def __init__(self, jobs: Sequence[Job], reservations: Reservations, is_done: Callable[[Job], bool]) -> None:
@@ -48,6 +49,9 @@ class Queue:
                 self._elsewhere.append(job)
             elif self._is_done(job):  # another process has just finished it
                 self._reservations.release(job.folder)
+            elif is_locked(job.folder):  # by `tflane train`, or by what a killed process has left behind
+                self._reservations.release(job.folder)
+                self._elsewhere.append(job)
             else:
                 return job
         return None

@@ -21,6 +21,7 @@ from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.ablations.scores import is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
+from tflane_jax.child_processes import end_with_parent
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
@@ -31,31 +32,38 @@ from tflane_jax.training.runtime import configure_jax
 _POLL_SECONDS = 1.0
 
 
-def train_all(jobs: Sequence[Job], parallel: int) -> list[Failure]:
+def train_all(jobs: Sequence[Job], parallel: int, cores: int | None = None) -> list[Failure]:
     """Train every job that is not complete, in this process or `parallel` at a time in workers; return what failed.
 
+    Workers have `cores` cores each, or equal shares of all for None. With `cores`, one at a time is a worker too.
     Workers also measure runs that are complete, but not measured by this state of the code.
 
     Several processes, also of several machines that share a folder, may train the same jobs: each takes those that no
     other has reserved, and returns when all are complete.
     """
     with Reservations() as reservations:
-        if parallel == 1:
+        if parallel == 1 and cores is None:
             return _train_here(Queue(jobs, reservations, lambda job: job.is_complete()))
-        return _train_in_workers(Queue(jobs, reservations, is_measured), jobs, parallel)
+        return _train_in_workers(Queue(jobs, reservations, is_measured), jobs, parallel, cores)
 
 
-def worker_threads(parallel: int) -> dict[str, Any]:
-    """Return the thread setting of each of `parallel` workers; of this process for one."""
-    return thread_setting(len(_cores(0, parallel)) or None) if parallel > 1 else thread_setting()
+def worker_threads(parallel: int, cores: int | None = None) -> dict[str, Any]:
+    """Return the thread setting in which `train_all` trains; raise UserError for more cores than there are."""
+    if parallel == 1 and cores is None:
+        return thread_setting()
+    return thread_setting(len(_cores(0, parallel, cores)) or None)
 
 
-def _cores(slot: int, parallel: int) -> list[int]:
+def _cores(slot: int, parallel: int, cores: int | None = None) -> list[int]:
     """Return the cores of a worker. All workers have the same number, so that results do not depend on the worker."""
     if not hasattr(os, "sched_getaffinity"):
+        if cores is not None:
+            raise UserError(f"--cores {cores}: this system does not tell a process which cores to use")
         return []
     every = sorted(os.sched_getaffinity(0))
-    each = max(len(every) // parallel, 1)
+    if cores is not None and not 1 <= cores <= len(every):
+        raise UserError(f"--cores {cores}: a training can have 1 to {len(every)} cores here")
+    each = cores or max(len(every) // parallel, 1)
     return [every[(slot * each + i) % len(every)] for i in range(each)]
 
 
@@ -83,8 +91,12 @@ def _log(job: Job, text: str) -> None:
 
 def _train_here(queue: Queue) -> list[Failure]:
     failures: list[Failure] = []
+    waits = False
     while len(queue):
         if (job := queue.take()) is None:
+            if not waits:
+                write(f"waiting for {len(queue)} runs that other processes train")
+            waits = True
             time.sleep(_POLL_SECONDS)
             continue
         with noted(job, failures):
@@ -96,11 +108,11 @@ def _train_here(queue: Queue) -> list[Failure]:
     return failures
 
 
-def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int) -> list[Failure]:
+def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: int | None) -> list[Failure]:
     failures: list[Failure] = []
     built: set[Any] = set()
     with contextlib.ExitStack() as stack:
-        workers = [stack.enter_context(Worker(slot, parallel)) for slot in range(min(parallel, len(queue)))]
+        workers = [stack.enter_context(Worker(slot, parallel, cores)) for slot in range(min(parallel, len(queue)))]
         total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
         bar = stack.enter_context(
             tqdm(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
@@ -152,8 +164,8 @@ def _build(job: Job, built: set[Any]) -> None:
 class Worker:
     """A process on its own cores that trains one job after the other, and compiles every model once."""
 
-    def __init__(self, slot: int, parallel: int) -> None:
-        self._cores = _cores(slot, parallel)
+    def __init__(self, slot: int, parallel: int, cores: int | None = None) -> None:
+        self._cores = _cores(slot, parallel, cores)
         self.job: Job | None = None
         self.tasks: set[Any] = set()
         self.stage = ""
@@ -225,6 +237,7 @@ def _train_jobs(pipe: Any, cores: list[int]) -> None:
     Before that, what a job is doing is told as ("stage", name), and ("stage", "") at its end. Messages go to the job's
     log.
     """
+    end_with_parent()
     if cores:
         os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this
 

@@ -10,7 +10,7 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace) -> int:
     """Leave each log out once, train on the others, test on it."""
-    for name in ("seeds", "jobs", "steps", "scenes"):
+    for name in ("seeds", "jobs", "cores", "steps", "scenes"):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise UserError(f"--{name} {value}: at least one")
@@ -25,6 +25,7 @@ def run(options: argparse.Namespace) -> int:
         steps=options.steps,
         scenes=options.scenes,
         jobs=options.jobs,
+        cores=options.cores,
         quick=options.quick,
     )
     carry_over(settings, options.out)

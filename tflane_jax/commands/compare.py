@@ -59,7 +59,7 @@ def _test_sets(arguments: Sequence[str]) -> dict[str, list[str]]:
 def _declaration(options: argparse.Namespace, names: Sequence[str]) -> Declaration | None:
     """Return what is tested, from --primary and the options that belong to it; None without --primary."""
     if options.primary is None:
-        for option in ("treatment", "negative_control", "alpha"):
+        for option in ("treatment", "negative_control", "secondary", "alpha"):
             if getattr(options, option) is not None:
                 raise UserError(f"--{option.replace('_', '-')} belongs to a declared comparison: add --primary")
         return None
@@ -67,7 +67,7 @@ def _declaration(options: argparse.Namespace, names: Sequence[str]) -> Declarati
         raise UserError("--treatment NAME: say which configuration's effect --primary tests")
     treatment = names[1] if options.treatment is None else options.treatment
     alpha = 0.05 if options.alpha is None else options.alpha
-    return Declaration(options.primary, (Claim(treatment),), options.negative_control, alpha)
+    return Declaration(options.primary, (Claim(treatment),), options.negative_control, alpha, options.secondary)
 
 
 def _named(argument: str) -> tuple[str, str, list[str]]:

@@ -11,7 +11,8 @@ predictions.npz, arrays over F frames and Q queries:
     (F, Q), 0 divider, 1 crossing, 2 boundary, 3 centerline, and has no successor.
 truth.npz, the ground-truth lanes, segments or labelled lines of the same frames over G slots:
     points (F, G, P, 3), successor (F, G, G) or category (F, G), valid (F, G), visibility (F, G), scene and
-    timestamp_ns. `tflane score` reads both files, but not those of lines.
+    timestamp_ns. Lines add dense (F, G, S, 3), what the evaluation measures. `tflane score` reads both files, but not
+    those of lines.
 
 predictions.json, lanes with a score of at least `threshold`, best first:
     {"run", "step", "seed", "threshold", "frames": [{"source", "scene", "timestamp_ns",
@@ -140,7 +141,7 @@ def _with_images(examples: Example, source: Any, indices: Sequence[int]) -> tupl
 def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:
     """Return the arrays of truth.npz but for the names of the frames; None for lines that are not labelled."""
     if isinstance(lanes, LinePrediction):
-        true, kept = examples.map_lines, ["points", "category", "valid", "visibility"]
+        true, kept = examples.map_lines, ["points", "category", "valid", "visibility", "dense"]
     else:
         true, kept = true_lanes(examples, lanes), ["points", "successor", "valid", "visibility"]
         kept += [name for name in ("left", "right", "left_type", "right_type") if name in arrays]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from tflane_jax.ablations.published import record
 from tflane_jax.ablations.tables import TABLES, find_table
@@ -19,17 +20,26 @@ def run(options: argparse.Namespace) -> int:
     jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs
     if jobs < 1:
         raise UserError(f"--jobs {jobs}: at least one training runs at a time")
+    if options.quick and options.source is not None:
+        raise UserError("--quick runs are no results and never recorded: leave out --from or --quick")
+    if options.cores is not None and options.cores < 1:
+        raise UserError(f"--cores {options.cores}: at least one")
     if not chosen:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         return 0
     configure_jax()
-    from tflane_jax.ablations.table_run import plan_table, run_table
+    from tflane_jax.ablations.reuse import find_archive
+    from tflane_jax.ablations.table_plan import plan_table
+    from tflane_jax.ablations.table_run import run_table
 
+    how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick}
+    how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}
+    archives = {t.name: None if options.source is None else find_archive(options.source, t.name) for t in chosen}
     if len(chosen) > 1:  # what is wrong in the last one is told before the first one is trained
         for table in chosen:
-            plan_table(table, seeds[table.name], options.out, jobs=jobs, quick=options.quick)
-    written = [run_table(t, seeds[t.name], options.out, jobs=jobs, quick=options.quick) for t in chosen]
+            plan_table(table, seeds[table.name], options.out, archive=archives[table.name], **how)
+    written = [run_table(t, seeds[t.name], options.out, archive=archives[t.name], **how) for t in chosen]
     if options.record is not None:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     return 0

@@ -10,7 +10,7 @@ Plain geometry: `MapGeometry.of` takes polylines and polygons of any source, glo
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from tflane_jax.datasets.packed_lines import PackedLines
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import clip_to_range
+from tflane_jax.geometry.rings import from_first_corner, oriented
 from tflane_jax.scene import LineClass
 
 # Metres. MapTR cuts road boundaries this far inside the patch; figures of OpenLane-V2 agree with it.
@@ -60,7 +61,8 @@ class MapGeometry:
 
     Attributes:
         dividers: one line for each divider.
-        crossings: the rings of merged crossings, those of a polygon in succession, its exterior first.
+        crossings: the rings of merged crossings, those of a polygon in succession: its exterior first and clockwise,
+            then its interiors, counter-clockwise.
         polygon: (R,) number of the polygon that each ring of `crossings` belongs to.
         boundaries: lines and rings.
         centerlines: lanes in driving direction.
@@ -114,7 +116,8 @@ class MapGeometry:
     ) -> list[MapPiece]:
         """Return the pieces inside a patch, in its frame: dividers, crossings, boundaries, and centerlines if wanted.
 
-        Raises UserError where a crossing must be cut and shapely is not installed.
+        Rings start at their first corner (`geometry.rings`), wherever the map has them start. Raises UserError where a
+        crossing must be cut and shapely is not installed.
         """
         pieces = [
             MapPiece(piece, LineClass.DIVIDER, number)
@@ -139,7 +142,7 @@ class MapGeometry:
             lanes = dict(_near(self.centerlines, patch_from_global, patch))
             edges = [(int(a), int(b)) for a, b in self.edges if a in lanes and b in lanes]
             pieces += [MapPiece(path, LineClass.CENTERLINE, None) for path in lane_paths(lanes, edges, patch)]
-        return pieces
+        return [replace(p, points=from_first_corner(p.points)) if p.closed else p for p in pieces]
 
 
 def _near(lines: PackedLines, pose: np.ndarray, range_: PerceptionRange) -> Iterator[tuple[int, np.ndarray]]:
@@ -167,7 +170,7 @@ def clip_ring(line: np.ndarray, range_: PerceptionRange) -> list[np.ndarray]:
 def cut_polygon(rings: Polygon, patch: PerceptionRange) -> list[np.ndarray]:
     """Return the rings of the part of a polygon inside a patch; they run along the patch's border where it is cut.
 
-    Exteriors run clockwise, interiors counter-clockwise, unless nothing is cut.
+    Exteriors run clockwise, interiors counter-clockwise; if nothing is cut, the rings are returned as they are.
     """
     if all(patch.contains(ring).all() for ring in rings):
         return list(rings)
@@ -179,13 +182,13 @@ def cut_polygon(rings: Polygon, patch: PerceptionRange) -> list[np.ndarray]:
 def merge_polygons(polygons: Sequence[Polygon]) -> list[list[np.ndarray]]:
     """Return the union of polygons, as polygons that do not touch; heights are those of the nearest vertices.
 
-    Polygons whose bounding boxes do not meet any other are returned as they are. Raises UserError if shapely is needed
-    and not installed.
+    Exteriors run clockwise, interiors counter-clockwise, as in MapTR. Polygons whose bounding boxes do not meet any
+    other keep their vertices. Raises UserError if shapely is needed and not installed.
     """
     low = np.array([np.min(p[0][:, :2], 0) for p in polygons]).reshape(-1, 2)
     high = np.array([np.max(p[0][:, :2], 0) for p in polygons]).reshape(-1, 2)
     meets = ((low[:, None] <= high) & (low <= high[:, None])).all(-1).sum(1) > 1
-    apart = [list(p) for p, meeting in zip(polygons, meets, strict=True) if not meeting]
+    apart = [oriented(p) for p, meeting in zip(polygons, meets, strict=True) if not meeting]
     together = [p for p, meeting in zip(polygons, meets, strict=True) if meeting]
     if not together:
         return apart

@@ -17,6 +17,8 @@ from tflane_jax.world.bev.line_of_sight import hidden_points
 
 # Points on each line at which distance and line of sight are measured.
 _SIGHT_SAMPLES = 101
+# Points at which MapTR's metric compares lines; `metrics.vector_map` asks for as many.
+DENSE_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,17 @@ def crop_map_lines(
     """
     pieces = geometry.cut(ego_from_global, range_, centerlines=config.centerlines == "include")
     # Of the many points, not of the vertices: a straight line has only its ends.
-    dense = resample_lines([piece.points for piece in pieces], _SIGHT_SAMPLES)[..., :2]
-    distance = np.linalg.norm(dense, axis=-1).min(1)
+    sight = resample_lines([piece.points for piece in pieces], _SIGHT_SAMPLES)[..., :2]
+    distance = np.linalg.norm(sight, axis=-1).min(1)
     kept = np.sort(np.argsort(distance, kind="stable")[: config.lines])
     dropped, pieces, n = len(pieces) - len(kept), [pieces[i] for i in kept], len(kept)
-    lines = MapLines.empty(config.lines, config.points)
+    lines = MapLines.empty(config.lines, config.points, DENSE_POINTS)
     if n:
-        hidden = hidden_points(dense[kept].reshape(-1, 2), boxes, buildings).reshape(n, -1)
-        lines.points[:n] = resample_lines([piece.points for piece in pieces], config.points)
+        hidden = hidden_points(sight[kept].reshape(-1, 2), boxes, buildings).reshape(n, -1)
+        originals = [piece.points for piece in pieces]
+        lines.points[:n] = resample_lines(originals, config.points)
+        assert lines.dense is not None
+        lines.dense[:n] = resample_lines(originals, DENSE_POINTS)
         lines.category[:n] = [piece.category for piece in pieces]
         lines.closed[:n] = [piece.closed for piece in pieces]
         lines.valid[:n] = True

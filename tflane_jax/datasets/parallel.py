@@ -12,7 +12,6 @@ import itertools
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -22,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from tflane_jax.child_processes import end_with_parent
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.errors import UserError
@@ -195,15 +195,7 @@ def _start_worker(job: _Job) -> None:
     _worker_job = job
     # Ctrl-C reaches the whole process group; only the parent handles it and shuts the pool down.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """End this worker when the parent is killed: a worker that waits for its next block would not notice."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    end_with_parent()
 
 
 def _write_block(indices: range) -> list[str]:

@@ -54,7 +54,7 @@ class LaneGraphMetrics:
     Args:
         versions: versions of the OpenLane-V2 centerline metrics.
         frame_groups, lane_groups: names of the groups of frames and of further groups of lanes, see
-            `GroupedCenterlineMetrics`.
+            `metrics.groups.GroupedMetrics`.
         parts: predicted parts that are measured as long as no frame was seen.
         map_measures, line_labels, line_dims: of the lines of vector maps, see `MapLineMetrics`.
     """
@@ -75,7 +75,9 @@ class LaneGraphMetrics:
         self._continues: list[bool] = []  # whether a frame belongs to the scene of the frame before
         self._segments = GroupedSegmentMetrics(frame_groups=frame_groups, lane_groups=lane_groups)
         self._devkit = LaneSegmentMetrics("OpenLane-V2")
-        self._lines = MapLineMetrics(map_measures, line_labels, lane_groups if line_labels else (), line_dims)
+        self._lines = MapLineMetrics(
+            map_measures, line_labels, lane_groups if line_labels else (), line_dims, frame_groups
+        )
         self._measured = tuple(parts)
 
     @property
@@ -122,7 +124,7 @@ class LaneGraphMetrics:
             self._segments.add(frame, segments.lanes, frame_group, members.get("segments"))
             self._devkit.add(frame)
         if prediction.lines is not None:
-            self._lines.update(prediction.lines, example, members.get("lines"))
+            self._lines.update(prediction.lines, example, members.get("lines"), frame_group)
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return metrics by name, for every group of every protocol that applies."""
@@ -205,7 +207,7 @@ def evaluate_lanes(
         arrays: examples with ground truth, see `datasets.batches`.
         config: batch size, versions, and traffic flow that the model sees.
         ground: the range that the BEV evidence covers; None for a model that does not see it, without those groups.
-        frame_groups: a further group for each example; lines of vector maps do not have it.
+        frame_groups: a further group for each example.
 
     Raises:
         ValueError: the task predicts no lanes.

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from tflane_jax.evaluation.line_tracks import LineTracks
 from tflane_jax.evaluation.vector_maps import detections_of_lines, map_truth, truth_of_lines
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
-from tflane_jax.metrics.groups import BY_OCCLUSION
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup
 from tflane_jax.metrics.vector_map import Dims, GroupedMapMetrics, MatchedMap, Measure, VectorMapMetrics, match_map
 from tflane_jax.scene import Example, LinePrediction
 
@@ -27,7 +27,8 @@ class MapLineMetrics:
     |---|---|
     | `lines` | Chamfer AP of all lines; `C-mAP` if lines have identities |
     | `lines occluded`, `lines clear` | Chamfer AP by visibility, if it is labelled |
-    | `lines hidden+traffic` ... | Chamfer AP of the further groups |
+    | `lines hidden+traffic` ... | Chamfer AP of the further groups of lines |
+    | `lines near training` ... | Chamfer AP of all lines in a group of frames |
     | `lines IoU` | AP by overlap of buffers, if asked for |
 
     Args:
@@ -35,6 +36,7 @@ class MapLineMetrics:
         labels: what the labels of lines tell.
         groups: names of further groups of lines, see `evaluation.lane_groups`.
         dims: 3 measures heights, too; only labelled lines have them.
+        frame_groups: names of groups of frames.
     """
 
     def __init__(
@@ -43,10 +45,11 @@ class MapLineMetrics:
         labels: Collection[LineLabel] = (),
         groups: Sequence[str] = (),
         dims: Dims = 2,
+        frame_groups: Sequence[str] = (),
     ) -> None:
         self._dims: Dims = dims
         partition = BY_OCCLUSION.names if "visibility" in labels else ()
-        self._chamfer = GroupedMapMetrics(("all", *partition), lane_groups=groups, dims=dims)
+        self._chamfer = GroupedMapMetrics(("all", *partition), frame_groups=frame_groups, lane_groups=groups, dims=dims)
         self._overlap = VectorMapMetrics(measure="iou", dims=dims) if "iou" in measures else None
         self._consistency = MapConsistency() if "identity" in labels else None
         self._tracks = LineTracks()
@@ -58,7 +61,11 @@ class MapLineMetrics:
         return "; ".join(metrics.protocol for metrics in measured if metrics is not None)
 
     def update(
-        self, lines: LinePrediction, example: Example, members: Mapping[str, Bool[np.ndarray, " g"]] | None = None
+        self,
+        lines: LinePrediction,
+        example: Example,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
+        frame_group: FrameGroup = None,
     ) -> None:
         """Add one frame.
 
@@ -66,6 +73,7 @@ class MapLineMetrics:
             lines: the last decoder layer's prediction.
             example: with labelled lines; without, they are derived from its lane segments and areas.
             members: for each of the further groups, which of the measured true lines belong to it.
+            frame_group: the groups that this frame belongs to.
         """
         lines = replace(lines, points=lines.points[..., : self._dims])
         detections = detections_of_lines(lines)
@@ -73,7 +81,7 @@ class MapLineMetrics:
         if example.map_lines is not None:
             truth = truth_of_lines(example.map_lines, lines)
         frame = match_map(detections, truth, dims=self._dims, nearest="all")
-        self._chamfer.add(frame, truth, None, members)
+        self._chamfer.add(frame, truth, frame_group, members)
         if self._overlap is not None:
             self._overlap.update(detections, truth)
         if self._consistency is not None and truth.identity is not None:

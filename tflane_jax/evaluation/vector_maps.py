@@ -89,16 +89,20 @@ def map_detections(
 
 
 def truth_of_lines(lines: MapLines, found: LinePrediction) -> MapTruth:
-    """Return the labelled lines of the classes that a model predicts, with as many coordinates."""
-    kept = measured_lines(lines, found)
+    """Return the labelled lines of the classes that a model predicts, with as many coordinates.
+
+    These are the lines as the source has them where the labels keep their dense form.
+    """
+    kept, dense = measured_lines(lines, found), lines.dense is not None
     visibility, identity = (
         None if known is None else np.asarray(known)[kept] for known in (lines.visibility, lines.identity)
     )
     return MapTruth(
-        np.asarray(lines.points)[kept][..., : found.points.shape[-1]],
+        np.asarray(lines.dense if dense else lines.points)[kept][..., : found.points.shape[-1]],
         np.asarray(lines.category)[kept],
         visibility,
         identity,
+        sampled=dense,
     )
 
 

@@ -5,9 +5,10 @@ ways to list the orders of a ring (`gt_shift_pts_pattern` v0 to v4). v0, v1 and 
 resampling: `point_orders`, which runs on the device. v2 and v3 start at each vertex of the original ring and resample
 from there: `vertex_orders`, for which the original ring is needed.
 
-The loss uses `point_orders`. A ring's start then never matters, whatever vertices its annotator set, and the truth of a
-frame stays L x P points. The orders of v2 would have to be stored with every frame, P - 1 times as much, and of a ring
-with more vertices the reference draws a random part.
+The loss uses `point_orders`, of rings that were resampled from their first corner (`geometry.rings`): it does not
+depend on the vertex at which the source starts a ring, and the truth of a frame stays L x P points. The orders of v2
+would have to be stored with every frame, P - 1 times as much, and of a ring with more vertices the reference draws a
+random part.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.metrics.buffers import buffers_touch
 from tflane_jax.metrics.chamfer import PaddedLines, near_pairs, pair_chamfer
 from tflane_jax.metrics.frames import Lines, check_shape
-from tflane_jax.metrics.groups import BY_OCCLUSION, GroupedMetrics, Partition
+from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
 from tflane_jax.metrics.map_overlap import OVERLAP_DISTANCES, OVERLAP_THRESHOLDS, map_overlap
 from tflane_jax.metrics.matching import average_precision_area, greedy_match, nearest_truth, pooled
 
@@ -50,12 +50,14 @@ class MapTruth:
         visibility: (G,) fraction in direct line of sight, for groups by occlusion; None if it is not known.
         identity: (G,) number of the line, the same in every frame of a scene, for `metrics.consistency`; None if it is
             not known.
+        sampled: whether each line is `SAMPLES` points, equally spaced along the original line; they stay as they are.
     """
 
     points: Lines
     classes: Int[np.ndarray, " g"]
     visibility: Float[np.ndarray, " g"] | None = None
     identity: Int[np.ndarray, " g"] | None = None
+    sampled: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class VectorMapMetrics:
     Args:
         sampling: of the detections. "maptr": to 100 points, as in all official configurations
             (`eval_use_same_gt_sample_num_flag`); "maptrv2": the same, but lines of exactly 100 points stay unchanged;
-            "as_given": none. Ground truth is always resampled.
+            "as_given": none. Ground truth is always resampled, but for `MapTruth.sampled`.
         measure: of the distance of two lines: "chamfer" at `MAP_THRESHOLDS`, or "iou", the overlap of their buffers, at
             `OVERLAP_THRESHOLDS`, which needs shapely.
         dims: of the points. 3 is MapTRv2's variant for Argoverse 2: heights count in Chamfer distances, but neither in
@@ -171,7 +173,7 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
     """The metric of all lines and of the groups of a partition, see `metrics.groups`.
 
     Args:
-        groups, lane_groups: see `GroupedMetrics`; lines take the place of lanes.
+        groups, frame_groups, lane_groups: see `GroupedMetrics`; lines take the place of lanes.
         partition: of the lines; default by occlusion.
         sampling, dims, measure: see `VectorMapMetrics`.
     """
@@ -180,6 +182,7 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
         self,
         groups: Sequence[str] | None = None,
         *,
+        frame_groups: Sequence[str] = (),
         lane_groups: Sequence[str] = (),
         partition: Partition = BY_OCCLUSION,
         sampling: Sampling = "maptr",
@@ -190,17 +193,21 @@ class GroupedMapMetrics(GroupedMetrics["MatchedMap"]):
         self.dims: Dims = dims
         self.measure: Measure = measure
         make = partial(VectorMapMetrics, sampling, measure, dims)
-        super().__init__(make, partition, groups, lane_groups=lane_groups)
+        super().__init__(make, partition, groups, frame_groups=frame_groups, lane_groups=lane_groups)
 
     def update(
-        self, detections: MapDetections, truth: MapTruth, members: Mapping[str, Bool[np.ndarray, " g"]] | None = None
+        self,
+        detections: MapDetections,
+        truth: MapTruth,
+        frame_group: FrameGroup = None,
+        members: Mapping[str, Bool[np.ndarray, " g"]] | None = None,
     ) -> None:
         """Add one frame; arguments as of `GroupedMetrics.add`.
 
         Raises UserError for arrays that do not fit together, or a visibility that is not known.
         """
         frame = match_map(detections, truth, self.sampling, self.measure, dims=self.dims, nearest="all")
-        self.add(frame, truth, None, members)
+        self.add(frame, truth, frame_group, members)
 
 
 @dataclass(frozen=True)
@@ -267,6 +274,8 @@ def match_map(
     true_classes = _checked_classes(truth.classes, len(true), "truth")
     if (true.counts < 2).any():
         raise UserError(f"truth: line {int((true.counts < 2).argmax())} has a single point")
+    if truth.sampled and (true.counts != SAMPLES).any():
+        raise UserError(f"truth: sampled lines have {SAMPLES} points, not {int(true.counts.min())}")
     found = PaddedLines.of(detections.points, "detections", dims)
     classes = _checked_classes(detections.classes, len(found), "detections")
     scores = np.asarray(detections.scores)
@@ -274,7 +283,8 @@ def match_map(
     lines = found.counts >= 2
     found, classes, scores = found.select(lines), classes[lines], scores[lines]
 
-    same, true, found = true_classes[:, None] == classes, true.resampled(SAMPLES), _sampled(found, sampling)
+    true = true if truth.sampled else true.resampled(SAMPLES)
+    same, found = true_classes[:, None] == classes, _sampled(found, sampling)
     if measure == "iou":
         distance = np.where(same, 1.0 - map_overlap(true, found, same), np.inf)
         limits = OVERLAP_DISTANCES

@@ -96,6 +96,11 @@ class HostConfig:
         return {}
 
     @property
+    def example_forms(self) -> dict[str, tuple[str, str]]:
+        """Settings of `ExampleConfig`, dots in their names, without which the truth is another: value, reason."""
+        return {}
+
+    @property
     def bev_range(self) -> PerceptionRange:
         """The box that the BEV features cover, in the frame of the example, metres."""
         return self.encoder.bev_range

@@ -84,6 +84,13 @@ class LaneSegNetConfig(HostConfig):
         areas = 2 * self.decoder.points if self.areas is None else self.areas.points
         return {"segment_points": self.decoder.points, "area_points": areas}
 
+    @property
+    def example_forms(self) -> dict[str, tuple[str, str]]:
+        """A crossing is a segment with two sides, or an area, which is a ring."""
+        if self.areas is None:
+            return {"crossings": ("sides", "it learns a crossing as a segment, by its two long sides")}
+        return {"crossings": ("ring", "it learns a crossing as an area, by its outline (task.model.areas)")}
+
     def build(self) -> LaneSegNet:
         """Return the Linen module; raises UserError where its parts do not fit together."""
         check_settings(self, "task.model.")

@@ -94,6 +94,7 @@ class LiftEncoder(nn.Module):
         points: Float[Array, "v d h w 3"],
         *,
         train: bool,
+        fuse: BevHook | None = None,
     ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
         """Return BEV features, row 0 at the smallest y, column 0 at the smallest x; and depth logits.
 
@@ -102,6 +103,7 @@ class LiftEncoder(nn.Module):
             cameras: parameters of the cameras, see `camera_vector`.
             points: of the rays, metres, ego frame (`ray_points`); NaN for those of a camera that does not exist.
             train: norms use batch statistics, and dropout is on.
+            fuse: how priors change the BEV features, once; positions are a sine encoding of (x, y).
         """
         config, grid = self.config, self.config.grid
         network = partial(DepthNet, config.dim, config.bins, config.pyramid, config.dropout, name="depth_net")
@@ -109,7 +111,14 @@ class LiftEncoder(nn.Module):
         rows, columns = grid.rows * config.fine, grid.columns * config.fine
         cells = cell_numbers(points, BevGrid(grid.range, rows, columns), config.border)
         x = collect(context, jax.nn.softmax(logits, -1), cells, rows * columns).reshape(rows, columns, config.dim)
-        return run_part(self, partial(_convolved, train), config, x), logits
+        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
+        bev = lax.optimization_barrier(run_part(self, partial(_convolved, train), config, x))
+        if fuse is not None:
+            places = cell_points(grid)
+            position = sine_encoding(jnp.asarray(places), config.dim // 4, lowest=0.125)
+            fused = fuse(0, places, bev.reshape(-1, config.dim), position)
+            bev = lax.optimization_barrier(fused.reshape(bev.shape))
+        return bev, logits
 
     def __call__(
         self,
@@ -126,31 +135,24 @@ class LiftEncoder(nn.Module):
         Args:
             levels: one level of feature maps.
             cameras: calibration and validity; of the images, only the shape is used.
-            train: see `encode`.
-            fuse: how priors change the BEV features, once; positions are a sine encoding of (x, y).
+            train, fuse: see `encode`.
 
         Raises:
             UserError: several levels, or more cameras than configured.
         """
-        config, grid = self.config, self.config.grid
+        config = self.config
         if len(levels) != 1 or len(cameras.valid) > config.cameras:
             raise UserError(
                 f"the lift takes one level of feature maps of at most {config.cameras} cameras and got {len(levels)} "
                 f"levels of {len(cameras.valid)}: change `images` of the encoder, or `cameras` of LiftConfig"
             )
-        bev, logits = self.lift(levels[0], cameras, train=train)
+        bev, logits = self.lift(levels[0], cameras, train=train, fuse=fuse)
         if config.supervised and self.is_mutable_collection(AUXILIARY):
             self.sow(AUXILIARY, "depth", logits)
-        # The barriers keep XLA from fusing across the hook: a prior without data gives bit-identical features.
-        bev = lax.optimization_barrier(bev)
-        if fuse is None:
-            return bev
-        places = cell_points(grid)
-        position = sine_encoding(jnp.asarray(places), config.dim // 4, lowest=0.125)
-        return lax.optimization_barrier(fuse(0, places, bev.reshape(-1, config.dim), position).reshape(bev.shape))
+        return bev
 
     def lift(
-        self, features: Float[Array, "v h w c"], cameras: CameraViews, *, train: bool
+        self, features: Float[Array, "v h w c"], cameras: CameraViews, *, train: bool, fuse: BevHook | None = None
     ) -> tuple[Float[Array, "y x c"], Float[Array, "v h w d"]]:
         """Return what `encode` does, from calibrated cameras."""
         size, shape = cameras.image.shape[1:3], (features.shape[1], features.shape[2])
@@ -170,7 +172,7 @@ class LiftEncoder(nn.Module):
                 own = pose @ invert_pose(jnp.asarray(cameras.vehicle.vehicle_from_ego))[None]
             pose = jnp.where(valid, own, eye)
         vector = camera_vector(intrinsics, pose, self.config.image_scale)
-        return self.encode(features, vector, points, train=train)
+        return self.encode(features, vector, points, train=train, fuse=fuse)
 
 
 def _convolved(train: bool, encoder: LiftEncoder, x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:

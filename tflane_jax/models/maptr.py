@@ -44,7 +44,7 @@ from tflane_jax.models.map_lines import (
 from tflane_jax.models.parameters import with_equal_heads
 from tflane_jax.models.prior import HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
-from tflane_jax.scene import Example, LinePrediction, MapLines, Prediction
+from tflane_jax.scene import Example, LineClass, LinePrediction, MapLines, Prediction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +83,13 @@ class MapTrConfig(HostConfig):
     def example_points(self) -> dict[str, int]:
         """Lines are compared point by point."""
         return {"map_lines.points": self.decoder.points}
+
+    @property
+    def example_forms(self) -> dict[str, tuple[str, str]]:
+        """Centerlines are labelled if they are a class."""
+        if self.decoder.classes <= LineClass.CENTERLINE:
+            return {}
+        return {"map_lines.centerlines": ("include", "it learns four classes of lines (task.model.decoder.classes)")}
 
     @property
     def bev_range(self) -> PerceptionRange:

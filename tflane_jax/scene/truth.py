@@ -122,12 +122,14 @@ class MapLines:
     Attributes:
         points: (L, P, 3) metres, ego frame; a ring repeats its first point at the end.
         category: (L,) `LineClass`.
-        closed: (L,) the line is a ring; its start and direction are arbitrary.
+        closed: (L,) the line is a ring; its start is arbitrary.
         valid: (L,).
         visibility: (L,) fraction of the line in direct line of sight, 0 to 1; None if the source cannot tell.
         identity: (L,) number of the line in its map, the same in every frame of a scene, for dividers, crossings and
             boundaries; pieces of one line share it. Paths of centerlines change with the range and have none. None if
             the source cannot tell.
+        dense: (L, S, 3) points equally spaced along the lines as the source has them, which the evaluation measures;
+            `points`, which a model learns, cut corners. None if `points` are all that is known.
     """
 
     points: Float[Array, "l p 3"]
@@ -136,10 +138,11 @@ class MapLines:
     valid: Bool[Array, " l"]
     visibility: Float[Array, " l"] | None = None
     identity: Int[Array, " l"] | None = None
+    dense: Float[Array, "l s 3"] | None = None
 
     @classmethod
-    def empty(cls, capacity: int, points: int) -> MapLines:
-        """Return a map of `capacity` invalid lines of `points` points."""
+    def empty(cls, capacity: int, points: int, dense: int | None = None) -> MapLines:
+        """Return a map of `capacity` invalid lines of `points` points, and of as many as `dense` in the dense form."""
         label, flag = np.zeros(capacity, np.int32), np.zeros(capacity, bool)
         return cls(
             points=np.zeros((capacity, points, 3), np.float32),
@@ -148,6 +151,7 @@ class MapLines:
             valid=flag.copy(),
             visibility=np.zeros(capacity, np.float32),
             identity=label.copy(),
+            dense=None if dense is None else np.zeros((capacity, dense, 3), np.float32),
         )
 
     def validate(self) -> None:
@@ -158,6 +162,8 @@ class MapLines:
         for known in (self.visibility, self.identity):
             if known is not None:
                 chex.assert_shape(known, (l,))
+        if self.dense is not None:
+            chex.assert_shape(self.dense, (l, None, 3))
 
 
 @struct.dataclass

@@ -19,8 +19,8 @@ from tflane_jax.scene import Example
 def check_settings_fit(model: HostConfig, config: ExampleConfig, *, images: bool) -> None:
     """Raise UserError where data and model cannot fit together whatever the examples are.
 
-    Ranges or points differ, or the data lack the camera images, the evidence, the past frames or the prior that the
-    model reads, or the lines of a map that it learns.
+    Ranges, points or forms of the truth differ, or the data lack the camera images, the evidence, the past frames or
+    the prior that the model reads, or the lines of a map that it learns.
 
     Args:
         model: the host.
@@ -31,6 +31,7 @@ def check_settings_fit(model: HostConfig, config: ExampleConfig, *, images: bool
     _check_ranges(model, config)
     _check_lines(model, config)
     _check_points(model, config)
+    _check_forms(model, config)
     _check_history(model, config)
 
 
@@ -134,6 +135,12 @@ def _check_points(model: HostConfig, config: ExampleConfig) -> None:
                 f"the truth of this model needs data.example.{name}={points}, as many points a lane as it predicts "
                 f"(task.model.decoder.points), not {found}: change either"
             )
+
+
+def _check_forms(model: HostConfig, config: ExampleConfig) -> None:
+    for name, (form, why) in model.example_forms.items():
+        if (found := attrgetter(name)(config)) != form:
+            raise UserError(f"the truth of this model needs data.example.{name}={form}, not {found}: {why}")
 
 
 def _check_history(model: HostConfig, config: ExampleConfig) -> None:

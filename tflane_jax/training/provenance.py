@@ -13,6 +13,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +26,35 @@ _PACKAGES = ("tflane_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint",
 
 # What decides how many threads XLA and the libraries below it use, beside the cores that a process may run on.
 _THREAD_VARIABLES = ("XLA_FLAGS", "OMP_NUM_THREADS", "NPROC", "PJRT_NPROC")
+_CPU = "cpu:"
 
 
 def thread_setting(cores: int | None = None) -> dict[str, Any]:
-    """Return what decides the number of threads: cores of this process, and environment variables that are set.
+    """Return what decides how numbers are rounded: cores, environment variables that are set, an accelerator if any.
 
     Args:
         cores: number of cores to report instead, for a process that is going to be started on as many.
     """
     if cores is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return {"cores": cores} | {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ}
+    setting = {"cores": cores} | {name: os.environ[name] for name in _THREAD_VARIABLES if name in os.environ}
+    device = _device()
+    return setting if device.startswith(_CPU) else setting | {"device": device}
+
+
+def threads_of(start: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the thread setting of a recorded start; None where it was not recorded.
+
+    Earlier versions recorded an accelerator only beside the setting, not in it.
+    """
+    threads, device = start.get("threads"), start.get("device")
+    if threads is None or not isinstance(device, str) or device.startswith(_CPU):
+        return threads
+    return {**threads, "device": device}
 
 
 def provenance() -> dict[str, Any]:
     """Return code version, package versions, machine, cores and command of this process, as plain JSON."""
-    device = jax.devices()[0]
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
@@ -48,7 +62,7 @@ def provenance() -> dict[str, Any]:
         "packages": {name: _version(name) for name in _PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "device": f"{device.platform}: {device.device_kind} x {jax.device_count()}",
+        "device": _device(),
         "threads": thread_setting(),
         "pinned_to": sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
     }
@@ -62,11 +76,11 @@ def add_provenance(folder: Path, **more: Any) -> list[str]:
     """
     earlier, new = read_provenance(folder), provenance() | more
     write_json(folder / "provenance.json", [*earlier, new])
-    others = [start["threads"] for start in earlier if start.get("threads", new["threads"]) != new["threads"]]
+    others = [threads for start in earlier if (threads := threads_of(start)) is not None and threads != new["threads"]]
     if not others:
         return []
     return [
-        f"{folder} was trained with {_listed(others[-1])} before, now with {_listed(new['threads'])}: "
+        f"{folder} was trained with {listed_setting(others[-1])} before, now with {listed_setting(new['threads'])}: "
         "the results are not bit-identical to those of an uninterrupted run"
     ]
 
@@ -81,7 +95,14 @@ def read_provenance(folder: Path) -> list[dict[str, Any]]:
     return [start for start in starts if isinstance(start, dict) and isinstance(start.get("threads", {}), dict)]
 
 
-def _listed(setting: dict[str, Any]) -> str:
+def _device() -> str:
+    """Return platform, kind and number of the devices."""
+    device = jax.devices()[0]
+    return f"{device.platform}: {device.device_kind} x {jax.device_count()}"
+
+
+def listed_setting(setting: Mapping[str, Any]) -> str:
+    """Return a thread setting for people."""
     return ", ".join(f"{name} {value}" for name, value in setting.items())
 
 

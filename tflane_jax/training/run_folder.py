@@ -115,6 +115,20 @@ def _lock(file: int, folder: Path) -> None:
         raise UserError(f"another process is training into {folder}: wait for it or choose another folder") from error
 
 
+def is_locked(folder: Path) -> bool:
+    """Return whether a process trains into the folder: another one, or this one."""
+    try:
+        import fcntl
+
+        with open(folder / "run.lock") as lock:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except (ImportError, OSError):  # Windows, or a folder without a lock
+        return False
+    return False
+
+
 def _delete(path: Path) -> None:
     if path.is_dir():
         shutil.rmtree(path)

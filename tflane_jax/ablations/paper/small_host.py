@@ -41,12 +41,13 @@ TABLES = (
         quoted=Quoted("no table of a paper", ()),
         seeds=3,
         steps=2500,
-        minutes=5.0,
+        minutes=10.0,
     ),
     replace(
         _TRAFFIC_FLOW,
         name="small_host.2",
         title="TopoNet with lane proposals, without and with traffic flow",
+        minutes=11.0,
         rows=tuple(replace(row, settings=_PROPOSALS) for row in _TRAFFIC_FLOW.rows),
     ),
 )

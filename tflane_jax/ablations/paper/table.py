@@ -52,12 +52,13 @@ class PaperTable:
         primary: the score that decides.
         columns: scores of the table.
         quoted: the paper's own numbers.
+        secondary: score that is tested as well, corrected apart from the primary one; None for none.
         negative_control: score on which no treatment should change anything; None for none.
         alpha: significance level of the corrected tests.
         seeds: number of seeds.
         steps: updates of every run; None for those of the configurations.
         hosts: models that rows start from. They are trained first and are no rows.
-        minutes: what a run takes on one core of the machine of docs/benchmarks.md, for estimates.
+        minutes: that a run takes on one core, for estimates; the mean over rows in docs/results where it is recorded.
         note: a sentence of the table's text, such as why a column of the paper is missing.
     """
 
@@ -68,6 +69,7 @@ class PaperTable:
     primary: str
     columns: tuple[str, ...]
     quoted: Quoted
+    secondary: str | None = None
     negative_control: str | None = None
     alpha: float = 0.05
     seeds: int = 8
@@ -79,7 +81,7 @@ class PaperTable:
     @property
     def declaration(self) -> Declaration:
         """What is tested."""
-        return Declaration(self.primary, self.claims, self.negative_control, self.alpha)
+        return Declaration(self.primary, self.claims, self.negative_control, self.alpha, self.secondary)
 
     def configs(self, rows: Sequence[TableRow], *, quick: bool = False) -> dict[str, RunConfig]:
         """Return the configuration of each of `rows` or `hosts` by name.

@@ -69,6 +69,9 @@ def compare(commands) -> None:
         metavar="GROUP/SCORE",
         help="score on which the treatment should change nothing, for example hidden-traffic/recall",
     )
+    declared.add_argument(
+        "--secondary", metavar="GROUP/SCORE", help="score that is tested as well, corrected apart from --primary"
+    )
     declared.add_argument("--alpha", type=float, help="level of the corrected tests (default 0.05)")
     parser.set_defaults(takes_overrides=True)
 
@@ -89,12 +92,31 @@ def tables(commands) -> None:
         type=int,
         help="number of trainings at a time, which share the cores (default 1; with --quick, one for each of 2 cores)",
     )
+    parser.add_argument(
+        "--cores",
+        metavar="N",
+        type=int,
+        help="cores of each training, on which its numbers depend (default: all, shared between --jobs)",
+    )
     parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
     parser.add_argument(
         "--record",
         metavar="DIR",
         type=Path,
-        help="copy the summaries to DIR and write DIR.md anew; the repository keeps docs/results",
+        help="copy the summaries and the scores of all runs to DIR and write DIR.md anew; the repository keeps "
+        "docs/results",
+    )
+    parser.add_argument(
+        "--from",
+        dest="source",
+        metavar="DIR",
+        type=Path,
+        help="take the runs that are recorded in DIR instead of training them, such as docs/results",
+    )
+    parser.add_argument(
+        "--earlier-scores",
+        action="store_true",
+        help="keep scores of complete runs that an earlier state of the code measured (default: measure again)",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("runs/tables"), help="default runs/tables")
 
@@ -121,6 +143,9 @@ def carry_over(commands) -> None:
     parser.add_argument("--steps", metavar="N", type=int, help="updates of each run (default: the configuration's)")
     parser.add_argument("--scenes", metavar="N", type=int, help="training scenes (default: the configuration's)")
     parser.add_argument("--jobs", type=int, default=1, help="number of trainings at a time (default 1)")
+    parser.add_argument(
+        "--cores", metavar="N", type=int, help="cores of each training (default: all, shared between --jobs)"
+    )
     parser.add_argument("--quick", action="store_true", help="a few updates on a few scenes: a smoke test, no result")
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("runs/carry_over"), help="default runs/carry_over"

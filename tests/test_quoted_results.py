@@ -1,0 +1,157 @@
+"""Numbers that pages quote from tables: those of docs/results, cell by cell.
+
+A quoting table stands below `<!-- results: NAME -->`, which names the recorded table. Its columns and rows have shorter
+names than there, which this file translates.
+"""
+
+import json
+import re
+
+import pytest
+
+from tests.shared import ROOT
+
+PAGES = ("README.md", "docs/tf_lane.md", "docs/small_models.md")
+COLUMNS = {
+    "DET_l": "all/DET_l",
+    "TOP_ll": "all/TOP_ll",
+    "recall": "all/recall",
+    "hidden, driven along": "hidden+traffic/recall",
+    "recall, hidden lanes that vehicles drove along": "hidden+traffic/recall",
+    "hidden, no vehicle near": "hidden-traffic/recall",
+}
+ROWS = {
+    "+ TFM (the paper)": "TopoNet + TFM",
+    "+ TFM, in the queries as in the paper": "TopoNet + TFM",
+    "+ TFM + BEV (ours)": "TopoNet + TFM + BEV",
+    "+ TFM, and traffic in the BEV features (ours)": "TopoNet + TFM + BEV",
+}
+# Rows about the model of the row above that has a name of its own.
+ADDED = {
+    "- none at inference": ", no traffic flow at inference",
+    "- of another scene": ", traffic of another scene",
+    "the same, traffic of another scene at inference": ", traffic of another scene",
+    "- control: trained without traffic": ", control",
+    "the same, trained without traffic (control)": ", control",
+}
+NUMBER = r"[+-]?\d+\.\d+"
+# "7.6 points over the control (+5.9 to +9.3, p = 0.02" and "(+6.1 points over the control, p = 0.003)".
+INTERVAL = re.compile(rf"({NUMBER})([^()\d]*)\(({NUMBER}) to ({NUMBER})(?:[^()]*?, p [=<] (\d\.\d+))?")
+DIFFERENCE = re.compile(rf"\(({NUMBER})\s+points[^()\d]*, p = (\d\.\d+)\)")
+FINDING = re.compile(rf"({NUMBER}) points \((?:95 % ({NUMBER}) to ({NUMBER}), )?(?:p [<]? ?(\d\.\d+), )?")
+
+
+def summaries():
+    """Return the recorded tables by name."""
+    paths = (ROOT / "docs" / "results").glob("*.json")
+    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
+
+
+def tables(text):
+    """Yield line above, header and rows of every table of a page, the rows as lists of cells without emphasis."""
+    lines = [*text.splitlines(), ""]
+    starts = [i for i, line in enumerate(lines[:-1]) if line.startswith("|") and not lines[i - 1].startswith("|")]
+    for start in starts:
+        end = next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))
+        header, _, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:end])
+        above = next((line for line in reversed(lines[:start]) if line), "")
+        yield above, header, [[cell.replace("*", "") for cell in row] for row in rows]
+
+
+def wrong_tables(text, recorded):
+    """Return what is wrong with the quoting tables of a page, and how many cells they have."""
+    wrong, count = [], 0
+    for above, header, rows in tables(text):
+        if not any("±" in cell for row in rows for cell in row):
+            continue
+        named = re.fullmatch(r"<!-- results: (\S+) -->", above)
+        if named is None or named[1] not in recorded:
+            wrong.append(f"a table with the row {rows[0]} does not name a recorded table, but has: {above}")
+            continue
+        found = {row["model"]: row for row in recorded[named[1]]["rows"] if row["checkpoint"] == "last"}
+        main = ""
+        for label, *cells in rows:
+            if label in ADDED:
+                name = main + ADDED[label]
+            else:
+                own = [row for row in found if re.match(rf"{re.escape(row)}($|[,:] )", label)]
+                name = main = ROWS.get(label, max(own, key=len, default=label))
+            if name not in found:
+                wrong.append(f"{named[1]} has no row {name}")
+                continue
+            for column, cell in zip(header[1:], cells, strict=True):
+                count += 1
+                if cell != (there := found[name].get(COLUMNS.get(column, column))):
+                    wrong.append(f"{named[1]}, {name}, {column}: {cell} is quoted, {there} recorded")
+    return wrong, count
+
+
+def wrong_sentences(text, recorded):
+    """Return what is wrong with the differences and intervals that a page tells, and how many numbers were compared."""
+    effects = [
+        [None if number is None else float(number) for number in match.groups()]
+        for summary in recorded.values()
+        for finding in summary["findings"]
+        for match in FINDING.finditer(finding)
+    ]
+    told = [(m[0], m[1] if m[1][0] in "+-" else None, m[1], m[3], m[4], m[5]) for m in INTERVAL.finditer(text)]
+    told += [(m[0], m[1], m[1], None, None, m[2]) for m in DIFFERENCE.finditer(text)]
+    wrong, count = [], 0
+    for words, signed, plain, low, high, p in told:
+        count += sum(number is not None for number in (plain, low, high, p))
+        same = [
+            e
+            for e in effects
+            if (_rounds(e[0], signed) if signed else _rounds(abs(e[0]), plain))
+            and all(
+                number is None or _rounds(value, number) for value, number in zip(e[1:], (low, high, p), strict=True)
+            )
+        ]
+        if not same:
+            wrong.append(f"no recorded finding has these numbers: {' '.join(words.split())}")
+    return wrong, count
+
+
+def _rounds(value, text):
+    """Return whether a recorded number, itself rounded, rounds to a quoted one."""
+    return value is not None and abs(value - float(text)) <= 0.5 * 10.0 ** -len(text.partition(".")[2]) + 1e-9
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_quoted_numbers_are_the_recorded_ones(page):
+    text, recorded = (ROOT / page).read_text(encoding="utf-8"), summaries()
+    wrong, cells = wrong_tables(text, recorded)
+    wrong_told, numbers = wrong_sentences(text, recorded)
+    assert wrong + wrong_told == []
+    assert cells >= 20
+    assert numbers >= {"README.md": 7, "docs/tf_lane.md": 30, "docs/small_models.md": 0}[page]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_changed_digit_is_found(page):
+    """Of each cell one digit is changed, of the next one the next digit; of intervals every digit."""
+    text, recorded = (ROOT / page).read_text(encoding="utf-8"), summaries()
+    cells = list(re.finditer(r"\d+\.\d ± \d+\.\d(?=\**\s*\|)", text))
+    for number, cell in enumerate(cells):
+        digits = [place for place in range(cell.start(), cell.end()) if text[place].isdigit()]
+        assert wrong_tables(_changed(text, digits[number % len(digits)], 1), recorded)[0], cell[0]
+    for told in re.finditer(rf"\({NUMBER} to {NUMBER}", text):
+        for place in range(told.start(), told.end()):
+            if text[place].isdigit():
+                assert wrong_sentences(_changed(text, place, 5), recorded)[0], told[0]
+
+
+def _changed(text, place, by):
+    return text[:place] + str((int(text[place]) + by) % 10) + text[place + 1 :]
+
+
+def test_a_row_or_a_table_without_its_source_is_found():
+    recorded, page = summaries(), (ROOT / "docs/tf_lane.md").read_text(encoding="utf-8")
+    for old, new, words in (
+        ("<!-- results: tf_lane.2 -->", "With learned queries:", "does not name a recorded table"),
+        ("<!-- results: tf_lane.2 -->", "<!-- results: tf_lane.9 -->", "does not name a recorded table"),
+        ("| + TFM (the paper) |", "| + TFM |", "has no row + TFM"),
+        ("- of another scene", "- none at inference", "is quoted"),
+    ):
+        assert old in page
+        assert any(words in line for line in wrong_tables(page.replace(old, new), recorded)[0])

@@ -1,0 +1,185 @@
+"""Runs that are recorded (`ablations.archive`) in the place of trainings, and the record of a table's own runs.
+
+A recorded run has the place of a training with the same configuration, seed and thread setting. If there is none with
+the thread setting of this process, one with another setting has it, because a table is made from what was trained,
+wherever that was. Runs of a CPU and of an accelerator do not meet in a table, see `with_recorded`.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.ablations.archive import Archive, read_archive
+from tflane_jax.ablations.facts import facts
+from tflane_jax.ablations.jobs import Job
+from tflane_jax.ablations.recorded import Measured, RecordedRun, evaluation_name
+from tflane_jax.ablations.scores import evaluations, measure
+from tflane_jax.config_io import first_difference, to_json
+from tflane_jax.errors import UserError
+from tflane_jax.runs import current_form
+
+FILE = "scores.json.gz"
+"""Name of the record in a table's folder."""
+
+Plan = Mapping[str, Sequence[Job]]
+
+
+def archive_path(folder: Path, table: str) -> Path:
+    """Return the file of a table in a folder of results."""
+    return folder / "scores" / f"{table}.json.gz"
+
+
+def find_archive(folder: Path, table: str) -> Archive:
+    """Return the record of a table in a folder of results; an empty one, with a message, if it has none.
+
+    Raises UserError if there is no such folder, or the record is damaged or of another table.
+    """
+    if not folder.is_dir():
+        raise UserError(f"--from {folder} is no folder: give the folder of results, such as docs/results")
+    path = archive_path(folder, table)
+    if not path.exists():
+        print(f"{path} does not exist: no run of {table} is recorded there")
+        return Archive(table, None, {})
+    archive = read_archive(path)
+    if archive.table != table:
+        raise UserError(f"{path} is the record of {archive.table}")
+    return archive
+
+
+def thread_settings(archive: Archive, own: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the thread settings that a run may have: that of this process, then those in the record."""
+    found: list[Mapping[str, Any]] = [own]
+    for run in archive.runs.values():
+        if run.threads not in found:
+            found.append(run.threads)
+    return found
+
+
+def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[str]) -> dict[str, list[Job]]:
+    """Return the first plan with recorded runs in the place of trainings.
+
+    Recorded runs of another device than that of this process are taken only if no training and no run of a third
+    device remains.
+
+    Args:
+        plans: the same trainings with different thread settings, that of this process first.
+        archive: what is recorded.
+        scores: that a table cannot do without; a run that lacks one is trained.
+    """
+
+    def best(same: Sequence[Job]) -> Job:
+        for job in same:
+            run = archive.runs.get(job.folder.name)
+            if run is not None and not _why_not(run, job, scores):
+                return replace(job, recorded=run)
+        return same[0]
+
+    own = _device(next(iter(plans[0].values()))[0])
+    for allowed in (plans, [plan for plan in plans if _device(next(iter(plan.values()))[0]) == own]):
+        found = {
+            name: [best([plan[name][i] for plan in allowed]) for i in range(len(jobs))]
+            for name, jobs in plans[0].items()
+        }
+        if len({_device(job) for jobs in found.values() for job in jobs}) == 1:
+            break
+    return found
+
+
+def _device(job: Job) -> Any:
+    """Return the accelerator of a training; None for a CPU."""
+    return job.threads.get("device")
+
+
+def unused(plan: Plan, archive: Archive, scores: Collection[str]) -> list[str]:
+    """Return a line for each training of a plan of which the record has another run, with the first difference."""
+    by_name = {(run.row, run.seed): run for run in archive.runs.values()}
+    lines = []
+    for name, jobs in plan.items():
+        for job in jobs:
+            (seed,) = job.config.training.seeds
+            run = archive.runs.get(job.folder.name) or by_name.get((name, seed))
+            if job.recorded is None and run is not None:
+                reason = _why_not(run, job, scores) or "runs of different devices do not meet in a table"
+                lines.append(f"the recorded run of {name}, seed {seed}, is not used: {reason}")
+    return lines
+
+
+def _why_not(run: RecordedRun, job: Job, scores: Collection[str]) -> str:
+    """Return why a recorded run cannot have the place of a training; "" if it can."""
+    try:
+        saved, _ = current_form(dict(run.config))
+    except UserError as error:
+        return str(error)
+    if difference := first_difference(saved, portable(job)):
+        return difference
+    names = [evaluation_name(which, config.evaluation, job.config.evaluation) for config, which in evaluations(job)]
+    if lacking := [name for name in names if name not in run.measured]:
+        return f"it was not measured by: {lacking[0]}"
+    # Without a best checkpoint there is None; the last one is always measured.
+    if any(run.measured[name] is None for name in names if name != "best"):
+        return "it has no scores of its last checkpoint"
+    every = [scores for measured in run.measured.values() if measured for scores in measured.ways.values()]
+    lacking = [score for score in scores if not all(score in of_way for of_way in every)]
+    return f"it has no {lacking[0]}" if lacking else ""
+
+
+def portable(job: Job) -> dict[str, Any]:
+    """Return the configuration of a stored run as JSON; a run that it starts from is named by its key."""
+    config, start = job.config, job.config.training.init_from
+    if start is not None and Path(start).parent == job.folder.parent:
+        config = replace(config, training=replace(config.training, init_from=Path(start).name))
+    return to_json(config)
+
+
+def archive_of(
+    table: str, declaration: Mapping[str, Any], trained: Plan, scores: Collection[str], curves: Collection[str]
+) -> Archive:
+    """Return the record of finished runs, which are measured if they are not yet.
+
+    Args:
+        table: name.
+        declaration: content of the file in which the comparison was declared.
+        trained: the runs, by row.
+        scores: that are tested; only their parts by scene are kept.
+        curves: scores of the validation split that are kept.
+    """
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    runs: dict[str, RecordedRun] = {}
+    for name, jobs in trained.items():
+        for job in jobs:
+            key = job.folder.name
+            runs.setdefault(key, job.recorded or _recorded(key, name, job, scores, curves, now))
+    return Archive(table, declaration, runs)
+
+
+def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Collection[str], now: str) -> RecordedRun:
+    own, found = facts(job), {}
+    for config, which in evaluations(job):
+        measured = measure(job, config, which)
+        name = evaluation_name(which, config.evaluation, job.config.evaluation)
+        found[name] = None if measured is None else _of_scores(measured, scores)
+    wanted = ("step", "split", *curves)
+    validation = tuple({n: record[n] for n in wanted if n in record} for record in own.validation)
+    return RecordedRun(
+        key=key,
+        row=row,
+        seed=job.config.training.seeds[0],
+        config=portable(job),
+        threads=dict(job.threads),
+        facts=replace(own, validation=validation),
+        measured=found,
+        time=now,
+    )
+
+
+def _of_scores(measured: Measured, scores: Collection[str]) -> Measured:
+    """Return what was measured with the parts by scene of some scores alone."""
+    kept = {
+        way: {name: ratio for name, ratio in ratios.items() if name in scores}
+        for way, ratios in measured.ratios.items()
+    }
+    return replace(measured, ratios=kept)

@@ -1,0 +1,144 @@
+"""The trainings of a table: what they are, what is complete, and how long the rest takes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.ablations.archive import Archive
+from tflane_jax.ablations.declaration import check
+from tflane_jax.ablations.jobs import Job, ScoredBy, check_rows
+from tflane_jax.ablations.paper.table import PaperTable
+from tflane_jax.ablations.reuse import thread_settings, with_recorded
+from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, stored_jobs
+from tflane_jax.ablations.workers import worker_threads
+from tflane_jax.config import RunConfig
+
+
+@dataclass(frozen=True)
+class TablePlan:
+    """The trainings of a table for given seeds.
+
+    Attributes:
+        table: of the paper.
+        rows, hosts: configurations of the rows, and of what rows start from, by name.
+        jobs: the trainings of the rows by name, one for each seed, or recorded runs in their place.
+        host_jobs: those of the hosts from which a row still has to start.
+    """
+
+    table: PaperTable
+    rows: Mapping[str, RunConfig]
+    hosts: Mapping[str, RunConfig]
+    jobs: Mapping[str, Sequence[Job]]
+    host_jobs: Mapping[str, Sequence[Job]]
+
+    def named(self) -> dict[str, Sequence[Job]]:
+        """Return all trainings; the names of hosts begin with "host"."""
+        return {f"host {name}": jobs for name, jobs in self.host_jobs.items()} | dict(self.jobs)
+
+    def every(self) -> list[Job]:
+        """Return every run once, those of the hosts first."""
+        return list({job.folder: job for jobs in (self.host_jobs, self.jobs) for job in seed_by_seed(jobs)}.values())
+
+    def declared(self) -> dict[str, RunConfig]:
+        """Return the configurations of all trainings; a row that starts from a host names it in place of its folder."""
+        found = dict(self.rows)
+        for row in self.table.rows:
+            if row.start:
+                started = replace(found[row.name].training, init_from=f"host {row.start}")
+                found[row.name] = replace(found[row.name], training=started)
+        return {f"host {name}": config for name, config in self.hosts.items()} | found
+
+
+def plan_table(
+    table: PaperTable,
+    seeds: Sequence[int],
+    out: Path,
+    *,
+    jobs: int = 1,
+    cores: int | None = None,
+    quick: bool = False,
+    archive: Archive | None = None,
+    scored_by: ScoredBy = "this code",
+) -> TablePlan:
+    """Return the trainings of a table; the arguments are those of `table_run.run_table`.
+
+    Raises UserError where one of them must fail.
+    """
+    rows, hosts = (table.configs(every, quick=quick) for every in (table.rows, table.hosts))
+    check(table.declaration, rows)
+    archive, store = archive or Archive(table.name, None, {}), store_of(out, quick=quick)
+    settings = thread_settings(archive, worker_threads(jobs, cores))
+    plans = [_planned(table, rows, hosts, seeds, store, threads) for threads in settings]
+    chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration.scores)
+    trained = {name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in chosen.items()}
+    # The host of a recorded row is needed no more.
+    starts = {job.config.training.init_from for of_row in trained.values() for job in of_row if job.recorded is None}
+    needed = {
+        name: [job for job in of_host if str(job.folder) in starts] for name, of_host in plans[0].host_jobs.items()
+    }
+    plan = replace(plans[0], jobs=trained, host_jobs=needed)
+    check_rows(plan.named())
+    return plan
+
+
+def _planned(
+    table: PaperTable,
+    rows: Mapping[str, RunConfig],
+    hosts: Mapping[str, RunConfig],
+    seeds: Sequence[int],
+    store: Path,
+    threads: Mapping[str, Any],
+) -> TablePlan:
+    host_jobs = stored_jobs(hosts, seeds, store, threads=threads)
+    origins = {row.name: host_jobs[row.start] for row in table.rows if row.start}
+    return TablePlan(table, rows, hosts, stored_jobs(rows, seeds, store, threads=threads, origins=origins), host_jobs)
+
+
+def store_of(out: Path, *, quick: bool) -> Path:
+    """Return the folder of runs below the folder of all tables."""
+    return (out / "quick" if quick else out) / "runs"
+
+
+def seed_by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
+    """Return every run once, seed by seed, so that a table stopped early has pairs."""
+    every = [job for of_seed in itertools.zip_longest(*plan.values()) for job in of_seed if job is not None]
+    return list({job.folder: job for job in every}.values())
+
+
+def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int) -> None:
+    """Print how many runs are complete, how long the others take, and which exist with other thread settings.
+
+    Args:
+        plan: the trainings.
+        seeds: of the plan.
+        store: folder of its runs.
+        jobs: trainings at a time.
+    """
+    every, table = plan.every(), plan.table
+    complete = sum(job.is_complete() for job in every)
+    text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
+    if recorded := sum(job.recorded is not None for job in every):
+        text += f" ({recorded} of them recorded)"
+    if complete < len(every):
+        seconds, guesses = remaining_seconds(plan.named(), table.minutes)
+        basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
+        text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
+    print(text, flush=True)
+
+    def replan(threads: Mapping[str, Any]) -> list[Job]:
+        return _planned(table, plan.rows, plan.hosts, seeds, store, threads).every()
+
+    trained = [job for job in every if job.recorded is None]
+    same = replan(trained[0].threads) if trained else []
+    places = [i for i, job in enumerate(same) if job.folder in {job.folder for job in trained}]
+    for line in runs_elsewhere([same[i] for i in places], store, lambda setting: [replan(setting)[i] for i in places]):
+        print(line, flush=True)
+
+
+def _duration(seconds: float) -> str:
+    minutes = max(1, round(seconds / 60))
+    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"

@@ -3,21 +3,37 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-from benchmarks import collectives, loading, marker_occlusion, metrics, paper_sizes
+from benchmarks import collectives, loading, marker_occlusion, marker_scenes, metrics, paper_sizes
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
+from tests.models.cases import CAMERA_TOPONET, make_camera_example
+from tests.models.test_marker_fusion import CONFIG as MARKERS
+from tests.parameters import random_params
 from tests.shared import ROOT
 from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_io import to_text
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.markers.image_search import DetectorConfig
+from tflane_jax.markers.pixels import PixelConfig
+from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.markers.square_pose import solve_square
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.runs import check_origin
+from tflane_jax.scene import MarkerObservations
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.marker_drive import DriveModel
 from tflane_jax.training.schedule import make_optimizer
+from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig
+from tflane_jax.world.roads.markers import PlacementConfig
+from tflane_jax.world.simulate import WorldConfig
 
 
 def test_ratio_is_taken_round_by_round():
@@ -74,6 +90,41 @@ def test_composites_show_the_board_where_they_say(damage, tmp_path, monkeypatch,
             assert abs(fit.camera_from_marker[0, 2, 3] - 10.0) < 0.4
         else:
             assert not len(found.marker_id)
+
+
+def test_a_drive_that_is_not_its_parts_is_noticed():
+    markers = MarkerObservations.empty(2, 3, 4)
+    reading = SimpleNamespace(observed=SimpleNamespace(markers=markers))
+    step = SimpleNamespace(reading=reading, guidance=[np.ones(2)], prediction=[np.ones(3)])
+    parts = SimpleNamespace(markers=markers), [np.ones(2)], [np.ones(3)]
+    marker_scenes._check(step, *parts)
+    other = markers.replace(residual=markers.residual + np.float32(1e-6))
+    for place, wrong in enumerate((SimpleNamespace(markers=other), [np.zeros(2)], [np.nextafter(np.ones(3), 2.0)])):
+        with pytest.raises(AssertionError):
+            marker_scenes._check(step, *(wrong if i == place else part for i, part in enumerate(parts)))
+
+
+@pytest.mark.slow
+def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monkeypatch):
+    """A random model of two cameras, on two short scenes."""
+    front = CameraMount("front", 0.0, 0.0, 1.5, 0.0, 0.0, 900.0, 960, 540)
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path / "cache"))
+    model = replace(CAMERA_TOPONET, denoising=None, priors=PriorsConfig(markers=MARKERS))
+    task = LaneGraphTask(model)
+    rig = CameraRigConfig(cameras=(front, replace(front, name="again")), scale=0.1, multiple=32)
+    markers = MarkerConfig(pixels=PixelConfig(detector=DetectorConfig()))
+    source = ProceduralConfig(
+        "test",
+        scenes=2,
+        world=WorldConfig(duration_s=3.1, keyframes=3, markers=PlacementConfig(side="both")),
+        example=ExampleConfig(range=model.range, sensor=None, cameras=rig, markers=markers),
+    )
+    drive = DriveModel(task, random_params(task.init, make_camera_example()), source)
+    scores, frames = marker_scenes.measure(source, drive, drive, tmp_path)
+    assert sum(frames.values()) == 6
+    assert list(scores) == [marker_scenes.WITH, marker_scenes.WITHHELD, marker_scenes.WITHOUT]
+    assert scores[marker_scenes.WITHHELD] == scores[marker_scenes.WITHOUT]
+    assert all(0.0 <= groups["all"]["recall"] <= 1.0 for groups in scores.values())
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """`tflane markers run`: from images, poses and a store to pictures and frames.json."""
 
+import datetime
 import json
 
 import numpy as np
@@ -24,10 +25,11 @@ def drive(tmp_path_factory):
     """Four frames half a second apart: board 3 in two of them, then none, then an unknown one with an old one."""
     folder = tmp_path_factory.mktemp("drive")
     boards = PlacedMarkers(np.array([3]), BOARDS[3][None])
-    near, old = store_of(LANES, boards), store_of(LANES, PlacedMarkers(np.array([8]), BOARDS[8][None]))
+    near = store_of(LANES, boards, surveyed=datetime.date(2026, 1, 15))
+    old = store_of(LANES, PlacedMarkers(np.array([8]), BOARDS[8][None]))
     store = json.loads(save_store(near, folder / "store.json").read_text())
-    expired = json.loads(save_store(old, folder / "old.json").read_text())["markers"][0]
-    store["markers"].append(expired | {"expires": "2026-01-01"})
+    aged = json.loads(save_store(old, folder / "old.json").read_text())["markers"][0]
+    store["markers"].append(aged | {"surveyed": "2025-01-01"})
     (folder / "store.json").write_text(json.dumps(store))
     shown = [(0.0, {3: BOARDS[3]}), (2.0, {3: BOARDS[3]}), (4.0, {}), (6.0, {8: BOARDS[8], 40: pose(25.0, -3.0, 3.0)})]
     frames = []
@@ -48,7 +50,7 @@ def cache(tmp_path, monkeypatch):
 def arguments(folder, out, **changed):
     options = {"store": folder / "store.json", "images": folder, "poses": folder / "poses.json", "out": out}
     options["search"] = "outlines"  # whole boards; the search for hidden ones takes seconds an image
-    options |= {"today": "2026-02-01"} | changed
+    options |= {"today": "2026-02-01", "max-age-days": 30, "interval": 0.5} | changed
     return ["markers", "run", *(text for name, value in options.items() for text in (f"--{name}", str(value)))]
 
 
@@ -87,6 +89,8 @@ def test_a_drive_from_pixels_to_lanes(drive, tmp_path, capsys):
         ({"images": "gone"}, "there is no image"),
         ({"today": "July"}, "--today"),
         ({"family": "QR"}, "ARUCO_5X5_100"),
+        ({"max-age-days": -1}, "--max-age-days"),
+        ({"interval": 0}, "--interval"),
         ({"model": "gone"}, "gone"),
     ],
 )

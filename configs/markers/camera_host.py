@@ -3,9 +3,11 @@
     tflane compare markers/camera_host markers/camera_host:bevformer_detr --seeds 0 1 2 3 4 --jobs 2 \\
         --out runs/markers/camera_hosts
 
-Models and cameras are those of `camera/toponet.py` and `camera/bevformer_detr.py`. Their hosts see single frames; these
-learn with the memory of BEV features that the rows use, at the frame rate of the paper. One host for each seed. The
-examples hold markers and an SD map, which the hosts ignore, so that all rows use the same cached data. Not trained yet.
+Models and cameras are those of `camera/toponet.py` and `camera/bevformer_detr.py`, with those parts of the recipe of
+docs/small_models.md that a camera model can have: the output in metres and the precision as class target. Those learn
+from single frames; these learn with the memory of BEV features that the rows use, at the frame rate of the paper. One
+host for each seed. The examples hold markers and an SD map, which the hosts ignore, so that all rows use the same
+cached data. Not trained yet.
 """
 
 from dataclasses import replace
@@ -13,7 +15,10 @@ from pathlib import Path
 
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
@@ -36,12 +41,16 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _on_clips(name: str) -> RunConfig:
-    """Return the training of a small camera model on clips: as many frames as its own on single ones."""
+    """Return the training of a small camera model on clips: twice as many frames as its own on single ones."""
     config = load_config(str(CAMERA / f"{name}.py"))
     assert isinstance(config.task, LaneGraphTask)
     assert isinstance(config.data, WorldData)
     cameras = config.data.example.cameras
     assert cameras is not None
+    model, losses = config.task.model, config.task.losses
+    assert isinstance(model, TopoNetConfig | BevFormerDetrConfig)
+    assert isinstance(losses, TopoNetLossConfig)
+    model = replace(model, decoder=replace(model.decoder, output="metric"))
     example = replace(
         config.data.example,
         cameras=replace(cameras, markers=True),
@@ -51,8 +60,8 @@ def _on_clips(name: str) -> RunConfig:
     )
     return replace(
         config,
-        task=replace(config.task, clip=CLIP),
-        data=replace(config.data, world=WORLD, example=example),
-        training=replace(config.training, steps=1500, batch_size=2, eval_every=1500),
+        task=replace(config.task, model=model, losses=replace(losses, class_target="quality"), clip=CLIP),
+        data=replace(config.data, train=1000, world=WORLD, example=example),
+        training=replace(config.training, steps=3000, batch_size=2, eval_every=1000),
         evaluation=EvaluationConfig(versions=("v2.1", "v1.0")),
     )

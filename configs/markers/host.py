@@ -1,68 +1,85 @@
-"""TopoNet's lane branch on single frames: the host that every model of `toponet_markers.py` starts from.
+"""The lane models on single frames that every model of `toponet_markers.py` starts from.
 
-    tflane compare markers/host markers/host:bevformer_detr --seeds 0 1 2 3 4 --jobs 2 \\
+    tflane compare markers/host markers/host:bevformer_detr --seeds 0 1 2 3 4 5 6 7 --jobs 2 \\
         --out runs/markers/hosts
 
-The examples hold markers and an SD map, which the hosts ignore, so that models with priors use the same cached data.
+Models, losses and optimizer are the recipe of docs/small_models.md (`tf_lane/toponet`, `tf_lane/lanesegnet`), with one
+more block after the U-Net, so that markers enter the BEV features before and after its context. The examples hold
+markers and an SD map, which the hosts ignore, so that models with priors use the same cached data.
 """
 
 from dataclasses import replace
+from pathlib import Path
 
-from tflane_jax.config import RunConfig, WorldData
+from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
-from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
-from tflane_jax.models.lane_denoising import DenoisingConfig
-from tflane_jax.models.lane_segments import SegmentDecoderConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.training.loop import TrainingConfig
-from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
 from tflane_jax.world.simulate import WorldConfig
 
+RECIPE = Path(__file__).parents[1] / "tf_lane"
 # Eight frames half a second apart, as in OpenLane-V2.
 WORLD = WorldConfig(duration_s=5.6, keyframes=8, markers=PlacementConfig(side="both", site="clear"))
 # Boards that the cameras of the paper's dataset have in view.
 SEEN = MarkerSimulationConfig(cameras=ARGOVERSE2_RING, occlusion="bodies")
 # GNSS receiver: 2 m and 1 degree (standard deviations), on top of the map's own error of 1.5 m.
 EXAMPLE = ExampleConfig(markers=MarkerConfig(simulation=SEEN), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
+DATA = WorldData(train=2000, val=15, test=100, world=WORLD, example=EXAMPLE)
+STEPS = 6000
 
 
 def get_config() -> RunConfig:
     """Return TopoNet."""
-    return RunConfig(
-        task=LaneGraphTask(TopoNetConfig(denoising=DenoisingConfig()), TopoNetLossConfig(successor_weight=20.0)),
-        data=WorldData(train=1000, val=15, test=100, world=WORLD, example=EXAMPLE),
-        optim=OptimConfig(lr=2e-3, warmup_steps=100, optimizer="muon", b2=0.99, clip_norm=5.0),
-        training=TrainingConfig(steps=2500, batch_size=4, eval_every=2500),
-        evaluation=EvaluationConfig(versions=("v2.1", "v1.0")),
-    )
+    config = _trained("toponet.py", DATA)
+    assert isinstance(config.task, LaneGraphTask)
+    model = config.task.model
+    assert isinstance(model, TopoNetConfig)
+    return replace(config, task=replace(config.task, model=replace(model, encoder=_encoder(model.encoder))))
 
 
 def ablations() -> dict[str, RunConfig]:
     """Return BEVFormer-DETR, the host without a graph, and LaneSegNet."""
     config = get_config()
     assert isinstance(config.task, LaneGraphTask)
-    model = BevFormerDetrConfig(encoder=config.task.model.encoder, elements=None, denoising=DenoisingConfig())
-    losses = BevFormerDetrLossConfig(points_weight=0.025, successor_weight=20.0)
-    segments = LaneSegNetConfig(
-        encoder=config.task.model.encoder,
-        decoder=SegmentDecoderConfig(sampling_points=8, refine="iterative", offsets="lane", initial_score=0.01),
-        denoising=DenoisingConfig(),
+    toponet, losses = config.task.model, config.task.losses
+    assert isinstance(toponet, TopoNetConfig)
+    assert isinstance(losses, TopoNetLossConfig)
+    # Its reference points never move, so that there is no proposed lane to start from.
+    decoder = replace(toponet.decoder, refine="fixed", proposals=None)
+    baseline = BevFormerDetrConfig(
+        encoder=toponet.encoder, range=toponet.range, decoder=decoder, elements=None, denoising=toponet.denoising
     )
-    lanesegnet = LaneGraphTask(segments, LaneSegNetLossConfig(dice_cost="probabilities"))
-    sides = WorldData(1000, 15, 100, WORLD, replace(EXAMPLE, crossings="sides"))
+    baseline_losses = BevFormerDetrLossConfig(
+        points_weight=losses.points_weight, successor_weight=losses.successor_weight, class_target=losses.class_target
+    )
+    lanesegnet = _trained("lanesegnet.py", replace(DATA, example=replace(EXAMPLE, crossings="sides")))
+    assert isinstance(lanesegnet.task, LaneGraphTask)
+    segments = lanesegnet.task.model
+    assert isinstance(segments, LaneSegNetConfig)
+    model = replace(segments, encoder=toponet.encoder)
     return {
-        "bevformer_detr": replace(config, task=LaneGraphTask(model, losses)),
-        "lanesegnet": replace(
-            config, task=lanesegnet, data=sides, training=replace(config.training, best_metric="all/mAP")
-        ),
+        "bevformer_detr": replace(config, task=LaneGraphTask(baseline, baseline_losses)),
+        "lanesegnet": replace(lanesegnet, task=replace(lanesegnet.task, model=model)),
     }
+
+
+def _trained(file: str, data: WorldData) -> RunConfig:
+    """Return a configuration of the recipe on our data."""
+    config = load_config(str(RECIPE / file))
+    training = replace(config.training, steps=STEPS, eval_every=2000)
+    return replace(config, data=data, training=training, evaluation=EvaluationConfig(versions=("v2.1", "v1.0")))
+
+
+def _encoder(config: object) -> EvidenceEncoderConfig:
+    assert isinstance(config, EvidenceEncoderConfig)
+    return replace(config, dilations=(1,))

@@ -1,9 +1,9 @@
 """TopoNet with fiducial markers (Wu and Hu), and the other rows of the paper's Tables I to IV, on clips.
 
-    tflane compare markers/host markers/host:bevformer_detr --seeds 0 1 2 3 4 \\
+    tflane compare markers/host markers/host:bevformer_detr --seeds 0 1 2 3 4 5 6 7 \\
         --out runs/markers/hosts
     tflane compare markers/toponet_markers:{toponet,bevformer_detr,toponet_smerf} \\
-        markers/toponet_markers --seeds 0 1 2 3 4 --out runs/markers/table_1
+        markers/toponet_markers --seeds 0 1 2 3 4 5 6 7 --out runs/markers/table_1
 
 Every row starts from the host of `host.py` trained with the same seed and makes the same number of updates, with or
 without a prior. The rows differ only in the prior. A clip has four frames, half a second apart.
@@ -23,6 +23,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 MARKERS = SMALL_MARKER_FUSION
 HOSTS = "runs/markers/hosts"
+STEPS = 600
 
 
 def get_config() -> RunConfig:
@@ -83,13 +84,15 @@ def _tuned(host: str = "host", **priors: Any) -> RunConfig:
     return replace(
         config,
         task=replace(config.task, model=model, clip=4),
-        # Average over about the last 100 updates: over 1,000, the host's own weights would dominate it.
-        optim=replace(config.optim, ema_decay=0.99),
+        # Half the host's rate: most parameters are trained already. Average over about the last 100 updates: over
+        # 1,000, the host's own weights would dominate it.
+        optim=replace(config.optim, lr=0.5 * config.optim.lr, ema_decay=0.99),
         training=replace(
             config.training,
-            steps=400,
+            steps=STEPS,
             batch_size=2,
-            eval_every=400,
+            eval_every=STEPS,
+            checkpoint_every=STEPS,
             init_from=f"{HOSTS}/{host}/seed_{{seed}}",
             init_partly=True,
         ),

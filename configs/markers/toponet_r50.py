@@ -1,27 +1,32 @@
 """TopoNet with markers at the paper's size, on OpenLane-V2 subset A, and the rows of the paper's Tables I to IV.
 
-    tflane summary --config markers/toponet_r50 --no-compile         # needs no data
+    tflane summary --config markers/toponet_r50 --no-compile         # needs no data; --plan 1: does it fit?
     tflane convert --config markers/toponet_r50 --weights resnet50.pth --out runs/imagenet
     tflane train --config markers/toponet_r50 --data.root PATH
 
 Section IV-C: ResNet-50 from ImageNet, 2048 x 1550 pixels, 200 x 100 BEV cells, AdamW, a cosine of 24 epochs from 1e-4,
 one frame at a time. The encoder is that of OpenLane-V2's large baseline, six layers, with Eq. (3) as written in each. A
-scene has one board. Ours: one clip of four frames for an update, and the clear place of a board. Not trained.
+scene has one board. Ours: one clip of four frames for an update, and the clear place of a board. Of the 28 images of a
+clip, one feature map of 256 channels at a quarter of the size takes 5.4 GiB, so that every part recomputes its
+activations, and the frames pass in a loop. Not trained.
 """
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
 from tflane_jax.datasets.openlane_markers import BoardsConfig
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import HostConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig, as_written, uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
+from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
@@ -62,11 +67,13 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
     config = load_config(str(CAMERA / f"{host}.py"))
     assert isinstance(config.task, LaneGraphTask)
     assert isinstance(config.data, OpenLaneV2Data)
-    example = replace(config.data.example, markers=MarkerConfig(), sd_map=SdMapConfig())
+    # Only a row that reads the official SD map asks for its file.
+    sd_map = None if priors.sd_map is None else SdMapConfig()
+    example = replace(config.data.example, markers=MarkerConfig(), sd_map=sd_map)
     boards = BoardsConfig(placement=PlacementConfig(per="scene", site="clear"))
     return replace(
         config,
-        task=replace(config.task, model=replace(_six_layers(config.task.model), priors=priors), clip=CLIP),
+        task=replace(config.task, model=_recomputing(_six_layers(config.task.model), priors), clip=CLIP, time="scan"),
         data=replace(config.data, image=BASELINE_LARGE, example=example, boards=boards),
         optim=replace(config.optim, lr=1e-4, epoch_steps=EPOCH),
         training=replace(
@@ -85,3 +92,23 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
 def _six_layers(model: HostConfig) -> HostConfig:
     assert isinstance(model.encoder, CameraEncoderConfig)
     return replace(model, encoder=replace(model.encoder, bev=replace(model.encoder.bev, layers=6)))
+
+
+def _recomputing(model: HostConfig, priors: PriorsConfig) -> HostConfig:
+    """Return the host with priors whose parts recompute their activations for the gradient."""
+    assert isinstance(model, TopoNetConfig | BevFormerDetrConfig)
+    assert isinstance(model.encoder, CameraEncoderConfig)
+    assert model.elements is not None
+    encoder = replace(model.encoder, images=_again(model.encoder.images), bev=_again(model.encoder.bev))
+    markers, sd_map = (None if prior is None else _again(prior) for prior in (priors.markers, priors.sd_map))
+    return replace(
+        model,
+        encoder=encoder,
+        decoder=_again(model.decoder),
+        elements=_again(model.elements),
+        priors=replace(priors, markers=markers, sd_map=sd_map),
+    )
+
+
+def _again(part: Any) -> Any:
+    return replace(part, remat=True)

@@ -4,7 +4,8 @@
     tflane train --config tf_lane/lanesegnet_tfm:street
 
 Same data, optimizer and host as `lanesegnet.py`; the settings of the module, and the names of the rows, are those of
-`toponet_tfm.py`. The ablations run on the preset `street`.
+`toponet_tfm.py`. The ablations run on the preset `street`; those of Table 6 also on `city` (`abla6_city` and so on),
+where more than N_t road users are in range.
 """
 
 from pathlib import Path
@@ -23,5 +24,6 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return the rows of `toponet_tfm.py` on LaneSegNet."""
     rows = load_ablations(str(HERE.with_name("toponet_tfm.py")))
-    street = load_config(str(HERE.with_name("lanesegnet.py:street")))
-    return {name: with_priors_of(row, street) for name, row in rows.items()}
+    street, city = (load_config(str(HERE.with_name(name))) for name in ("lanesegnet.py:street", "lanesegnet.py"))
+    on_street = {name: with_priors_of(row, street) for name, row in rows.items()}
+    return on_street | {f"{name}_city": with_priors_of(rows[name], city) for name in ("abla6", "abla7", "abla8")}

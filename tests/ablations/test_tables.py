@@ -26,13 +26,16 @@ TABLE_FILES = {"table.md", "table.json", "table.tex", "effects.md", "effects.jso
 @pytest.mark.parametrize("name", TABLES)
 def test_every_table_is_about_its_rows_and_measured_by_its_scores(name):
     table = TABLES[name]
-    configs = table.configs(table.rows)
+    configs, hosts = table.configs(table.rows), table.configs(table.hosts)
     check(table.declaration, configs)
-    assert all(row.start in {host.name for host in table.hosts} for row in table.rows if row.start)
+    for row in (row for row in table.rows if row.start):
+        # So that all parameters of the host are found again.
+        model, host = configs[row.name].task.model, hosts[row.start].task.model
+        assert replace(model, denoising=host.denoising, priors=host.priors) == host, row.name
     for config in configs.values():
         known = config.task.score_names(config.data, config.evaluation)
         assert set(table.columns) <= known
-    quick = {name: shortened(config) for name, config in (configs | table.configs(table.hosts)).items()}
+    quick = {name: shortened(config) for name, config in (configs | hosts).items()}
     for config in quick.values():
         assert (config.training.steps, config.data.train) == (8, 24)
         make_optimizer(config.optim, config.training.steps)  # raises where the schedule does not fit

@@ -1,13 +1,15 @@
 """Native images at the sizes that a trained model reads."""
 
-from types import SimpleNamespace
+from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, photo, pose, views
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.native_views import fitted_views
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
@@ -51,11 +53,27 @@ def test_a_missing_image_stays_missing(native):
     assert not nothing.image.any()
 
 
+def openlane(native, cameras=7):
+    """Return a source whose images are read from files, and the images of a drive."""
+    image = ImageConfig(front_rows=(100, 500), scale=0.5, divisor=32)
+    stacked = jax.tree.map(lambda leaf: np.concatenate([leaf] * cameras), native)
+    return stacked, OpenLaneV2Config(Path("data"), image=image)
+
+
 def test_images_fit_the_settings_of_a_dataset(native):
-    source = SimpleNamespace(image=ImageConfig(front_rows=(100, 500), scale=0.5, divisor=32))
-    fitted = fitted_views(native, source)
-    assert fitted.size.tolist() == [[480, 200]]
-    assert fitted.image.shape == (1, 224, 480, 3)
+    fitted = fitted_views(*openlane(native))
+    assert fitted.size.tolist() == [[480, 200], *[[480, 270]] * 6]
+    assert fitted.image.shape == (7, 288, 480, 3)
+
+
+def test_a_drive_needs_the_cameras_of_the_dataset_and_an_image_in_each_frame(native):
+    with pytest.raises(UserError, match=r"trained with 7 cameras \(ring_front_center, .*the drive has 6"):
+        fitted_views(*openlane(native, 6))
+    views, source = openlane(native)
+    one = views.replace(valid=np.arange(7) == 3)
+    assert fitted_views(one, source).valid.tolist() == one.valid.tolist()
+    with pytest.raises(UserError, match="no image of any camera"):
+        fitted_views(views.replace(valid=np.zeros(7, bool)), source)
 
 
 @pytest.mark.parametrize(

@@ -117,3 +117,14 @@ def test_too_many_boards_and_frames_out_of_order():
     for time in (5, 4):
         with pytest.raises(UserError, match="put frames in order"):
             reader.read(seen_from(0.0), time, ego(0.0))
+
+
+@pytest.mark.parametrize(("interval", "residual"), [(None, 1.0), (0.5, 2.0)])
+def test_the_residual_compares_with_the_frame_that_training_compared_with(interval, residual):
+    """The vehicle claims to stand, but a board comes nearer by 1 m every quarter of a second."""
+    reader = MarkerReader(STORE, ReaderConfig(residual_interval=interval))
+    for number in range(3):
+        nearer = BOARDS[3].copy()
+        nearer[0, 3] -= number
+        found = reader.read(seen_from(0.0, {3: nearer}), number * SECOND // 4, ego(0.0)).observed.markers
+    assert found.residual[0] == pytest.approx(residual, abs=0.25)

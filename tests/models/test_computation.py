@@ -26,6 +26,7 @@ LANES = MarkerGuidance(
     points=RNG.uniform(-20, 20, (3, 4, 2)).astype(np.float32),
     successor=np.eye(3, k=1, dtype=bool),
     weight=np.array([1.0, 0.5, 0.5], np.float32),
+    confidence=np.array([0.5, 0.25, 0.0], np.float32),
     valid=np.array([True, True, False]),
     gate=np.float32(0.5),
 )

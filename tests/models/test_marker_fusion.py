@@ -224,6 +224,28 @@ def test_the_gate_is_the_confidence_and_its_variants():
     assert not np.array_equal(out, fused(CONFIG, far, bev, position)[0])
 
 
+def test_hard_masking_looks_at_each_marker():
+    """A distrusted marker beside a trusted one is ignored, and so are lanes whose remembered confidence has decayed."""
+    both = observed(10.0)
+    for name in ("pose", "lanes", "lane_valid", "valid"):
+        getattr(both, name)[1] = getattr(both, name)[0]
+    both.residual[:] = 0.0, 30.0
+    hard = replace(CONFIG, fusion="hard")
+    prior = MarkerPrior(hard, BASELINE.spec)
+    guide, bank = prior.observe(seeing(both), prior.start())
+    np.testing.assert_allclose(guide.confidence[:4], np.exp([-0.25, -0.25, -3.25, -3.25]), rtol=1e-5)
+    gate, valid = fusion_gate(guide, hard)
+    assert gate == 1.0
+    np.testing.assert_array_equal(np.flatnonzero(guide.valid), [0, 1, 2, 3])
+    np.testing.assert_array_equal(np.flatnonzero(valid), [0, 1])
+    # One frame later 0.39 is left of 0.78, below the threshold of 0.5.
+    gap, _ = prior.observe(seeing(None, has_previous=np.asarray(True)), bank)
+    assert gap.valid.any()
+    np.testing.assert_allclose(gap.confidence.max(), 0.5 * np.exp(-0.25), rtol=1e-5)
+    assert not fusion_gate(gap, hard)[1].any()
+    assert fusion_gate(gap, replace(hard, hard_threshold=0.3))[1].sum() == 2
+
+
 def test_as_written_the_norm_applies_without_markers_too():
     config = as_written(replace(CONFIG, width=16, radius=2.0, norm="query"))
     assert (config.norm, config.width, config.radius, config.query_position) == ("written", None, None, False)

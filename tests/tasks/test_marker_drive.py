@@ -1,29 +1,42 @@
 """A drive with a model: equal to the model's own steps on the same examples."""
 
+import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, photo
-from tests.markers.test_reader import BOARDS, SECOND, STORE, ego
+from tests.markers.test_reader import BOARDS, SECOND, STORE, ego, seen_from
 from tests.models.cases import CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG
 from tests.parameters import random_params
 from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, thinned
 from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.datasets.openlane_example import blank
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
+from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import CameraViews
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
-from tflane_jax.tasks.marker_drive import DriveModel, MarkerDrive, check_model
+from tflane_jax.tasks.marker_drive import (
+    DriveModel,
+    FrameRateWarning,
+    MarkerDrive,
+    as_trained,
+    check_model,
+    check_rate,
+)
 from tflane_jax.world.cameras.ring import CameraMount, CameraRigConfig
+from tflane_jax.world.simulate import WorldConfig
 
 pytest.importorskip("cv2")
 
@@ -75,3 +88,58 @@ def test_a_drive_with_a_model_is_the_composition_of_its_parts():
         np.testing.assert_allclose(found.prediction.centerlines.points, expected.centerlines.points, atol=1e-4)
         assert set(found.reading.observed.outcomes) == {3, 8}
         assert not found.remembered
+
+
+def test_a_pause_longer_than_the_memory_is_a_new_start():
+    """Six frames half a second apart fit into the memory: 3 s."""
+    for pause, remembered in ((3.0, True), (3.5, False)):
+        drive = MarkerDrive(MarkerReader(STORE))
+        seen, gap = (
+            drive.step(seen_from(x, boards), round(time * SECOND), ego(x))
+            for x, boards, time in ((0.0, None, 0.0), (4.0, {}, pause))
+        )
+        assert seen.guidance.valid.any()
+        assert (gap.remembered, bool(gap.guidance.valid.any())) == (remembered, remembered)
+
+
+def test_another_drive_starts_without_the_memory_of_the_last_one():
+    drive = MarkerDrive(MarkerReader(STORE))
+    drive.step(seen_from(0.0), SECOND, ego(0.0))
+    drive.restart(MarkerReader(STORE))
+    assert not drive.step(seen_from(0.0, {}), 0, ego(0.0)).guidance.valid.any()
+
+
+@pytest.mark.parametrize(("seconds", "warns"), [(0.1, True), (0.26, False), (0.5, False), (0.74, False), (0.8, True)])
+def test_frames_at_another_rate_than_in_training_are_warned_of(seconds, warns):
+    times = (np.arange(6) * seconds * SECOND).astype(np.int64)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        check_rate(times.tolist(), 0.5)
+        check_rate([*times[times < 0], 0, SECOND // 2, SECOND, 60 * SECOND], 0.5)  # a pause is no rate
+        check_rate([0], 0.5)
+    assert [warning.category for warning in found] == [FrameRateWarning] * warns
+    assert all("--interval" in str(warning.message) for warning in found)
+
+
+def test_a_drive_is_thinned_to_the_frames_nearest_to_an_interval():
+    camera = DriveCamera("front", AHEAD.intrinsics, np.eye(4))
+    times = [0.0, 0.1, 0.24, 0.38, 0.52, 0.6, 0.95, 3.0, 3.1, 3.2]
+    every = Drive((camera,), tuple(DriveFrame(round(t * SECOND), ego(0.0), {}) for t in times))
+    assert [frame.timestamp_ns / SECOND for frame in thinned(every, 0.5).frames] == [0.0, 0.52, 0.95, 3.0]
+    assert thinned(every, 0.01) == every
+
+
+def test_a_drive_has_the_settings_of_training():
+    simulation = MarkerSimulationConfig(residual_interval=None, first_residual=7.0)
+    world = WorldConfig(duration_s=5.6, keyframes=8)
+    example = ExampleConfig(markers=MarkerConfig(markers=3, lanes=5, points=7, simulation=simulation))
+    model = DriveModel(LaneGraphTask(), {}, ProceduralConfig(world=world, example=example))
+    config = as_trained(ReaderConfig(), model)
+    assert (config.markers, config.lanes, config.points) == (3, 5, 7)
+    assert (config.residual_interval, config.first_residual) == (None, 7.0)
+    assert as_trained(config, None) == config
+    assert model.interval == pytest.approx(0.5)
+    slower = ProceduralConfig(world=replace(world, duration_s=9.1))
+    assert DriveModel(LaneGraphTask(), {}, slower).interval == pytest.approx(1.0)
+    assert DriveModel(LaneGraphTask(), {}, OpenLaneV2Config(Path("data"))).interval == 0.5
+    assert DriveModel(LaneGraphTask(), {}, replace(slower, world=replace(world, keyframes=1))).interval == 0.5

@@ -17,7 +17,6 @@ import argparse
 import datetime
 import warnings
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tflane_jax.commands.sources import make_folder
-from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive
+from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive, thinned
 from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.errors import UserError
@@ -41,7 +40,7 @@ from tflane_jax.plots.marker_drive import save_drive_frame
 from tflane_jax.runs import open_run
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
-from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, check_model
+from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model, check_rate
 from tflane_jax.training.runtime import configure_jax
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig, draw_rig
 from tflane_jax.world.cameras.sensor import render_cameras
@@ -55,11 +54,16 @@ def run(options: argparse.Namespace) -> int:
     """Follow a drive: markers, store, confidence, memory and, with a model, lanes."""
     configure_jax()
     store, drive = load_store(options.store), load_drive(options.poses, options.images)
+    if options.interval is not None:
+        if not options.interval > 0.0:
+            raise UserError(f"--interval is a positive number of seconds, not {options.interval:g}")
+        drive = thinned(drive, options.interval)
     model = None if options.model is None else _model(options.model)
     range_ = PerceptionRange() if model is None else model.source.example.range
     detector = _detector(options, store)
-    config = _with_capacities(ReaderConfig(detector, range_, today=_day(options)), model)
-    steps = MarkerDrive(MarkerReader(store, config), model)
+    config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
+    steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
+    check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
     make_folder(options.out)
     frames, outcomes = [], Counter()
     with warnings.catch_warnings():
@@ -103,15 +107,6 @@ def _model(folder: Path) -> DriveModel:
     return DriveModel(check_model(trained.config.task), trained.params[0], trained.config.data.source("test"))
 
 
-def _with_capacities(config: ReaderConfig, model: DriveModel | None) -> ReaderConfig:
-    """Return the configuration with the sizes that a model was trained with."""
-    markers = None if model is None else model.source.example.markers
-    if markers is None:
-        return config
-    sizes = {name: getattr(markers, name) for name in ("markers", "lanes", "points")}
-    return replace(config, **sizes, first_residual=markers.simulation.first_residual)
-
-
 def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig:
     if options.family not in MarkerFamily.__members__:
         raise UserError(f"there is no marker family {options.family}: one of {', '.join(MarkerFamily.__members__)}")
@@ -128,6 +123,12 @@ def _day(options: argparse.Namespace) -> datetime.date:
         return datetime.date.fromisoformat(options.today)
     except ValueError:
         raise UserError(f"--today {options.today} is no day: write it like 2025-07-11") from None
+
+
+def _age(options: argparse.Namespace) -> int | None:
+    if options.max_age_days is not None and options.max_age_days < 0:
+        raise UserError(f"--max-age-days is a number of days, not {options.max_age_days}")
+    return options.max_age_days
 
 
 def _confidence(step: DriveStep) -> dict[int, float]:
@@ -179,9 +180,9 @@ def render(options: argparse.Namespace) -> int:
     """Write a drive of the built-in world: images, poses.json and store.json."""
     if options.frames < 1 or not options.scale > 0.0:
         raise UserError("--frames must be at least 1 and --scale positive")
-    world = WorldConfig(
-        duration_s=2.1 + 0.5 * options.frames, keyframes=options.frames, markers=PlacementConfig(side="both")
-    )
+    boards = PlacementConfig(side="both", site="clear")
+    # Two seconds of history come before the first frame.
+    world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
     log = simulate(options.log, world)
     store = store_of_log(log, radius=50.0, bike_lanes=True)
     if not store.markers:

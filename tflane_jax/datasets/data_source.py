@@ -98,6 +98,8 @@ class DataSource(Generic[ConfigT]):
         tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
         views: (config, numbers) -> images of these examples for pictures, where examples have none; None for an
             example whose images are not there.
+        interval: config -> seconds between successive examples of a scene; None where they are not known without data.
+        cameras: config -> names of the cameras whose images are read from files, in order; None for no such images.
     """
 
     name: str
@@ -117,6 +119,8 @@ class DataSource(Generic[ConfigT]):
     drives: Callable[[ConfigT], list[Drive]] | None = None
     tracks: bool = False
     views: Callable[[ConfigT, Sequence[int]], list[CameraViews | None]] | None = None
+    interval: Callable[[ConfigT], float | None] = lambda config: None
+    cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
 
 
 def loading_of(config: Any) -> StreamingConfig:

@@ -99,6 +99,17 @@ class Drive:
         return views
 
 
+def thinned(drive: Drive, interval: float) -> Drive:
+    """Return the drive with the frames that are nearest to `interval` seconds after one another."""
+    times, kept = np.array([frame.timestamp_ns for frame in drive.frames], np.int64), [0]
+    while kept[-1] + 1 < len(times):
+        after = (times[kept[-1] + 1 :] - times[kept[-1]]) / 1e9
+        if after[-1] < 0.5 * interval:
+            break
+        kept.append(kept[-1] + 1 + int(np.abs(after - interval).argmin()))
+    return Drive(drive.cameras, tuple(drive.frames[i] for i in kept))
+
+
 def load_drive(path: Path, images: Path) -> Drive:
     """Read and check a drive.
 

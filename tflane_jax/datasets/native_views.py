@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.datasets.view_images import ImageFit, canvas_size, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import opencv
@@ -20,10 +22,14 @@ def fitted_views(views: CameraViews, source: Any) -> CameraViews:
         views: native images; cameras in the order of the source's.
         source: configuration of a split: of the built-in world with cameras, or one with an `ImageConfig` (`image`).
 
-    Raises UserError for a source without cameras, another number of cameras, or images of another shape.
+    Raises UserError for a source without cameras, another number of cameras, images of another shape, or no image at
+    all, which tells no shape.
     """
     image = getattr(source, "image", None)
     if image is not None:
+        _check_cameras(views, source_of(source).cameras(source) or ())
+        if not np.asarray(views.valid).any():
+            raise UserError("a frame has no image of any camera: leave such frames out of the drive")
         sizes = np.asarray(views.size).tolist()
         fits = [
             fit_image(size[0], size[1], image, front=place == 0) if valid else None
@@ -40,12 +46,16 @@ def fitted_views(views: CameraViews, source: Any) -> CameraViews:
     return _of_rig(views, rig)
 
 
-def _of_rig(views: CameraViews, rig: CameraRigConfig) -> CameraViews:
-    if len(views.valid) != len(rig.cameras):
+def _check_cameras(views: CameraViews, names: Sequence[str]) -> None:
+    if len(views.valid) != len(names):
         raise UserError(
-            f"the model was trained with {len(rig.cameras)} cameras ({', '.join(m.name for m in rig.cameras)}), the "
-            f"drive has {len(views.valid)}: give images of the same cameras, in this order"
+            f"the model was trained with {len(names)} cameras ({', '.join(names)}), the drive has {len(views.valid)}: "
+            "give images of the same cameras, in this order"
         )
+
+
+def _of_rig(views: CameraViews, rig: CameraRigConfig) -> CameraViews:
+    _check_cameras(views, [mount.name for mount in rig.cameras])
     fits: list[ImageFit | None] = []
     for number, mount in enumerate(rig.cameras):
         if not views.valid[number]:

@@ -20,6 +20,7 @@ from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.nuscenes_cameras import (
+    CAMERAS,
     CameraPoses,
     CanBus,
     camera_fits,
@@ -330,4 +331,6 @@ SOURCE = DataSource(
     root="its folder",
     check=check_nuscenes,
     views=_views,
+    interval=lambda config: 0.5,
+    cameras=lambda config: None if config.image is None else CAMERAS,
 )

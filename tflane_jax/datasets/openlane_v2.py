@@ -339,4 +339,6 @@ SOURCE = DataSource(
     root="its folder",
     check=_check,
     tracks=True,
+    interval=lambda config: 0.5,
+    cameras=lambda config: None if config.image is None else SUBSETS[config.subset].cameras,
 )

@@ -229,6 +229,15 @@ def _choose_cameras(choice: Choice) -> ProceduralConfig:
     return ProceduralConfig(choice.split, scenes=_SCENES, example=replace(example, cameras=cameras))
 
 
+def _interval(config: ProceduralConfig) -> float | None:
+    """Return the mean distance of the key frames of a scene, seconds."""
+    world = config.world
+    if world.keyframes < 2:
+        return None
+    driven = world.frames - 1 - ProceduralDataset(config).history(world)
+    return driven / (world.keyframes - 1) / world.rate_hz
+
+
 def _open(config: ProceduralConfig, progress: bool) -> CachedDataset:
     return cached(ProceduralDataset(config), progress=progress)
 
@@ -245,6 +254,7 @@ SOURCE = DataSource(
     # Not from the cache: one example is made sooner than all of them.
     sample=lambda config: ProceduralDataset(config).example(0),
     build=lambda config, progress: len(_open(config, progress)),
+    interval=_interval,
 )
 CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
 """The same world with a ring of cameras, under a name of its own for `tflane data show`."""

@@ -31,7 +31,8 @@ class ReaderConfig:
         detector: how images are searched; the store's sizes replace its own.
         range: lanes are cut at this box, metres.
         markers, lanes, points: capacities of the prior, as in `MarkerConfig`.
-        residual_interval, first_residual: of the residual, as in `MarkerSimulationConfig`.
+        residual_interval, first_residual: of the residual, as in `MarkerSimulationConfig`; an interval of None compares
+            with the frame before.
         today: entries of the store that are out of date on this day give no prior; None ignores dates.
         max_age_days: see `look_up`.
     """
@@ -41,7 +42,7 @@ class ReaderConfig:
     markers: int = 2
     lanes: int = 48
     points: int = 11
-    residual_interval: float = 0.5
+    residual_interval: float | None = 0.5
     first_residual: float = 0.0
     today: datetime.date | None = None
     max_age_days: int | None = None
@@ -88,8 +89,7 @@ class MarkerReader:
             detected = detect(views, config.detector, sizes)
         else:
             detected = locate(views, found, config.detector, sizes)
-        number = frame_before([past.timestamp_ns for past in self._past], timestamp_ns, config.residual_interval)
-        before = None if number is None else self._past[number]
+        before = self._earlier(timestamp_ns)
         observed = observe(
             detected,
             self.store,
@@ -105,9 +105,18 @@ class MarkerReader:
         )
         self._past.append(_Past(timestamp_ns, np.asarray(global_from_ego, np.float64), detected))
         # A frame later than 1.5 intervals ago may still be the earlier one of the next frame.
-        while timestamp_ns - self._past[0].timestamp_ns > 1.5e9 * config.residual_interval:
+        reach = 0.0 if config.residual_interval is None else 1.5e9 * config.residual_interval
+        while timestamp_ns - self._past[0].timestamp_ns > reach:
             self._past.popleft()
         return Reading(detected, observed)
+
+    def _earlier(self, timestamp_ns: int) -> _Past | None:
+        """Return the frame that the residual compares with, None without one."""
+        interval = self.config.residual_interval
+        if interval is None:
+            return self._past[-1] if self._past else None
+        number = frame_before([past.timestamp_ns for past in self._past], timestamp_ns, interval)
+        return None if number is None else self._past[number]
 
 
 class _Past(NamedTuple):

@@ -46,9 +46,9 @@ class MarkerFusionConfig:
         encoding: of a polyline (Table IV): "sine" is the transformer on Eq. (1), "transformer" the same on raw
             coordinates, "mlp" a perceptron on all raw coordinates of a line.
         lines: sizes of the transformer; `dim` is that of a token.
-        fusion: "gated" is Eq. (3); "uniform" sets c = 1; "hard" sets c = 1 from `hard_threshold` on and ignores
-            markers below (Table II). c is only the factor in Eq. (3): confidence also scales tokens (Eq. 4) and decides
-            when memory is read. `uniform_fusion` removes it from there too.
+        fusion: "gated" is Eq. (3); "uniform" sets c = 1; "hard" sets c = 1 and ignores markers, seen or remembered,
+            whose own confidence is below `hard_threshold` (Table II). c is only the factor in Eq. (3): confidence also
+            scales tokens (Eq. 4) and decides when memory is read. `uniform_fusion` removes it from there too.
         hard_threshold: lowest confidence at which "hard" uses markers.
         heads: of the attention to the tokens.
         width: channels of that attention; None: those of the BEV features.
@@ -278,7 +278,8 @@ def fusion_gate(lanes: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Floa
     one = jnp.ones_like(lanes.gate)
     if config.fusion == "uniform":
         return one, lanes.valid
-    return one, lanes.valid & (lanes.gate >= config.hard_threshold)
+    # Each marker by its own confidence: the gate is that of the most trusted one.
+    return one, lanes.valid & (lanes.confidence >= config.hard_threshold)
 
 
 def fusion_mask(

@@ -4,6 +4,10 @@ The bank has one slot for each of the last T frames, with the lanes of that fram
 paper stores encoded tokens. This bank stores the polylines instead, which is equivalent at inference and allows
 compensation of the ego motion.
 
+Slots and decay count frames, not seconds: with the frames half a second apart of training, T = 6 slots are 3 s, at
+10 Hz they are 0.6 s. A drive must be fed at the rate of training, and a pause longer than the bank is a new start
+(`tasks.marker_drive`, `tflane markers run --interval`).
+
 Choices that the paper leaves open (the first two are options):
 
 - The paper mentions no compensation of the ego motion. `compensation="ego_motion"` transforms stored lanes into the
@@ -89,6 +93,7 @@ class MarkerGuidance:
     Attributes:
         points: (N, K, 2) metres, ego frame.
         weight: (N,) factor of each token; 0 where not valid.
+        confidence: (N,) of the marker of each token, decayed if it is remembered; 0 where not valid.
         gate: () c of Eq. (3); 0 without tokens.
         successor: (N, N) directed connectivity, between lanes of the same frame.
         valid: (N,).
@@ -96,6 +101,7 @@ class MarkerGuidance:
 
     points: Float[Array, "n k 2"]
     weight: Float[Array, " n"]
+    confidence: Float[Array, " n"]
     gate: Float[Array, ""]
     successor: Bool[Array, "n n"]
     valid: Bool[Array, " n"]
@@ -108,6 +114,7 @@ def guidance(observed: MarkerLanes, exponent: float = 1.0) -> MarkerGuidance:
     return MarkerGuidance(
         points=jnp.asarray(observed.points),
         weight=_power(relative, exponent),
+        confidence=jnp.asarray(observed.confidence),
         gate=jnp.asarray(strongest),
         successor=jnp.asarray(observed.successor),
         valid=jnp.asarray(observed.valid),
@@ -151,11 +158,17 @@ def remember(
     from_bank = jnp.where(strongest > 0, 1.0, 0.0) if config.gate == "one" else strongest
     used = bank.valid & (retrieve | (age == 0))[:, None]
     gate = jnp.where(retrieve, from_bank, alone.gate)
-    return bank, _union(bank, jnp.where(used, weight, 0.0), used, gate, config.lanes)
+    weight, decayed = (jnp.where(used, each, 0.0) for each in (weight, decayed))
+    return bank, _union(bank, weight, decayed, used, gate, config.lanes)
 
 
 def _union(
-    bank: MarkerMemory, weight: Float[Array, "t l"], used: Bool[Array, "t l"], gate: Array, most: int | None
+    bank: MarkerMemory,
+    weight: Float[Array, "t l"],
+    confidence: Float[Array, "t l"],
+    used: Bool[Array, "t l"],
+    gate: Array,
+    most: int | None,
 ) -> MarkerGuidance:
     """Return the lanes of all slots, or the `most` lanes with the largest weights, the latest first among equals."""
     slots, lanes, k = bank.points.shape[:3]
@@ -168,6 +181,7 @@ def _union(
     return MarkerGuidance(
         points=points[chosen],
         weight=weight[chosen],
+        confidence=confidence.reshape(-1)[chosen],
         gate=gate,
         valid=used[chosen],
         successor=bank.successor[slot[:, None], lane[:, None], lane[None, :]] & together,

@@ -5,6 +5,7 @@ Each step is a function of another file; this one only calls them in order, so t
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -16,10 +17,11 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.datasets.openlane_example import blank
+from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.image_search import ImageMarkers
-from tflane_jax.markers.reader import MarkerReader, Reading
+from tflane_jax.markers.reader import MarkerReader, ReaderConfig, Reading
 from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior
 from tflane_jax.models.parameters import Params
 from tflane_jax.models.prior import HostSpec
@@ -28,8 +30,15 @@ from tflane_jax.priors.markers import confidence
 from tflane_jax.scene import CameraViews, Prediction
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
-# Gate and memory that are shown without a model.
+# Gate and memory that are shown without a model, and the paper's distance of frames, seconds.
 SHOWN = MarkerFusionConfig(memory=MarkerMemoryConfig(lanes=32))
+INTERVAL = 0.5
+# A drive whose frames are more than this fraction nearer or farther apart than in training is warned of.
+_OFF = 0.5
+
+
+class FrameRateWarning(UserWarning):
+    """The frames of a drive are not as far apart as those that a model was trained on."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,11 @@ class DriveModel:
     task: LaneGraphTask
     params: Params
     source: Any
+
+    @property
+    def interval(self) -> float:
+        """Seconds between the frames of training; the paper's where the data do not tell."""
+        return source_of(self.source).interval(self.source) or INTERVAL
 
 
 class DriveStep(NamedTuple):
@@ -67,6 +81,9 @@ class DriveStep(NamedTuple):
 class MarkerDrive:
     """The markers of a drive and a model's lanes, frame by frame.
 
+    Memory counts frames: give them as far apart as in training (`interval`). A pause longer than the memory, T of those
+    intervals, is the start of another drive.
+
     Args:
         reader: of the store.
         model: with or without a marker prior; None shows the prior alone.
@@ -75,17 +92,24 @@ class MarkerDrive:
     """
 
     def __init__(self, reader: MarkerReader, model: DriveModel | None = None):
-        self.reader, self.model = reader, model
+        self.model = model
+        self.interval = INTERVAL if model is None else model.interval
         sizes = ExampleConfig(range=reader.config.range) if model is None else model.source.example
         self._sizes: ExampleConfig = sizes
         configured = None if model is None else model.task.model.priors.markers
         spec = HostSpec(1, sizes.range, sizes.range) if model is None else model.task.model.spec
         self._prior = MarkerPrior(configured or SHOWN, spec)
         self._observe = jax.jit(self._prior.observe)
-        self._bank = self._prior.start()
-        self._memory = None if model is None else model.task.start()
         self._step = None if model is None else jax.jit(model.task.step)
-        self._pose: Float[np.ndarray, "4 4"] | None = None
+        memory = self._prior.config.memory or MarkerMemoryConfig()
+        self._longest_ns = 1e9 * memory.frames * self.interval
+        self._last: tuple[int, Float[np.ndarray, "4 4"]] | None
+        self.restart(reader)
+
+    def restart(self, reader: MarkerReader) -> None:
+        """Begin another drive, with its own store, without compiling the model again."""
+        self.reader, self._last, self._bank = reader, None, self._prior.start()
+        self._memory = None if self.model is None else self.model.task.start()
 
     def step(
         self,
@@ -97,14 +121,15 @@ class MarkerDrive:
         """Return the markers and lanes of the next frame; arguments as of `MarkerReader.read`."""
         reading = self.reader.read(views, timestamp_ns, global_from_ego, found)
         markers = reading.observed.markers
-        before = global_from_ego if self._pose is None else self._pose
+        continues = self._last is not None and timestamp_ns - self._last[0] <= self._longest_ns
+        before = self._last[1] if self._last is not None and continues else global_from_ego
         example = replace(
             blank(self._sizes, governed="lanes", views=None, traffic=True),
             markers=markers,
             previous_from_ego=relative_pose(before, global_from_ego).astype(np.float32),
-            has_previous=np.asarray(self._pose is not None),
+            has_previous=np.asarray(continues),
         )
-        self._pose = np.asarray(global_from_ego, np.float64)
+        self._last = timestamp_ns, np.asarray(global_from_ego, np.float64)
         guidance, self._bank = self._observe(example, self._bank)
         guidance = jax.device_get(guidance)
         prediction = None
@@ -120,6 +145,33 @@ class MarkerDrive:
         seen = float(trust[markers.lane_valid.any(-1)].max(initial=0.0))
         remembered = bool(guidance.valid.any()) and seen < threshold
         return DriveStep(reading, trust, guidance, remembered, prediction)
+
+
+def as_trained(config: ReaderConfig, model: DriveModel | None) -> ReaderConfig:
+    """Return the configuration with the capacities and the residual that a model was trained with."""
+    markers = None if model is None else model.source.example.markers
+    if markers is None:
+        return config
+    sizes = {name: getattr(markers, name) for name in ("markers", "lanes", "points")}
+    residual = {name: getattr(markers.simulation, name) for name in ("residual_interval", "first_residual")}
+    return replace(config, **sizes, **residual)
+
+
+def check_rate(times_ns: Sequence[int], interval: float) -> None:
+    """Warn (`FrameRateWarning`) of a drive whose frames are not as far apart as `interval` seconds, up to 50 %.
+
+    The median counts: a missing frame or a pause does not.
+    """
+    if len(times_ns) < 2:
+        return
+    found = float(np.median(np.diff(np.asarray(times_ns, np.int64)))) / 1e9
+    if abs(found - interval) > _OFF * interval:
+        warnings.warn(
+            f"frames are {found:.3g} s apart, in training {interval:.3g} s: memory counts frames, so that it lasts "
+            f"{found / interval:.2g} times as long as it should; take frames {interval:.3g} s apart (--interval)",
+            FrameRateWarning,
+            stacklevel=2,
+        )
 
 
 def check_model(task: Any) -> LaneGraphTask:

@@ -110,6 +110,15 @@ def _drive(inner) -> None:
     run.add_argument("--model", metavar="RUN", type=Path, help="run folder of a model with cameras; default none")
     run.add_argument("--today", metavar="YYYY-MM-DD", help="day on which entries are valid (default the present day)")
     run.add_argument(
+        "--max-age-days", metavar="DAYS", type=int, help="leave out entries surveyed longer ago; default any age"
+    )
+    run.add_argument(
+        "--interval",
+        metavar="SECONDS",
+        type=float,
+        help="take frames this far apart, as in training (default every frame)",
+    )
+    run.add_argument(
         "--search", choices=("all", "outlines"), default="all", help="all also finds partly hidden boards (default)"
     )
     run.add_argument("--family", default="ARUCO_5X5_100", help="marker family (default ARUCO_5X5_100)")

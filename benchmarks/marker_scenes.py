@@ -1,0 +1,303 @@
+"""A camera model with markers on rendered drives, from pixels to lanes: scores with its boards and without them.
+
+    python -m benchmarks.marker_scenes --model RUN [--without RUN] --out runs/marker_scenes    # twenty scenes
+    python -m benchmarks.marker_scenes --tiny --scenes 1 --out runs/marker_scenes
+
+Native images of scenes of the test split are searched for boards as a whole, as `tflane markers run` does; store,
+residual, confidence, memory and model follow. Every frame is computed a second time by the functions of each part, and
+must be the same. "boards withheld" is the same model without detections, `--without` another one, such as the host
+tuned without markers. Frames are "seen" (a board of the store was read), "gap" (none now, one before) or "before".
+
+`--tiny` trains a model for eight updates first and shows that everything runs; its scores mean nothing. A model whose
+scores mean something is a run of `markers/camera_clips:pixels` (400 updates from a host of 3,000: docs/markers.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.timing import machine, markdown_table, save
+from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.datasets.marker_cache import search_views
+from tflane_jax.datasets.marker_observations import store_of_log
+from tflane_jax.datasets.native_views import fitted_views
+from tflane_jax.datasets.openlane_example import blank
+from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
+from tflane_jax.errors import UserError
+from tflane_jax.evaluation.lane_graph import LaneGraphMetrics, Sightings
+from tflane_jax.geometry import relative_pose
+from tflane_jax.markers.detection import DetectedMarkers, locate
+from tflane_jax.markers.image_search import ImageMarkers
+from tflane_jax.markers.observe import observe
+from tflane_jax.markers.pixels import PixelConfig
+from tflane_jax.markers.reader import MarkerReader, ReaderConfig
+from tflane_jax.markers.store import MarkerStore
+from tflane_jax.models.marker_fusion import MarkerPrior
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.priors.marker_memory import MarkerGuidance
+from tflane_jax.runs import open_run, train_run
+from tflane_jax.scene import CameraViews, Example, MarkerObservations, Prediction, stack_examples
+from tflane_jax.scene.logs import KeyFrame, Log
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model
+from tflane_jax.training.runtime import configure_jax
+from tflane_jax.world.cameras.sensor import render_cameras
+
+CONFIG = "markers/camera_clips:pixels"
+WITH, WITHHELD, WITHOUT = "markers", "boards withheld", "model without markers"
+SCORES = ("recall", "DET_l", "TOP_ll")
+# Frames in the picture, from scenes of their own.
+_SHOWN = 4
+
+
+class Frame(NamedTuple):
+    """A frame of a rendered drive.
+
+    Attributes:
+        scene: number among the scenes that are driven.
+        moment: time and pose.
+        views: native images.
+        truth: the example of the dataset, without markers.
+        store: of the scene's boards.
+    """
+
+    scene: int
+    moment: KeyFrame
+    views: CameraViews
+    truth: Example
+    store: MarkerStore
+
+
+@dataclass
+class _Gap:
+    """A frame without a board in sight whose lanes come from memory, with the predictions of each row."""
+
+    gate: float
+    scene: int
+    title: str
+    truth: Example
+    found: dict[str, Prediction]
+
+
+def frames(source: ProceduralConfig, pixels: PixelConfig) -> Iterator[Frame]:
+    """Yield the frames of the source's scenes in order, with native images of its own cameras."""
+    markers = source.example.markers
+    assert markers is not None
+    dataset = ProceduralDataset(replace(source, example=replace(source.example, markers=None)))
+    rig, bikes = pixels.native(source.example.cameras), source.example.bike_lanes == "include"
+    for scene, log in enumerate(dataset.drives()):
+        store = store_of_log(log, radius=markers.radius, bike_lanes=bikes)
+        for number, moment in enumerate(log.keyframes):
+            truth = dataset.example(scene * len(log.keyframes) + number)
+            yield Frame(scene, moment, _rendered(log, number, rig), truth, store)
+
+
+def _rendered(log: Log, keyframe: int, rig: Any) -> CameraViews:
+    return render_cameras(log, keyframe, rig).replace(depth=None, depth_valid=None)  # pyright: ignore
+
+
+class Parts:
+    """The priors of a drive, put together from the functions of each part, beside `MarkerDrive`."""
+
+    def __init__(self, model: DriveModel, config: ReaderConfig):
+        self.model, self.config = model, config
+        markers = model.task.model.priors.markers
+        assert markers is not None
+        self._prior = MarkerPrior(markers, model.task.model.spec)
+        self._observe = jax.jit(self._prior.observe)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin another scene."""
+        self._before: tuple[KeyFrame, DetectedMarkers] | None = None
+        self._bank = self._prior.start()
+
+    def frame(self, frame: Frame, searched: Sequence[ImageMarkers]) -> tuple[Example, MarkerGuidance]:
+        """Return what the model reads, and the lanes after gate and memory."""
+        config, before, moment = self.config, self._before, frame.moment
+        last = moment if before is None else before[0]
+        detected = locate(frame.views, searched, config.detector, frame.store.sizes)
+        observed = observe(
+            detected,
+            frame.store,
+            config.range,
+            markers=config.markers,
+            lanes=config.lanes,
+            points=config.points,
+            previous=None if before is None else before[1],
+            now_from_previous=None if before is None else relative_pose(moment.global_from_ego, last.global_from_ego),
+            first_residual=config.first_residual,
+        ).markers
+        example = replace(
+            blank(self.model.source.example, governed="lanes", views=None, traffic=True),
+            markers=observed,
+            previous_from_ego=relative_pose(last.global_from_ego, moment.global_from_ego).astype(np.float32),
+            has_previous=np.asarray(before is not None),
+        )
+        guidance, self._bank = self._observe(example, self._bank)
+        self._before = moment, detected
+        return replace(example, cameras=fitted_views(frame.views, self.model.source)), jax.device_get(guidance)
+
+
+class Stream:
+    """A model with its memory, frame by frame."""
+
+    def __init__(self, model: DriveModel, step: Any):
+        self._model, self._step = model, step
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin another scene."""
+        self._memory = self._model.task.start()
+
+    def answer(self, example: Example) -> Prediction:
+        """Return the prediction for the next frame."""
+        self._memory, found = self._step(self._model.params, self._memory, example)
+        return jax.device_get(found)
+
+
+def _check(step: DriveStep, example: Example, guidance: MarkerGuidance, answer: Prediction) -> None:
+    """Raise AssertionError where the drive is not the composition of its parts, bit by bit."""
+    whole = step.reading.observed.markers, step.guidance, step.prediction
+    jax.tree.map(np.testing.assert_array_equal, whole, (example.markers, guidance, answer))
+
+
+def measure(
+    source: ProceduralConfig, model: DriveModel, other: DriveModel | None, out: Path
+) -> tuple[dict[str, dict[str, dict[str, float]]], dict[str, int]]:
+    """Drive through the scenes, draw a picture, and return scores by row and group, and the frames of each group."""
+    markers = source.example.markers
+    if markers is None or model.task.model.priors.markers is None or source.example.cameras is None:
+        raise UserError(f"this model reads no markers in images: take a run of {CONFIG}")
+    pixels = markers.pixels or PixelConfig()
+    config = as_trained(ReaderConfig(pixels.detector, source.example.range), model)
+    program, parts, drive = jax.jit(model.task.step), Parts(model, config), None
+    streams = {WITH: Stream(model, program), WITHHELD: Stream(model, program)}
+    if other is not None:
+        streams[WITHOUT] = Stream(other, jax.jit(other.task.step))
+    metrics = {name: LaneGraphMetrics(frame_groups=Sightings.groups) for name in streams}
+    sightings, count, shown, scene = Sightings(), dict.fromkeys(Sightings.groups, 0), [], 0
+    nothing = MarkerObservations.empty(config.markers, config.lanes, config.points)
+    total = source.scenes * source.world.keyframes
+    for frame in tqdm(frames(source, pixels), desc="drive", unit="frame", total=total):
+        reader = MarkerReader(frame.store, config)
+        if drive is None:
+            drive = MarkerDrive(reader, model)
+        elif frame.scene != scene:
+            for each in (parts, *streams.values()):
+                each.restart()
+            drive.restart(reader)
+        scene, moment = frame.scene, frame.moment
+        searched = search_views(frame.views, config.detector)
+        step = drive.step(frame.views, moment.timestamp_ns, moment.global_from_ego, searched)
+        example, guidance = parts.frame(frame, searched)
+        seen = {name: example if name == WITH else replace(example, markers=nothing) for name in streams}
+        found = {name: stream.answer(seen[name]) for name, stream in streams.items()}
+        _check(step, example, guidance, found[WITH])
+        group = sightings.next(step.reading.observed.markers.valid.any(), frame.truth.has_previous)
+        count[group] += 1
+        for name, metric in metrics.items():
+            metric.update(found[name], frame.truth, [group])
+        if group == "gap" and guidance.valid.any():
+            gate = float(guidance.gate)
+            title = f"scene {scene} at {moment.timestamp_ns / 1e9:.1f} s, confidence in memory {gate:.2f}"
+            shown.append(_Gap(gate, scene, title, frame.truth, found))
+    _draw(shown, source, out / "marker_scenes.png")
+    return {name: metric.compute() for name, metric in metrics.items()}, count
+
+
+def _draw(shown: list[_Gap], source: ProceduralConfig, path: Path) -> None:
+    """Draw the gap of each scene in which memory is trusted most, whichever model is better there."""
+    from tflane_jax.plots import save_examples
+
+    best = {each.scene: each for each in sorted(shown, key=lambda each: each.gate)}
+    chosen = sorted(best.values(), key=lambda each: -each.gate)[:_SHOWN]
+    if not chosen:
+        print("no picture: in these scenes no board was seen and then lost")
+        return
+    found = {
+        name: jax.tree.map(lambda *leaves: np.stack(leaves), *(each.found[name].centerlines for each in chosen))
+        for name in chosen[0].found
+    }
+    examples = stack_examples([each.truth for each in chosen])
+    titles = [each.title for each in chosen]
+    example = source.example
+    print("written to", save_examples(path, examples, found, titles=titles, ground=example.ground, view=example.range))
+
+
+def tiny_config() -> RunConfig:
+    """Return a training of eight updates, from random weights, of a model with one decoder layer, to compile sooner."""
+    config = load_config(CONFIG)
+    assert isinstance(config.data, WorldData)
+    assert isinstance(config.task, LaneGraphTask)
+    model = config.task.model
+    assert isinstance(model, TopoNetConfig)
+    assert model.elements is not None
+    model = replace(model, decoder=replace(model.decoder, layers=1), elements=replace(model.elements, layers=1))
+    training = replace(
+        config.training, steps=8, eval_every=8, checkpoint_every=8, log_every=4, init_from=None, init_partly=False
+    )
+    return replace(
+        config,
+        task=replace(config.task, model=model, time="scan"),
+        data=replace(config.data, train=2, val=1, test=1),
+        optim=replace(config.optim, warmup_steps=2),
+        training=training,
+        evaluation=replace(config.evaluation, pictures=0),
+    )
+
+
+def opened(folder: Path, scenes: int) -> DriveModel:
+    """Return a trained model with the first scenes of its test split."""
+    trained = open_run(folder)
+    source = trained.config.data.source("test")
+    if not isinstance(source, ProceduralConfig):
+        raise UserError(f"{folder} was not trained on the built-in world: take a run of {CONFIG}")
+    return DriveModel(check_model(trained.config.task), trained.params[0], replace(source, scenes=scenes))
+
+
+def run(out: Path, folder: Path | None, without: Path | None = None, scenes: int = 20) -> dict[str, Any]:
+    """Print and write the table and the picture of a run, of a tiny training without one; return the record."""
+    if folder is None:
+        folder = out / "tiny"
+        if not folder.exists():
+            train_run(tiny_config(), folder, progress=False)
+    model = opened(folder, scenes)
+    scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out)
+    groups = {"all": sum(count.values())} | count
+    header = ["model", *(f"{score}, {group} ({n})" for group, n in groups.items() for score in SCORES)]
+    rows = [
+        [name, *(f"{100 * of_model[group][score]:.1f}" for group in groups for score in SCORES)]
+        for name, of_model in scores.items()
+    ]
+    table = markdown_table(header, rows)
+    print(f"\n{scenes} scenes; every frame equals the composition of its parts\n\n{table}")
+    record = {"machine": machine(), "model": str(folder), "scenes": scenes, "frames": count, "scores": scores}
+    save(out, "marker_scenes", record, table)
+    return record
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    which = parser.add_mutually_exclusive_group(required=True)
+    which.add_argument("--model", type=Path, help="run folder of a camera model with markers")
+    which.add_argument("--tiny", action="store_true", help="train a model for eight updates first")
+    parser.add_argument("--without", type=Path, help="run folder of a model without markers")
+    parser.add_argument("--scenes", type=int, default=20)
+    parser.add_argument("--out", type=Path, required=True, help="folder for table, picture and JSON")
+    options = parser.parse_args()
+    configure_jax()
+    run(options.out, options.model, options.without, options.scenes)
+
+
+if __name__ == "__main__":
+    main()

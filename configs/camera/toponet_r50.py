@@ -31,7 +31,9 @@ def get_config() -> RunConfig:
     return RunConfig(
         task=LaneGraphTask(replace(paper_config(), encoder=ENCODER)),
         data=OpenLaneV2Data(Path("data/OpenLane-V2")),
-        optim=OptimConfig(epoch_steps=EPOCH, ema_decay=0.0, lr_factors=(("encoder/images/backbone", 0.1),)),
+        optim=OptimConfig(
+            decayed="all", epoch_steps=EPOCH, ema_decay=0.0, lr_factors=(("encoder/images/backbone", 0.1),)
+        ),
         training=TrainingConfig(steps=24 * EPOCH, batch_size=8, eval_every=EPOCH, checkpoint_every=EPOCH),
     )
 

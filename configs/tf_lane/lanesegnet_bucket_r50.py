@@ -5,15 +5,16 @@
     tflane train --config tf_lane/lanesegnet_bucket_r50 --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-Six encoder layers, images times 0.33, no photometric distortion. Crossings are areas, no segments. `:published_fault`
-predicts areas as the published code does, without the reference that its decoder refines. `:remat` recomputes
-activations in the backward pass, `:bfloat16` does so in half precision.
+Six encoder layers, images times 0.33, no photometric distortion, only the GridMask. Crossings are areas, no
+segments. `:published_fault` predicts areas as the published code does, without the reference that its decoder refines.
+`:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig, load_ablations, load_config, with_remat
+from tflane_jax.datasets.photometric import LANESEGNET_BUCKET_PHOTOMETRIC
 from tflane_jax.datasets.view_images import LANESEGNET_BUCKET
 from tflane_jax.models.area_decoder import PAPER_AREA_DECODER
 from tflane_jax.models.lanesegnet import LaneSegNetConfig, paper_bucket_config
@@ -46,5 +47,5 @@ def _bucket(model: LaneSegNetConfig) -> RunConfig:
     assert isinstance(config.data, OpenLaneV2Data)
     task = replace(config.task, model=replace(model, encoder=six_layers.task.model.encoder))
     example = replace(config.data.example, crossings="ring")
-    data = replace(config.data, image=LANESEGNET_BUCKET, example=example, augmentation=None)
+    data = replace(config.data, image=LANESEGNET_BUCKET, example=example, augmentation=LANESEGNET_BUCKET_PHOTOMETRIC)
     return replace(config, task=task, data=data, training=replace(config.training, best_metric="all/OLUS"))

@@ -50,7 +50,13 @@ def get_config() -> RunConfig:
     return RunConfig(
         task=LaneGraphTask(paper_config(), MapTrLossConfig(), empty_frames="skip"),
         data=WorldData(example=example),
-        optim=OptimConfig(lr=6e-4, epoch_steps=EPOCH, ema_decay=0.0, lr_factors=(("encoder/images/backbone", 0.1),)),
+        optim=OptimConfig(
+            lr=6e-4,
+            decayed="all",
+            epoch_steps=EPOCH,
+            ema_decay=0.0,
+            lr_factors=(("encoder/images/backbone", 0.1),),
+        ),
         training=TrainingConfig(
             steps=24 * EPOCH, batch_size=32, eval_every=EPOCH, checkpoint_every=EPOCH, best_metric="lines/mAP"
         ),

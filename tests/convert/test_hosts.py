@@ -11,6 +11,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid
 from tflane_jax.layers.fpn import FeaturePyramidConfig
 from tflane_jax.layers.resnet import ResNetConfig
+from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
@@ -71,6 +72,33 @@ def lanesegnet_checkpoint():
     return state | fixture("laneseg_relationship_head", "lclc_head.")
 
 
+def bucket_checkpoint():
+    """Return the tensors of LaneSegNet's map-element-bucket variant; its area head is MapTR's with other sizes."""
+    state = {name: value for name, value in lanesegnet_checkpoint().items() if not name.startswith("lclc_head.")}
+    for branch in ("weight", "bias"):  # one class, no crossing
+        for i in range(2):
+            name = f"pts_bbox_head.cls_branches.{i}.6.{branch}"
+            state[name] = state[name][:1]
+    for head in ("lsls_head", "lste_head"):
+        state |= fixture("laneseg_relationship_head", f"{head}.")
+    state |= fixture("toponet_te_head", "bbox_head.")
+    for name, value in fixture("maptr_head_gkt", "area_head.").items():
+        parts = name.split(".")
+        if parts[1] not in ("transformer", "cls_branches", "reg_branches", "instance_embedding", "pts_embedding"):
+            continue
+        if parts[1] == "transformer" and parts[2] not in ("decoder", "reference_points"):
+            continue  # the BEV encoder of MapTR's head
+        if parts[1] == "cls_branches":  # one hidden layer less, and two classes
+            if parts[3] in ("3", "4"):
+                continue
+            if parts[3] == "6":
+                name, value = name.replace(".6.", ".3."), value[:2]
+        if "reference_points" in name or (".4." in name and parts[1] == "reg_branches"):
+            value = np.concatenate([value, value[:1]])  # z beside x and y
+        state[name] = value
+    return state | {"area_head.code_weights": np.ones(3, np.float32)}
+
+
 LANESEGNET = LaneSegNetConfig(
     encoder=ENCODER,
     decoder=SegmentDecoderConfig(dim=16, heads=8, layers=2, queries=7, hidden=24, relation=128, sampling_points=8),
@@ -119,10 +147,17 @@ def maptr(attention):
     return MapTrConfig(encoder=CameraEncoderConfig(images, bev), decoder=decoder)
 
 
+BUCKET = dataclasses.replace(
+    LANESEGNET,
+    decoder=dataclasses.replace(LANESEGNET.decoder, classes=1),
+    elements=ELEMENTS,
+    areas=AreaDecoderConfig(dim=16, heads=4, layers=2, queries=5, points=4, class_layers=1, hidden=24),
+)
 CASES = {
     "toponet": (TOPONET, lambda: checkpoint("toponet_head")),
     "baseline": (BASELINE, lambda: checkpoint("olv2_lc_head", ("lclc_head", "lcte_head"))),
     "lanesegnet": (LANESEGNET, lanesegnet_checkpoint),
+    "lanesegnet, bucket": (BUCKET, bucket_checkpoint),
     "maptr": (maptr("kernel"), lambda: maptr_checkpoint("maptr_head_gkt")),
     "maptrv2": (maptrv2(), maptrv2_checkpoint),
     "maptr, bevformer": (maptr("deformable"), lambda: maptr_checkpoint("maptr_head_bevformer")),

@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ import pytest
 from tests.datasets.openlane_scenes import FRAMES, DriveConfig, DriveDataset
 from tflane_jax.cli import main
 from tflane_jax.datasets.openlane_check import check_openlane_v2
-from tflane_jax.datasets.openlane_check_cameras import image_size
+from tflane_jax.datasets.openlane_check_cameras import CameraChecks, image_size
 from tflane_jax.datasets.openlane_export import export_openlane_v2
+from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.errors import UserError
 
 cv2 = pytest.importorskip("cv2")
@@ -149,9 +151,24 @@ def scale(content):
     K[:2] = [[2.0 * value for value in row] for row in K[:2]]
 
 
+def millimetres(content):
+    back = content["sensor"]["CAM_BACK"]["extrinsic"]
+    back["translation"] = [1000.0 * value for value in back["translation"]]
+
+
+def scaled(factor):
+    def function(content):
+        K = content["sensor"]["CAM_FRONT_LEFT"]["intrinsic"]["K"]
+        K[:2] = [[factor * value for value in row] for row in K[:2]]
+
+    return function
+
+
 @pytest.mark.parametrize(
     ("function", "said"),
     [
+        (millimetres, r"CAM_BACK is 2193 m from the vehicle's origin: is its translation in metres"),
+        (scaled(0.75), r"CAM_FRONT_LEFT has a focal length of 29 pixels in images of 48 x 32, expected about 38"),
         (
             swap,
             r"CAM_FRONT_RIGHT looks to 5\d degrees .*, expected about -5\d, where CAM_FRONT_LEFT should look: .*swap",
@@ -167,6 +184,23 @@ def test_a_calibration_that_cannot_be_is_named(folder, function, said):
     faults = check_openlane_v2(folder, progress=False).faults
     assert any(re.search(said, fault) for fault in faults), faults
     assert len(faults) == (2 if function is swap else 1)
+
+
+@pytest.mark.parametrize("name", ["CAM_BACK", "ring_front_center", "my_camera"])
+@pytest.mark.parametrize("factor", [0.75, 0.85, 0.95, 1.0, 1.05, 1.15, 1.25])
+def test_a_focal_length_is_compared_with_that_of_the_dataset(tmp_path, name, factor):
+    """Images of a tenth of the native size; all intrinsics are scaled, as in images of another size."""
+    focal, width, height = (80.9, 160, 90) if name != "ring_front_center" else (177.6, 155, 205)
+    assert cv2.imwrite(str(tmp_path / "image.png"), np.zeros((height, width, 3), np.uint8))
+    pose = np.eye(4)
+    pose[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]) * (
+        [[-1.0], [-1.0], [1.0]] if name == "CAM_BACK" else 1.0
+    )
+    intrinsics = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    intrinsics[:2] *= factor
+    camera = FrameCamera(name, tmp_path / "image.png", intrinsics, pose)
+    _, faults = CameraChecks().check(SimpleNamespace(path=tmp_path, cameras=(camera,)))
+    assert len(faults) == (abs(factor - 1.0) > 0.1 and name != "my_camera"), faults
 
 
 def test_a_camera_that_frames_lack_is_one_fault(folder):

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from tests.datasets.nuscenes_small import PITCH, START, write_nuscenes
-from tests.models.cases import CAMERA_TOPONET, WITH_TRAFFIC
+from tests.models.cases import CAMERA_TOPONET, SEGMENTS, WITH_TRAFFIC
 from tests.shared import shared_path
 from tflane_jax.cli import main
 from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, load_log
-from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
+from tflane_jax.datasets.nuscenes_export import export_scenes
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_tracks import SourceTracks
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
@@ -24,6 +25,8 @@ from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import yaw_pose
+from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.losses.toponet import TopoNetLossConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.priors.traffic_flow import TrafficFlowPriorConfig
 from tflane_jax.runs import open_run, train_run
@@ -31,7 +34,7 @@ from tflane_jax.scene import shapes_of
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.loop import TrainingConfig
 from tflane_jax.training.schedule import OptimConfig
-from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING, CameraRigConfig
 from tflane_jax.world.simulate import WorldConfig
 
 feather = pytest.importorskip("pyarrow.feather")
@@ -42,13 +45,26 @@ EXAMPLE = ExampleConfig(sensor=None, cameras=RIG, history=6, history_hz=5.0)
 WORLD = ProceduralConfig("val", scenes=2, world=WorldConfig(keyframes=2), example=EXAMPLE)
 
 
+# Six cameras, as subset B has them, and boxes at nuScenes' 2 Hz.
+EXAMPLE_B = replace(EXAMPLE, cameras=CameraRigConfig(NUSCENES_RING, scale=0.04), history=4, history_hz=2.0)
+WORLD_B = replace(WORLD, scenes=1, example=EXAMPLE_B)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Return the folders of frames and tracks, as one command writes them."""
-    root = tmp_path_factory.mktemp("export")
+    return export(tmp_path_factory.mktemp("export"), "WORLD")
+
+
+@pytest.fixture(scope="module")
+def written_b(tmp_path_factory):
+    return export(tmp_path_factory.mktemp("export"), "WORLD_B")
+
+
+def export(root, name):
+    """Return the folders of frames and tracks of a world, as one command writes them."""
     config = root / "world.py"
     config.write_text(
-        "from tests.datasets.test_openlane_tracks import WORLD\n"
+        f"from tests.datasets.test_openlane_tracks import {name} as WORLD\n"
         "from tflane_jax.config import RunConfig, WorldData\n"
         "def get_config():\n"
         "    return RunConfig(data=WorldData(val=WORLD.scenes, world=WORLD.world, example=WORLD.example))\n"
@@ -73,9 +89,14 @@ def by_place(flow):
     return [np.asarray(leaf)[order] for leaf in (flow.valid, flow.position, flow.yaw, flow.size, flow.category)]
 
 
-@pytest.mark.parametrize("index", [0, 3])
-def test_frames_get_the_tracks_that_they_had(written, index):
-    made, read = ProceduralDataset(WORLD).example(index), opened(*written).example(index)
+@pytest.mark.parametrize(("subset", "index"), [("A", 0), ("A", 3), ("B", 1)])
+def test_frames_get_the_tracks_that_they_had(subset, index, request):
+    if subset == "A":
+        made, read = ProceduralDataset(WORLD).example(index), opened(*request.getfixturevalue("written")).example(index)
+    else:
+        folders = request.getfixturevalue("written_b")
+        made = ProceduralDataset(WORLD_B).example(index)
+        read = opened(*folders, subset="B", example=EXAMPLE_B).example(index)
     read.validate()
     expected, got = by_place(made.traffic_flow), by_place(read.traffic_flow)
     assert len(expected[0]) > 5
@@ -115,8 +136,13 @@ def test_missing_logs_are_named_and_can_be_dropped_or_left_empty(written, tmp_pa
     shutil.rmtree(gone)
     with pytest.raises(UserError, match=rf"lacks 1 of the logs .*{gone.name}.*2 of 4 frames"):
         opened(frames, fewer)
-    assert len(opened(frames, fewer, without_tracks="drop")) == 2
-    kept = opened(frames, fewer, without_tracks="empty")
+    with pytest.warns(MissingTracksWarning, match=rf"2 of 4 frames are left out .* 1 of their logs \({gone.name}\)"):
+        assert len(opened(frames, fewer, without_tracks="drop")) == 2
+    with pytest.warns(MissingTracksWarning, match="2 of 4 frames have an empty traffic flow"):
+        kept = opened(frames, fewer, without_tracks="empty")
+    found = check_openlane_v2(frames, fewer, progress=False)
+    assert (found.rows[0]["with log"], found.rows[0]["without log"], found.faults) == (2, 2, [])
+    assert f"2 of 4 val frames have no log in {fewer}, so no traffic flow: it lacks {gone.name}" in found.skipped
     assert [bool(kept.example(i).traffic_flow.valid.any()) for i in range(4)] == [False, False, True, True]
     shutil.rmtree(sorted((fewer / "sensor" / "val").iterdir())[0])
     with pytest.raises(UserError, match="holds no Argoverse 2 log"):
@@ -150,16 +176,14 @@ def test_the_check_counts_frames_with_traffic(written, capsys):
     assert main(["data", "check", "--format", "tusimple", str(frames), "--tracks", str(tracks)]) == 2
 
 
-def test_tracks_are_written_once_and_only_beside_seven_cameras(written, tmp_path):
+def test_tracks_are_written_once_and_are_those_of_one_subset(written):
     _, tracks = written
     with pytest.raises(UserError, match="is not empty"):
         export_tracks([], tracks)
     with pytest.raises(UserError, match="holds no nuScenes tables"):
         SourceTracks(tracks, "B", {})
-    out = tmp_path / "six"
-    arguments = ["data", "export", "--config", "camera/toponet", "--splits", "val", "--out", str(out)]
-    assert main([*arguments, "--tracks", str(tmp_path / "t"), "--data.val", "1"]) == 2
-    assert not out.exists()
+    with pytest.raises(UserError, match="is not empty"):
+        export_scenes([], tracks)
 
 
 @pytest.mark.parametrize("scene", ["scene-0061", "scene-a"])
@@ -168,7 +192,8 @@ def test_subset_b_takes_the_tracks_of_nuscenes(tmp_path, scene):
     tracks = SourceTracks(write_nuscenes(tmp_path), "B", {("val", "11000"): scene, ("val", "11001"): "scene-0001"})
     key = FrameKey("val", "11000", str(START + 1_500_000 + 10_000))
     other = FrameKey("val", "11001", key.timestamp)
-    assert tracks.known([key, other], "drop") == [key]
+    with pytest.warns(MissingTracksWarning, match="scene-0001"):
+        assert tracks.known([key, other], "drop") == [key]
     with pytest.raises(UserError, match=r"lacks 1 of the logs of these frames \(scene-0001\)"):
         tracks.known([key, other], "refuse")
     pitched = np.array([[np.cos(PITCH), 0, np.sin(PITCH)], [0, 1, 0], [-np.sin(PITCH), 0, np.cos(PITCH)]])
@@ -185,26 +210,51 @@ def test_subset_b_takes_the_tracks_of_nuscenes(tmp_path, scene):
 
 
 @pytest.mark.slow
-def test_a_camera_model_trains_on_frames_with_tracks(written, tmp_path):
+@pytest.mark.parametrize(("host", "subset"), [("toponet", "A"), ("toponet", "B"), ("lanesegnet", "A")])
+def test_a_camera_model_trains_on_frames_with_tracks(tmp_path, host, subset, request):
     """The whole chain: both layouts, workers, prior, camera model, update, evaluation with and without traffic."""
-    frames, tracks = written
+    frames, tracks = request.getfixturevalue("written" if subset == "A" else "written_b")
+    flavour, weights, score, small, example = (
+        "centerline",
+        TopoNetLossConfig(),
+        "DET_l",
+        CAMERA_TOPONET,
+        EXAMPLE if subset == "A" else EXAMPLE_B,
+    )
+    if host == "lanesegnet":
+        flavour, weights, score = "lane_segment", LaneSegNetLossConfig(), "mAP"
+        decoder = replace(SEGMENTS.decoder, points=EXAMPLE.segment_points)
+        small = replace(SEGMENTS, encoder=CAMERA_TOPONET.encoder, decoder=decoder)
+        example = replace(EXAMPLE, crossings="sides")
     loading = StreamingConfig(threads=1, ahead=2)
     image = ImageConfig(divisor=16)
     data = OpenLaneV2Data(
-        frames, "val", example=EXAMPLE, image=image, loading=loading, tracks=tracks, augmentation=None
+        frames,
+        "val",
+        subset=subset,
+        flavour=flavour,
+        example=example,
+        image=image,
+        loading=loading,
+        tracks=tracks,
+        augmentation=None,
     )
-    traffic = replace(WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=EXAMPLE.history))
-    encoder = replace(CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=7))
-    model = replace(CAMERA_TOPONET, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
-    training = TrainingConfig(steps=2, batch_size=2, eval_every=2)
-    run = RunConfig(LaneGraphTask(model), data, OptimConfig(warmup_steps=0), training)
+    traffic = replace(
+        WITH_TRAFFIC.priors.traffic_flow, prior=TrafficFlowPriorConfig(frames=example.history, min_valid_frames=2)
+    )
+    encoder = replace(
+        CAMERA_TOPONET.encoder, bev=replace(CAMERA_TOPONET.encoder.bev, cameras=len(example.cameras.cameras))
+    )
+    model = replace(small, encoder=encoder, priors=PriorsConfig(traffic_flow=traffic))
+    training = TrainingConfig(steps=2, batch_size=2, eval_every=2, best_metric=f"all/{score}")
+    run = RunConfig(LaneGraphTask(model, weights), data, OptimConfig(warmup_steps=0), training)
     result = train_run(run, tmp_path / "run", progress=False)
     assert result.step == 2
     flows = {name: replace(run.evaluation, traffic=name) for name in ("own", "none")}
     trained = open_run(tmp_path / "run", "last")
     examples = run.task.load(data.source("val"), progress=False)
     answers = {name: run.task.evaluate(trained.params[0], examples, config) for name, config in flows.items()}
-    assert all(np.isfinite(answer.groups["all"]["DET_l"]) for answer in answers.values())
+    assert all(np.isfinite(answer.groups["all"][score]) for answer in answers.values())
 
 
 def test_a_real_log_and_the_frames_of_its_segment():

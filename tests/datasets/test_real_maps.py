@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from tests.datasets.small_argoverse2 import write_log
 from tests.datasets.test_nuscenes_scenes import content
@@ -13,13 +14,19 @@ from tests.datasets.test_road_maps import crossroads_features, write
 from tests.shared import shared_path
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.cache import fingerprint
+from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.leaves import example_leaves
+from tflane_jax.datasets.marker_observations import markers_of
 from tflane_jax.datasets.procedural import ProceduralConfig, ProceduralDataset
 from tflane_jax.datasets.real_maps import RealMapConfig, RealMapData, RealMapDataset, check_real_maps, sees
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE, RecordedConfig, RecordedData, RecordedDataset
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import invert_pose, project, transform_points
+from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.world.cameras.ring import NUSCENES_RING, CameraRigConfig
 from tflane_jax.world.presets import REAL_MAPS
+from tflane_jax.world.roads.map_roadside import lane_points
 from tflane_jax.world.roads.sd_map import SdMapConfig
 from tflane_jax.world.simulate import WorldConfig
 
@@ -180,3 +187,47 @@ def test_a_map_of_one_short_lane_gives_a_scene_or_is_named(tmp_path):
     example = RealMapDataset(config(tmp_path)).example(0)
     assert example.lanes.valid.sum() == 1
     assert np.isfinite(example.lanes.points[example.lanes.valid]).all()
+
+
+CAMERA = CameraRigConfig(NUSCENES_RING[:1], scale=0.2, jitter=0.0, severity=0.0, markers=True)
+
+
+@pytest.mark.parametrize("name", ["", *(pytest.param(name, marks=pytest.mark.slow) for name in REAL)])
+def test_markers_and_cameras_work_on_recorded_maps(name, maps):
+    """Boards stand beside the map's lanes, are detected there with lanes of the map, and are drawn where they stand."""
+    pytest.importorskip("cv2")
+    example = ExampleConfig(sensor=None, cameras=CAMERA, markers=MarkerConfig())
+    source = RealMapConfig(shared_path("data"), (name,), scenes=8) if name else config(maps)
+    dataset, blank = RealMapDataset(replace(source, example=example)), replace(CAMERA, markers=False)
+    detected = drawn = 0
+    for scene in range(dataset.config.scenes):
+        log = dataset.simulated(scene)
+        placed, road = markers_of(log), KDTree(lane_points(log.map.segments.values()))
+        assert len(placed.marker_id) > 0
+        assert road.query(placed.pose[:, :2, 3])[0].min() > 1.0
+        for number, moment in enumerate(log.keyframes):
+            one = make_example(log, number, example)
+            found = one.markers
+            for row in np.flatnonzero(found.valid):
+                ego_from_marker = (
+                    invert_pose(moment.global_from_ego) @ placed.pose[placed.marker_id == found.marker_id[row]][0]
+                )
+                apart = np.linalg.norm(found.pose[row, :3, 3] - ego_from_marker[:3, 3])
+                lanes = found.lanes[row][found.lane_valid[row]].reshape(-1, 3).astype(np.float64)
+                beside = road.query(transform_points(moment.global_from_ego, lanes)[:, :2])[0]
+                assert np.median(beside) < apart + 1.0, "stored lanes move with the marker"
+                detected += 1
+                pixel, depth, _ = project(
+                    ego_from_marker[None, :3, 3], one.cameras.intrinsics[0], one.cameras.camera_from_ego[0]
+                )
+                width, height = one.cameras.size[0]
+                if not (3.0 < depth[0] < 25.0 and 20 < pixel[0, 0] < width - 20 and 20 < pixel[0, 1] < height - 20):
+                    continue
+                without = make_example(log, number, replace(example, cameras=blank))
+                changed = (one.cameras.image[0] != without.cameras.image[0]).any(-1)
+                side = one.cameras.intrinsics[0, 0, 0] / depth[0]  # of a metre, pixels
+                places = np.argwhere(changed)[:, ::-1]
+                near = np.linalg.norm(places - pixel[0], axis=-1) < side
+                drawn += bool(near.any())
+    assert detected >= 2
+    assert drawn >= 1

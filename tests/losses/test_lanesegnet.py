@@ -1,5 +1,6 @@
 """LaneSegNet's costs and losses against the reference's numbers, and at their edges."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -9,7 +10,7 @@ import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case, numbered
 from tests.golden_compare import compare
-from tests.models.cases import SEGMENTS, make_segment_example
+from tests.models.cases import SEGMENTS, make_bucket_example, make_segment_example
 from tflane_jax.convert.toponet import relationship_params
 from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.layers.graph import RelationshipHead
@@ -24,7 +25,7 @@ from tflane_jax.losses.lanesegnet import (
 from tflane_jax.matching import Assignment, match
 from tflane_jax.models.auxiliary import AuxiliaryOutputs
 from tflane_jax.models.segment_truth import CROSSING, LANE
-from tflane_jax.scene import SegmentPrediction, stack_examples
+from tflane_jax.scene import ElementPrediction, Prediction, SegmentPrediction, stack_examples
 
 
 @pytest.mark.golden
@@ -250,3 +251,42 @@ def test_padding_of_the_examples_may_hold_nan():
     clean, other = run(stack_examples([example])), run(stack_examples([dirty]))
     jax.tree.map(np.testing.assert_array_equal, clean, other)
     assert np.isfinite(clean[0])
+
+
+def test_elements_count_as_matched_pairs_and_not_at_all_in_a_batch_without_any():
+    """The map-element-bucket variant: its topology has the loss of the successors."""
+    host = replace(SEGMENTS, decoder=replace(SEGMENTS.decoder, classes=1))
+    example, none = make_bucket_example(0), make_bucket_example(0, elements=0)
+    points, rng = example.segments.points.shape[1], np.random.default_rng(0)
+    draw = lambda *shape: jnp.asarray(rng.normal(size=(1, 1, *shape)), jnp.float32)  # noqa: E731
+    lines, types = [draw(6, points, 3) for _ in range(3)], [draw(6, 3) for _ in range(2)]
+    segments = SegmentPrediction(*lines, draw(6, 1), *types, draw(6, *CELLS), draw(6, 6))
+    outputs = Prediction(segments=segments, elements=ElementPrediction(draw(5, 2, 2), draw(5, 13), draw(6, 5)))
+    config = LaneSegNetLossConfig(matcher="scipy")
+
+    @jax.jit
+    def run(batch):
+        def loss(logits):
+            found = outputs.replace(elements=outputs.elements.replace(lane_logits=logits))
+            return config.loss(found, AuxiliaryOutputs(), batch, host)
+
+        return jax.value_and_grad(loss, has_aux=True)(outputs.elements.lane_logits)
+
+    (_, report), gradient = run(stack_examples([example]))
+    pairs = np.argwhere(gradient[0, 0])
+    assert len(pairs) == 4 * 2  # of the queries of four segments and of two elements
+    assert (len(set(pairs[:, 0])), len(set(pairs[:, 1]))) == (4, 2)
+    assert float(report["element_class"]) > 0.0
+    edges = int((example.traffic_elements.lane & example.segments.valid[:, None]).sum())
+    assert 0 < edges < 8
+    # By hand, over the pairs without an edge; which pairs have one follows from the gradient's sign.
+    x, rising = np.asarray(outputs.elements.lane_logits)[0, 0][tuple(pairs.T)], gradient[0, 0][tuple(pairs.T)] > 0
+    p = 1 / (1 + np.exp(-x))
+    focal = np.where(rising, 0.75 * p**2 * -np.log(1 - p), 0.25 * (1 - p) ** 2 * -np.log(p))
+    assert (~rising).sum() == edges
+    np.testing.assert_allclose(report["element_lane"], 5.0 * focal.sum() / (8 - edges), rtol=1e-5)
+
+    (_, report), gradient = run(stack_examples([none]))
+    assert not np.any(gradient)
+    assert all(float(report[f"element_{name}"]) == 0.0 for name in ("class", "box", "iou", "lane"))
+    assert float(report["class"]) > 0.0

@@ -43,6 +43,24 @@ CONFIG = BevFormerConfig(GRID, 8, 2, 1, 16, 0.0, 2, 4, anchors=2, levels=2, came
 MODEL = BevFormer(CONFIG)
 
 
+@pytest.mark.parametrize("initial", ["mixed", "xavier", "normal"])
+def test_queries_and_positions_start_as_published(initial):
+    grid = BevGrid(GRID.range, 20, 40)
+    model = BevFormer(replace(CONFIG, grid=grid, initial=initial))
+    fresh = jax.jit(lambda: model.init(jax.random.key(0), levels(), ring(), None, jnp.eye(4)))()["params"]
+    tables = fresh["queries"], fresh["position"]["row"], fresh["position"]["column"]
+    for table, mean in zip(tables, (0.0, 0.5, 0.5), strict=True):
+        uniform = initial == "xavier" or (initial == "mixed" and mean)
+        if not uniform:
+            np.testing.assert_allclose((table.mean(), table.std()), (0.0, 1.0), atol=0.25)
+            continue
+        # Within +-bound about the mean; Xavier: the root of 6 / (rows + columns).
+        bound = np.sqrt(6.0 / sum(table.shape)) if initial == "xavier" else 0.5
+        apart = np.abs(table - (0.0 if initial == "xavier" else mean)).max()
+        assert 0.8 * bound < apart <= bound
+    np.testing.assert_allclose(fresh["cameras"].std(), 1.0, atol=0.35)
+
+
 def ring(cameras=3, shape=(48, 64)):
     """Return cameras that look evenly around, 1.5 m above the ground."""
     height, width = shape

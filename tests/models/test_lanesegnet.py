@@ -12,11 +12,13 @@ from tests.parameters import random_params, zero_params
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.losses.lanesegnet import LaneSegNetLossConfig
+from tflane_jax.models import host
 from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.lane_queries import LaneProposalConfig
 from tflane_jax.models.lane_segments import SegmentHeads, regions
 from tflane_jax.models.lanesegnet import LaneSegNet
+from tflane_jax.models.parameters import with_xavier_layers
 from tflane_jax.scene import stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
@@ -60,6 +62,31 @@ def test_the_published_evaluation_moves_only_the_last_layer_and_only_outside_tra
 def test_boundaries_mirror_each_other_at_the_centerline(params):
     found = decode(params)
     np.testing.assert_allclose((found.left + found.right) / 2, found.points, atol=1e-4)
+
+
+def test_published_layers_start_xavier_uniform_and_the_rest_as_it_is():
+    """`init` calls the function under test where the configuration says so; it sees the parameters as zeros here."""
+    key = jax.random.key(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "with_xavier_layers", lambda variables, key: {**variables, "drawn": key})
+        for initial, drawn in (("lecun", False), ("xavier", True)):
+            module = replace(SEGMENTS, initial=initial).build()
+            shapes = jax.eval_shape(lambda m=module: m.init(key, BEV, method=LaneSegNet.decode))
+            assert ("drawn" in shapes) == drawn
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, np.float32), shapes["params"])
+    params = with_xavier_layers({"params": zeros}, key)["params"]
+    flat = {jax.tree_util.keystr(k, simple=True, separator="/"): v for k, v in jax.tree.leaves_with_path(params)}
+    attention = [f"self_attention/{name}" for name in ("query", "key", "value", "output")]
+    names = [*attention, "bev_attention/value_proj", "bev_attention/output_proj"]
+    names += ["feed_forward/expand", "feed_forward/contract"]
+    redrawn = {f"layer_{i}/{name}/kernel" for i in range(2) for name in names}
+    assert {name for name, leaf in flat.items() if np.any(leaf)} == redrawn
+    for name in redrawn:
+        inputs, outputs = flat[name].shape
+        packed = name.endswith(("query/kernel", "key/kernel", "value/kernel"))  # one matrix in PyTorch
+        bound = np.sqrt(6.0 / (inputs + outputs * (3 if packed else 1)))
+        assert 0.9 * bound < np.abs(flat[name]).max() <= bound, name
+    assert not np.array_equal(flat["layer_0/feed_forward/expand/kernel"], flat["layer_1/feed_forward/expand/kernel"])
 
 
 def test_heads_start_as_copies_of_one_another():

@@ -80,6 +80,19 @@ def test_decay_leaves_biases_and_norms_alone():
     }
 
 
+def test_decay_of_all_spares_only_what_does_not_learn():
+    params = {"dense": {"kernel": jnp.ones((2, 3)), "bias": jnp.ones(3)}, "norm": {"scale": jnp.ones(3)}}
+    grads = params | {"norm": {"scale": jnp.zeros(3)}}
+    config = OptimConfig(lr=1.0, warmup_steps=0, weight_decay=0.5, decayed="all", clip_norm=np.inf)
+    plain, decayed = (
+        updates_of(make_optimizer(each, 10), grads, params)[0] for each in (replace(config, weight_decay=0.0), config)
+    )
+    assert jax.tree.map(lambda a, b: float(np.round(a - b, 4).mean()), plain, decayed) == {
+        "dense": {"kernel": 0.5, "bias": 0.5},
+        "norm": {"scale": 0.0},
+    }
+
+
 def test_first_update_is_adamw_with_clipping():
     config = OptimConfig(lr=0.1, warmup_steps=0, weight_decay=0.5, clip_norm=1.0)
     params = {"kernel": jnp.full((1, 2), 3.0), "bias": jnp.full(2, 3.0)}

@@ -1,4 +1,7 @@
-"""`tflane data export`: writes a dataset with cameras in OpenLane-V2's layout, and its tracks as Argoverse 2 logs."""
+"""`tflane data export`: writes a dataset with cameras in OpenLane-V2's layout, and its tracks as the logs behind it.
+
+Seven cameras are subset A, whose logs are Argoverse 2's; six are subset B, whose logs are nuScenes' scenes.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,10 @@ from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.argoverse2_export import export_tracks
 from tflane_jax.datasets.base import DrivenDataset, Split
+from tflane_jax.datasets.nuscenes_export import export_scenes
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_export import export_openlane_v2, time_offset
+from tflane_jax.datasets.openlane_frames import subset_of
 from tflane_jax.datasets.openlane_sd_map import sd_records
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
@@ -31,7 +36,10 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     datasets = {split: sources.open_dataset(source) for split, source in chosen.items()}
     out = export_openlane_v2(datasets, options.out, images=options.images, sd_maps=_sd_maps(chosen))
     if tracks is not None:
-        export_tracks(_drives(driven), tracks, partial(time_offset, "A"))
+        if subset_of(out) == "A":
+            export_tracks(_drives(driven), tracks, partial(time_offset, "A"))
+        else:
+            export_scenes((log for _, log in _drives(driven)), tracks, partial(time_offset, "B"))
     found = check_openlane_v2(out, tracks, cameras="some", progress=False)
     print(format_table(found.rows, title=f"{out}: OpenLane-V2, subset {found.subset}"))
     if found.faults:
@@ -57,10 +65,10 @@ def _driven(chosen: Mapping[Split, Any]) -> dict[Split, DrivenDataset]:
         if not isinstance(dataset, DrivenDataset):
             raise UserError(f"--tracks: {sources.source_name(source)} has no logs whose tracks could be written")
         cameras = dataset.example(0).cameras  # pyright: ignore[reportAttributeAccessIssue]
-        if cameras is not None and len(cameras.valid) != 7:
+        if cameras is not None and len(cameras.valid) not in (6, 7):
             raise UserError(
-                "--tracks writes Argoverse 2 logs, which belong to subset A with seven cameras; this dataset has "
-                f"{len(cameras.valid)}: choose a ring of seven, data.example.cameras.ring"
+                "--tracks writes Argoverse 2 logs for subset A with seven cameras, or nuScenes' tables for subset B "
+                f"with six; this dataset has {len(cameras.valid)}: choose another ring, data.example.cameras.cameras"
             )
         driven[split] = dataset
     return driven

@@ -28,9 +28,12 @@ predictions.json, lanes with a score of at least `threshold`, best first:
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
@@ -44,7 +47,7 @@ from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
-from tflane_jax.scene import Example, LinePrediction, SegmentPrediction
+from tflane_jax.scene import Example, LinePrediction, SegmentPrediction, stack_examples
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
 
@@ -104,13 +107,13 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         threshold=options.threshold,
     )
     written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
-    if examples.cameras is not None:
+    shown, examples = _with_images(examples, source, indices)
+    if shown:
         save_camera_views(
             options.out / "cameras.png",
             examples,
-            lanes,
-            elements,
-            titles=names,
+            *jax.tree.map(lambda leaf: np.asarray(leaf)[shown], (lanes, elements)),
+            titles=[names[i] for i in shown],
             ground=ground,
             view=view,
             threshold=options.threshold,
@@ -118,6 +121,21 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         written.append("cameras.png")
     print(f"{len(indices)} frames written to {options.out}: {', '.join(written)}")
     return 0
+
+
+def _with_images(examples: Example, source: Any, indices: Sequence[int]) -> tuple[list[int], Example]:
+    """Return the rows of the examples that have camera images, and these examples with them.
+
+    Where the model reads none, images that are there nevertheless are read for the picture.
+    """
+    if examples.cameras is not None:
+        return list(range(len(indices))), examples
+    views = sources.drawing_views(source, indices)
+    shown = [i for i, view in enumerate(views) if view is not None]
+    if not shown:
+        return [], examples
+    rows: Example = jax.tree.map(lambda leaf: np.asarray(leaf)[shown], examples)
+    return shown, replace(rows, cameras=stack_examples([views[i] for i in shown]))
 
 
 def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:

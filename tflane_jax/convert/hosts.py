@@ -1,7 +1,8 @@
 """Whole detectors: the reference's checkpoints as parameters of our hosts.
 
 All of them call the image encoder `img_backbone` and `img_neck`, the BEV encoder `bev_constructor`, the head of traffic
-elements `bbox_head`, that of lanes `pts_bbox_head`, and topology heads beside it `lclc_head` and `lcte_head`. MapTR's
+elements `bbox_head`, that of lanes `pts_bbox_head`, and topology heads beside it `lclc_head` and `lcte_head`; in
+LaneSegNet's map-element-bucket variant these are `lsls_head` and `lste_head`, and areas have the `area_head`. MapTR's
 BEV encoder is part of its head.
 """
 
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 from tflane_jax.convert.bevformer import BEV_CONSTRUCTER, IMAGE_ENCODER
 from tflane_jax.convert.fitting import Expected, Missing, expected_variables, fitted
 from tflane_jax.convert.lanesegnet import LANESEGNET_HEAD
-from tflane_jax.convert.maptr import MAPTR_HEAD, MAPTRV2_HEAD
+from tflane_jax.convert.maptr import MAPTR_HEAD, MAPTRV2_HEAD, area_head
 from tflane_jax.convert.renaming import Converted, Rule, below, convert, naming
 from tflane_jax.convert.toponet import BASELINE_LANES, ELEMENTS, RELATIONSHIP, TOPONET_LANES
 from tflane_jax.convert.torch_file import read_state_dict
@@ -44,7 +45,15 @@ def _head_rules(model: PublishedHost) -> tuple[str, tuple[Rule, ...]]:
         return "TopoNet", (*elements, *below(r"pts_bbox_head\.", "", TOPONET_LANES))
     if isinstance(model, LaneSegNetConfig):
         segments = below(r"pts_bbox_head\.", "", LANESEGNET_HEAD)
-        return "LaneSegNet", (*segments, *below(r"lclc_head\.", "successor", RELATIONSHIP))
+        if model.areas is None:
+            return "LaneSegNet", (*segments, *below(r"lclc_head\.", "successor", RELATIONSHIP))
+        return "LaneSegNet's map-element-bucket variant", (
+            *segments,
+            *below(r"lsls_head\.", "successor", RELATIONSHIP),
+            *elements,
+            *below(r"lste_head\.", "element_lane", RELATIONSHIP),
+            *below(r"area_head\.", "areas", area_head(model.areas.class_layers)),
+        )
     if isinstance(model, MapTrV2Config):
         return "MapTRv2", below(r"pts_bbox_head\.", "", MAPTRV2_HEAD)
     if isinstance(model, MapTrConfig):

@@ -10,14 +10,16 @@ from tflane_jax.convert.toponet import PLAIN_DECODER
 from tflane_jax.geometry.namespace import AnyArray
 
 
-def branch(name: str, ours: str, *, norm: bool = False) -> tuple[Rule, ...]:
-    """Return the rules of one kind of branch: three linear layers, numbered with the layers between them."""
+def branch(name: str, ours: str, *, norm: bool = False, layers: int = 3) -> tuple[Rule, ...]:
+    """Return the rules of one kind of branch: linear layers, numbered with the layers between them."""
     step = 3 if norm else 2
     linear = [
-        (rf"{name}\.(\d+)\.{step * i}\.(weight|bias)", rf"heads_\1/{ours}/linear_{i}/\2", "linear") for i in range(3)
+        (rf"{name}\.(\d+)\.{step * i}\.(weight|bias)", rf"heads_\1/{ours}/linear_{i}/\2", "linear")
+        for i in range(layers)
     ]
     norms = [
-        (rf"{name}\.(\d+)\.{step * i + 1}\.(weight|bias)", rf"heads_\1/{ours}/norm_{i}/\2", "norm") for i in range(2)
+        (rf"{name}\.(\d+)\.{step * i + 1}\.(weight|bias)", rf"heads_\1/{ours}/norm_{i}/\2", "norm")
+        for i in range(layers - 1)
     ]
     return (*linear, *(norms if norm else ()))
 

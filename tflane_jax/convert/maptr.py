@@ -27,6 +27,23 @@ MAPTR_HEAD: tuple[Rule, ...] = (
     *PLAIN_DECODER,
     *below(r"(?:transformer\.)?", "encoder/bev", _ENCODER),
 )
+
+
+def area_head(class_layers: int) -> tuple[Rule, ...]:
+    """Return the rules of the areas of LaneSegNet's map-element-bucket variant: MapTR's head without BEV encoder.
+
+    Args:
+        class_layers: see `LineDecoderConfig`.
+    """
+    return (
+        (r"instance_embedding\.weight", "queries/instances", "vector"),
+        (r"pts_embedding\.weight", "queries/points", "vector"),
+        *branch("cls_branches", "class", norm=True, layers=class_layers + 1),
+        *branch("reg_branches", "points"),
+        *PLAIN_DECODER,
+    )
+
+
 _NORMS = ("line_attention", "point_attention", "bev_attention", "feed_forward")
 _MASK: tuple[Rule, ...] = (
     (r"0\.weight", "hidden/kernel", "conv"),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tflane_jax.datasets.plausible import first_twice, left_of
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry.polylines import resample
@@ -32,9 +33,7 @@ def read_map(folder: Path) -> VectorMap:
     if not segments:
         raise UserError(f"{path} holds no lane segment: download it again")
     by_id = {segment.id: segment for segment in segments}
-    if len(by_id) < len(segments):
-        ids = [segment.id for segment in segments]
-        twice = next(number for number in ids if ids.count(number) > 1)
+    if (twice := first_twice([segment.id for segment in segments])) is not None:
         raise UserError(f"{path} has two lane segments with the id {twice}: download it again")
     return VectorMap(
         segments=by_id,
@@ -91,7 +90,7 @@ def _lane_segment(record: Any, where: str) -> LaneSegment:
     if number in successors:
         raise UserError(f"{where} is its own successor: download it again")
     sides = resample(left, _CENTERLINE_POINTS), resample(right, _CENTERLINE_POINTS)
-    if _left_of(*sides) < 0.0:
+    if left_of(*sides) < 0.0:
         raise UserError(f"{where}: the left boundary is to the right of the right one, in driving direction")
     flags = member(record, "is_intersection", where), member(record, "lane_type", where)
     if not isinstance(flags[0], bool) or not isinstance(flags[1], str):
@@ -115,13 +114,6 @@ def _mark(record: Any, name: str, where: str) -> LineType:
         return line_type(str(mark))
     except ValueError:
         raise UserError(f"{where}.{name} is {mark!r:.40}, no lane marking of Argoverse 2") from None
-
-
-def _left_of(left: np.ndarray, right: np.ndarray) -> float:
-    """Return by how much the left boundary lies to the left, square metres: the area between the boundaries."""
-    ring = np.concatenate([right, left[::-1]])[:, :2]
-    x, y = (ring - ring[0]).T  # city coordinates are large
-    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2.0)
 
 
 def _crossing(record: Any, where: str) -> np.ndarray:

@@ -109,6 +109,10 @@ class TruncationWarning(UserWarning):
     """An example has more items in range than its capacity; some were left out."""
 
 
+class MissingTracksWarning(UserWarning):
+    """Frames whose source log is not at hand were left out, or have an empty traffic flow."""
+
+
 @dataclass(frozen=True)
 class FrameInfo:
     """Where an example comes from.

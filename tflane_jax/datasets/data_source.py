@@ -7,7 +7,7 @@ opens such a config, and the frozen dataclass that a run configuration holds for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -16,7 +16,7 @@ from tflane_jax.datasets.base import ExampleConfig, Split
 from tflane_jax.datasets.loading import load_or_stream
 from tflane_jax.datasets.overlap import Drive
 from tflane_jax.datasets.streaming import StreamingConfig
-from tflane_jax.scene import Example, RoadImage
+from tflane_jax.scene import CameraViews, Example, RoadImage
 
 ConfigT = TypeVar("ConfigT")
 
@@ -96,6 +96,8 @@ class DataSource(Generic[ConfigT]):
         check: folder -> counts and faults, for `tflane data check`; None where there is no folder to check.
         drives: config -> where its examples were recorded, area by area; None for data that show no real place.
         tracks: whether tracks come from a folder of their own, which `check` takes as `tracks`.
+        views: (config, numbers) -> images of these examples for pictures, where examples have none; None for an
+            example whose images are not there.
         interval: config -> seconds between successive examples of a scene; None where they are not known without data.
         cameras: config -> names of the cameras whose images are read from files, in order; None for no such images.
     """
@@ -116,6 +118,7 @@ class DataSource(Generic[ConfigT]):
     check: Callable[..., FolderCheck] | None = None
     drives: Callable[[ConfigT], list[Drive]] | None = None
     tracks: bool = False
+    views: Callable[[ConfigT, Sequence[int]], list[CameraViews | None]] | None = None
     interval: Callable[[ConfigT], float | None] = lambda config: None
     cameras: Callable[[ConfigT], tuple[str, ...] | None] = lambda config: None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +41,7 @@ from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
 from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
 from tflane_jax.datasets.openlane_example import camera_views
+from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.plausible import FAR, check_place
@@ -47,7 +49,7 @@ from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
 from tflane_jax.errors import UserError
-from tflane_jax.scene import Example
+from tflane_jax.scene import CameraViews, Example
 from tflane_jax.scene.logs import Log
 
 # Metres of map beyond the corners of the perception range, so that chains of lanes are merged as on the whole map.
@@ -126,13 +128,28 @@ class NuScenesDataset:
         example = make_example(self.log(name), number, config.example)
         if config.image is None:
             return example
-        frames = self.frames(name)
-        sample, vehicle = frames.samples[number], frames.global_from_ego[number]
-        pose = frames.frame_from_ego[number] if config.frame == "lidar" else None
-        cameras = sample_cameras(self.tables, sample, vehicle, pose, config.camera_poses)
-        views = camera_views(cameras, self._fits, config.image)
+        views = camera_views(self._cameras(index), self._fits, config.image)
+        sample, pose = self.frames(name).samples[number], self._frame_from_ego(name, number)
         state = vehicle_state(self.tables, self.scenes[name], sample, pose, config.can_bus)
         return replace(example, cameras=replace(views, vehicle=state))
+
+    def views(self, index: int) -> CameraViews | None:
+        """Return the images of a key frame whose files are there, for pictures; None without any.
+
+        Raises UserError for an image that cannot be read.
+        """
+        cameras = [one if one is not None and one.image.is_file() else None for one in self._cameras(index)]
+        image = self.config.image or TOPONET_SUBSET_B
+        return camera_views(cameras, camera_fits(self.tables, image), image) if any(cameras) else None
+
+    def _cameras(self, index: int) -> tuple[FrameCamera | None, ...]:
+        name, number = self._place(index)
+        frames, pose = self.frames(name), self._frame_from_ego(name, number)
+        vehicle = frames.global_from_ego[number]
+        return sample_cameras(self.tables, frames.samples[number], vehicle, pose, self.config.camera_poses)
+
+    def _frame_from_ego(self, name: str, number: int) -> np.ndarray | None:
+        return self.frames(name).frame_from_ego[number] if self.config.frame == "lidar" else None
 
     def info(self, index: int) -> FrameInfo:
         """Return scene, time and (level) pose of one key frame."""
@@ -296,6 +313,11 @@ def _choose(choice: Choice) -> NuScenesConfig:
     return NuScenesConfig(choice.root, split, image=image, example=replace(example, cameras=None))
 
 
+def _views(config: NuScenesConfig, numbers: Sequence[int]) -> list[CameraViews | None]:
+    dataset = NuScenesDataset(config)
+    return [dataset.views(number) for number in numbers]
+
+
 SOURCE = DataSource(
     name="nuscenes",
     data=NuScenesData,
@@ -308,6 +330,7 @@ SOURCE = DataSource(
     drives=lambda config: frame_drives(NuScenesDataset(config)),
     root="its folder",
     check=check_nuscenes,
+    views=_views,
     interval=lambda config: 0.5,
     cameras=lambda config: None if config.image is None else CAMERAS,
 )

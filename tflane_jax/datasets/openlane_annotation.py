@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tflane_jax.datasets.plausible import first_twice, left_of
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, member
+from tflane_jax.files.fields import items, member, shown
 from tflane_jax.files.openlane import (
     SEGMENT,
     FieldNames,
@@ -19,6 +20,9 @@ from tflane_jax.files.openlane import (
     read_lines,
     read_matrix,
 )
+
+# Metres of mean width below zero: boundaries that the crop has shortened may cross, swapped ones are 3 m the wrong way.
+_SWAPPED = 0.5
 
 
 @dataclass(frozen=True)
@@ -72,16 +76,16 @@ def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
             read_labels(record, names.lanes, f"{side}_laneline_type", 0, 2, where) for side in ("left", "right")
         )
         areas, area_category = read_areas(record, where)
+    successor = _binary(record, names.lane_lane, (lanes, lanes), where)
+    _check_lanes(record, names, successor, (left, right), where)
     return Annotation(
         lines=lines,
         left=left,
         right=right,
         left_type=left_type,
         right_type=right_type,
-        is_connector=np.array(
-            [bool(lane.get("is_intersection_or_connector", False)) for lane in items(record, names.lanes, where)], bool
-        ),
-        successor=_binary(record, names.lane_lane, (lanes, lanes), where),
+        is_connector=_flags(record, names.lanes, "is_intersection_or_connector", where),
+        successor=successor,
         boxes=boxes,
         element_category=read_labels(record, "traffic_element", "category", 1, 2, where),
         attribute=attribute,
@@ -89,6 +93,36 @@ def read_annotation(record: Any, names: FieldNames, where: str) -> Annotation:
         areas=areas,
         area_category=area_category,
     )
+
+
+def _check_lanes(
+    record: Any,
+    names: FieldNames,
+    successor: Bool[np.ndarray, "n n"],
+    sides: tuple[list[Float[np.ndarray, "_ 3"]] | None, list[Float[np.ndarray, "_ 3"]] | None],
+    where: str,
+) -> None:
+    """Raise UserError for lanes that cannot be true: an id twice, a lane that follows itself, boundaries swapped."""
+    known = [lane["id"] for lane in items(record, names.lanes, where) if "id" in lane]
+    if (twice := first_twice([str(name) for name in known])) is not None:
+        raise UserError(f"{where}: two of {names.lanes} have the id {shown(twice)}: restore the file")
+    if (own := np.flatnonzero(np.diagonal(successor))).size:
+        raise UserError(f"{where}: {names.lane_lane}: {names.lanes}[{own[0]}] is its own successor: restore the file")
+    for i, (left, right) in enumerate(zip(*(side or [] for side in sides), strict=True)):
+        length = sum(float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum()) for line in (left, right)) / 2
+        if left_of(left, right) < -_SWAPPED * length:
+            raise UserError(
+                f"{where}: {names.lanes}[{i}]: the left boundary is to the right of the right one, in driving direction"
+            )
+
+
+def _flags(record: Any, things: str, field: str, where: str) -> Bool[np.ndarray, " n"]:
+    """Return a truth value of each lane, False for lanes without the entry."""
+    values = [lane.get(field, False) for lane in items(record, things, where)]
+    for i, value in enumerate(values):
+        if not isinstance(value, (bool, np.bool_)) and not (isinstance(value, int) and value in (0, 1)):
+            raise UserError(f"{where}: {things}[{i}].{field} is {shown(value)}, expected true or false")
+    return np.array(values, bool)
 
 
 def lane_ids(record: Any, names: FieldNames, where: str) -> list[str]:

@@ -29,7 +29,7 @@ from tflane_jax.datasets.openlane_frames import (
     read_frame,
     source_logs,
 )
-from tflane_jax.datasets.openlane_tracks import SourceTracks
+from tflane_jax.datasets.openlane_tracks import SourceTracks, listed
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
@@ -39,7 +39,7 @@ _FASTEST = 70.0
 # Frames of a segment that are read to find its subset.
 _TRIED = 3
 _FRAME_FILE = re.compile(r"(\d+)(-ls)?\.json")
-_WITH_LOG, _WITH_TRAFFIC = "with log", "with traffic"
+_WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC = "with log", "without log", "with traffic"
 _COUNTS = ("segments", "frames", "-ls files", "images", "lanes", "lane segments", "elements", "areas")
 
 
@@ -51,7 +51,7 @@ class OpenLaneCheck:
         subset: "A", "B" or "A and B", by the cameras of each segment's first frame.
         rows: counts of each split, and of each subset where there are both, for a table.
         faults: sentences, each naming a file.
-        skipped: files that are none of the dataset's, and what was not read.
+        skipped: files that are none of the dataset's, what was not read, and the logs that frames lack.
     """
 
     subset: str
@@ -73,7 +73,8 @@ def check_openlane_v2(
     Args:
         root: of the dataset.
         tracks: folder of the logs of which the segments are parts. With it, the rows say how many frames have such a
-            log, and in how many of them there is any road user; a log that does not fit its frames is a fault.
+            log, and in how many of them there is any road user; a log that does not fit its frames is a fault. Logs
+            that are missing are named among what was skipped.
         images: how far images are read, see `openlane_check_cameras.Images`.
         cameras: whether a frame without one of its subset's cameras is a fault.
         progress: show a bar.
@@ -105,6 +106,11 @@ def check_openlane_v2(
             counts = _check_frames(root, there, subset, logs, CameraChecks(images), cameras, faults, progress)
             counts["segments"] = len({key.segment for key in keys})
             content = counts if tracks is None else _with_share(counts)
+            if logs is not None and (lacking := logs.lacking(there)):
+                skipped.append(
+                    f"{lacking.total()} of {len(there)} {split} frames have no log in {tracks}, so no traffic flow: "
+                    f"it lacks {listed(lacking, len(lacking))}"
+                )
             both = {"subset": subset} if len(present) > 1 else {}
             rows.append({"split": split, **both, **content, "faults": len(faults) - found})
     of_collections, not_read = check_collections(root, [key for keys in on_disk.values() for key in keys])
@@ -122,9 +128,8 @@ def _check_frames(
     progress: bool,
 ) -> Counter[str]:
     """Check frames that are there, in the order of time, and return what they hold."""
-    counts: Counter[str] = Counter(dict.fromkeys((*_COUNTS, _WITH_LOG, _WITH_TRAFFIC), 0))
-    if logs is None:
-        del counts[_WITH_LOG], counts[_WITH_TRAFFIC]
+    of_logs = () if logs is None else (_WITH_LOG, _WITHOUT_LOG, _WITH_TRAFFIC)
+    counts: Counter[str] = Counter(dict.fromkeys((*_COUNTS, *of_logs), 0))
     before = None
     lacking: dict[tuple[str, str], list[FrameKey]] = {}
     for key in tqdm(keys, f"checking {keys[0].split if keys else ''}", unit="frame", disable=not progress):
@@ -301,6 +306,7 @@ def _logs(root: Path, keys: list[FrameKey], subset: SubsetName, tracks: Path, *,
 
 def _check_tracks(logs: SourceTracks, key: FrameKey, frame: FrameFile, counts: Counter[str]) -> Iterator[str]:
     if not logs.has(key):
+        counts[_WITHOUT_LOG] += 1
         return
     try:
         flow = logs.flow(key, frame.global_from_ego, ExampleConfig())

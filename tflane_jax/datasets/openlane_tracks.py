@@ -7,6 +7,7 @@ time is that of the front camera, some 10 ms before the lidar frame in which box
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_log import find_logs, load_log
-from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
 from tflane_jax.datasets.examples import traffic_flow, warn_dropped
 from tflane_jax.datasets.nuscenes_log import level_poses
 from tflane_jax.datasets.nuscenes_tracks import SceneTracks
@@ -34,7 +35,7 @@ flow."""
 # Seconds and metres between a frame and the nearest annotated one. Boxes of Argoverse 2 come at 10 Hz, those of
 # nuScenes at OpenLane-V2's own frames; the ego vehicle moves less than 5 m in 0.1 s.
 _NEAR_S, _NEAR_M = 0.1, 5.0
-_NAMED = 3
+_NAMED, _NAMED_IN_FULL = 3, 50
 
 
 class SourceTracks:
@@ -61,11 +62,11 @@ class SourceTracks:
         return self._names[key.split, key.segment] in self._logs
 
     def known(self, keys: Sequence[FrameKey], without: WithoutTracks) -> list[FrameKey]:
-        """Return the frames to use; see `WithoutTracks`.
+        """Return the frames to use; see `WithoutTracks`. Warns (`MissingTracksWarning`) where logs are missing.
 
         Raises UserError where logs are missing and must not be, or no frame is left.
         """
-        lacking = Counter(self._names[key.split, key.segment] for key in keys if not self.has(key))
+        lacking = self.lacking(keys)
         if lacking and without == "refuse":
             raise UserError(
                 f"{self._root} lacks {len(lacking)} of the logs of these frames ({listed(lacking)}), so "
@@ -75,7 +76,19 @@ class SourceTracks:
         kept = list(keys) if without != "drop" else [key for key in keys if self.has(key)]
         if not kept:
             raise UserError(f"{self._root} holds none of the logs of these {len(keys)} frames ({listed(lacking)})")
+        if lacking:
+            become = "are left out" if without == "drop" else "have an empty traffic flow"
+            warnings.warn(
+                f"{lacking.total()} of {len(keys)} frames {become} (data.without_tracks={without}): {self._root} lacks "
+                f"{len(lacking)} of their logs ({listed(lacking, _NAMED_IN_FULL)})",
+                MissingTracksWarning,
+                stacklevel=2,
+            )
         return kept
+
+    def lacking(self, keys: Sequence[FrameKey]) -> Counter[str]:
+        """Return the names of the logs that are not at hand, and how many of the frames belong to each."""
+        return Counter(self._names[key.split, key.segment] for key in keys if not self.has(key))
 
     def flow(self, key: FrameKey, global_from_ego: Float[np.ndarray, "4 4"], config: ExampleConfig) -> TrafficFlow:
         """Return the traffic flow of a frame: boxes of earlier annotated frames, moved into its ego frame by Eq. (1).
@@ -127,8 +140,8 @@ class _Argoverse2:
         return self._read[name]
 
 
-def listed(names: Iterable[str]) -> str:
+def listed(names: Iterable[str], most: int = _NAMED) -> str:
     """Return the first names, in order, and how many more there are."""
     ordered = sorted(names)
-    more = len(ordered) - _NAMED
-    return ", ".join(ordered[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(ordered) - most
+    return ", ".join(ordered[:most]) + (f" and {more} more" if more > 0 else "")

@@ -6,6 +6,7 @@ Such files would give examples without lanes or with senseless traffic, and no e
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,6 +19,8 @@ FAR = 200.0
 """Metres from a vehicle to the nearest lane. Parking lots are not on the map; another city is farther."""
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
+
+T = TypeVar("T")
 
 
 def check_motion(position: Float[np.ndarray, "f 2"], times_ns: Int[np.ndarray, " f"], where: Sequence[str]) -> None:
@@ -41,6 +44,19 @@ def check_place(lanes: Sequence[Float[np.ndarray, "_ d"]], position: Float[np.nd
         raise UserError(
             f"{where}: the vehicle never comes within {FAR:.0f} m of a lane: the map is empty or of another place"
         )
+
+
+def left_of(left: Float[np.ndarray, "n d"], right: Float[np.ndarray, "m d"]) -> float:
+    """Return by how much a left boundary lies to the left of the right one, in driving direction: the area between."""
+    ring = np.concatenate([right, left[::-1]])[:, :2]
+    x, y = (ring - ring[0]).T  # city coordinates are large
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum() / 2.0)
+
+
+def first_twice(names: Sequence[T]) -> T | None:
+    """Return the first name that occurs twice, or None."""
+    seen: set[T] = set()
+    return next((name for name in names if name in seen or seen.add(name)), None)
 
 
 def check_distance(position: Float[np.ndarray, "n 3"], where: Sequence[str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any, Union
 
@@ -20,7 +20,7 @@ from tflane_jax.datasets import (
 from tflane_jax.datasets.data_source import DataSource, loading_of
 from tflane_jax.datasets.loading import TRAINING_PARTS
 from tflane_jax.errors import UserError
-from tflane_jax.scene import Example, RoadImage
+from tflane_jax.scene import CameraViews, Example, RoadImage
 
 SOURCES: tuple[DataSource[Any], ...] = (
     procedural.SOURCE,
@@ -92,6 +92,12 @@ def sample(config: Any) -> Any:
     """Return one example with the shapes and types of all, without building a cache and, if possible, without data."""
     source = source_of(config)
     return source.dataset(config).example(0) if source.sample is None else source.sample(config)
+
+
+def drawing_views(config: Any, numbers: Sequence[int]) -> list[CameraViews | None]:
+    """Return the images of some examples for pictures, for data whose examples have none; None where none are there."""
+    views = source_of(config).views
+    return [None] * len(numbers) if views is None else views(config, numbers)
 
 
 def source_name(config: Any) -> str:

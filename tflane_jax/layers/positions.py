@@ -63,19 +63,20 @@ class LearnedImageEncoding(nn.Module):
     Attributes:
         rows, columns: largest map.
         bands: channels of each axis.
+        init_table: initial values of both tables.
     """
 
     rows: int
     columns: int
     bands: int
+    init_table: nn.initializers.Initializer = nn.initializers.uniform(1.0)
 
     @nn.compact
     def __call__(self, height: int, width: int) -> Float[Array, "h w f"]:
         """Return the encoding of a map of `height` x `width` cells; raises ValueError where that is too large."""
         if height > self.rows or width > self.columns:
             raise ValueError(f"positions are learned up to {self.rows} x {self.columns}, not {height} x {width}")
-        init = nn.initializers.uniform(1.0)
-        row = self.param("row", init, (self.rows, self.bands))[:height, None]
-        column = self.param("column", init, (self.columns, self.bands))[None, :width]
+        row = self.param("row", self.init_table, (self.rows, self.bands))[:height, None]
+        column = self.param("column", self.init_table, (self.columns, self.bands))[None, :width]
         shape = (height, width, self.bands)
         return jnp.concatenate([jnp.broadcast_to(column, shape), jnp.broadcast_to(row, shape)], -1)

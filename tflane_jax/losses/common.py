@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -89,6 +89,37 @@ def edge_loss(
         return focal(logits, true, alpha, gamma).mean() if logits.size else jnp.zeros(())
 
     return jax.vmap(jax.vmap(one, in_axes=(0, 0, 0, None)))(logits, rows, columns, edges).mean(0)
+
+
+def matched_edge_sums(
+    logits: Float[Array, "b q r"],
+    rows: Assignment,
+    columns: Assignment,
+    edges: Bool[Array, "b n m"],
+    loss: tuple[float, float],
+    mean: Literal["negatives", "pairs"],
+) -> tuple[Float[Array, " b"], Float[Array, " b"]]:
+    """Return the sum of the focal loss over pairs of matched queries, and what it is divided by, for each example.
+
+    Pairs with an unmatched query do not count: LaneSegNet's relationship head (docs/reference/lanesegnet.md).
+
+    Args:
+        logits: predicted edges of one layer.
+        rows, columns: assignments (B, N) and (B, M) of that layer.
+        edges: true edges between targets.
+        loss: alpha and gamma of the focal loss.
+        mean: whether pairs without an edge are counted, "negatives", or all "pairs".
+    """
+
+    def one(logits, rows, columns, edges):
+        pairs: Bool[Array, "n m"] = rows.matched[:, None] & columns.matched[None]
+        edges = edges & pairs
+        found = logits[rows.query[:, None], columns.query[None]]
+        each = focal(found, edges.astype(logits.dtype), *loss)
+        counted = pairs & ~edges if mean == "negatives" else pairs
+        return jnp.where(pairs, each, 0.0).sum(), counted.sum().astype(jnp.float32)
+
+    return jax.vmap(one)(logits, rows, columns, edges)
 
 
 def focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], alpha: float, gamma: float) -> Float[Array, "*b"]:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from tflane_jax.datasets.segment_targets import SegmentTargets
 from tflane_jax.limits import Fraction, PositiveOrZero
@@ -26,11 +26,10 @@ from tflane_jax.losses.common import (
     HostLossConfig,
     Report,
     Terms,
-    edge_loss,
     focal,
     last_layer,
-    last_layers,
     matched,
+    matched_edge_sums,
     positives,
     quality_focal,
     total,
@@ -65,9 +64,9 @@ class LaneSegNetLossConfig(HostLossConfig):
         matcher: backend of `matching.match`.
         dice_cost: the dice cost takes the masks' "logits", as the published configuration does, or their
             "probabilities", as the dice loss does.
-        element_lane_weight: of the topology with traffic elements, a focal loss as that of the successors.
-        successor_mean: the sum over matched pairs is divided by the number of "negatives", the pairs without an edge,
-            as in the published code, or of all "pairs".
+        element_lane_weight: of the topology with traffic elements, whose loss is that of the successors.
+        successor_mean: of both topologies: the sum over matched pairs is divided by the number of "negatives", the
+            pairs without an edge, as in the published code, or of all "pairs".
         raster: of the mask targets.
         class_target: of a query matched with a segment: "one", or "quality" (`segment_quality`).
         proposal_weight: of the heat map of proposals; their shapes have `points_weight`.
@@ -110,7 +109,7 @@ class LaneSegNetLossConfig(HostLossConfig):
             of_areas, terms = area_loss(segments.areas, batch.areas, self.areas, self.matcher)
             loss, report = loss + of_areas, report | terms
         if outputs.elements is not None:
-            of_elements, terms = self._element_loss(outputs.elements, last_layers(assignment, 1), batch)
+            of_elements, terms = self._element_loss(outputs.elements, _last(assignment), targets, batch)
             loss, report = loss + of_elements, report | terms
 
         def denoising(found, _):
@@ -131,19 +130,28 @@ class LaneSegNetLossConfig(HostLossConfig):
         return loss, report | more
 
     def _element_loss(
-        self, prediction: ElementPrediction, segments: Assignment, batch: Example
+        self, prediction: ElementPrediction, segments: Assignment, targets: SegmentTargets, batch: Example
     ) -> tuple[Float[Array, ""], Report]:
-        """Return the loss of traffic elements and of their topology with the segments, and its terms."""
+        """Return the loss of traffic elements and of their topology with the segments, and its terms.
+
+        Both are 0 for a batch without elements, as in the published code.
+        """
         elements, size = true_elements(batch)
         elements = clear_padding(elements)
         found = assign_elements(prediction, elements, size, self.elements, self.matcher)
         terms = element_losses(prediction, found, elements, size, self.elements)
-        rows = jax.vmap(partial(governed_rows, rows=segments.query.shape[-1]))(batch.segments, elements.lane)
-        edges = rows & elements.valid[:, None]
-        logits = jnp.asarray(prediction.lane_logits)
-        terms["element_lane"] = self.element_lane_weight * edge_loss(
-            logits, segments, last_layers(found, 1), edges, self.alpha, self.gamma
+        edges = jax.vmap(partial(governed_rows, rows=segments.query.shape[-1]))(batch.segments, elements.lane)
+        losses, counts = matched_edge_sums(
+            jnp.asarray(prediction.lane_logits)[:, -1],
+            _of_lanes(segments, targets),
+            _last(found),
+            edges,
+            (self.alpha, self.gamma),
+            self.successor_mean,
         )
+        terms["element_lane"] = (self.element_lane_weight * losses.sum() / jnp.maximum(counts.sum(), 1.0))[None]
+        there = elements.valid.any()
+        terms = {name: jnp.where(there, term, 0.0) for name, term in terms.items()}
         return total(terms), last_layer(terms) | {"matching/elements": matched(found)}
 
 
@@ -229,9 +237,8 @@ def segment_losses(
         "line_type": config.type_weight,
     }
     terms = {name: weight * sums[name].sum(0) / count for name, weight in weights.items()}
-    last = jax.tree.map(lambda leaf: leaf[:, -1], assignment)
     edges = jnp.asarray(prediction.successor_logits)[:, -1]
-    return terms | {"successor": successor_loss(edges, last, targets, config)[None]}
+    return terms | {"successor": successor_loss(edges, _last(assignment), targets, config)[None]}
 
 
 def _layer_sums(
@@ -284,18 +291,21 @@ def successor_loss(
 
     Pairs with an unmatched query or a crossing do not count.
     """
-
-    def one(logits, assignment, targets):
-        lane = assignment.matched & (targets.category == LANE)
-        pairs: Bool[Array, "n n"] = lane[:, None] & lane[None]
-        edges = targets.successor & pairs
-        found = logits[assignment.query[:, None], assignment.query[None]]
-        loss = focal(found, edges.astype(logits.dtype), config.alpha, config.gamma)
-        counted = pairs & ~edges if config.successor_mean == "negatives" else pairs
-        return jnp.where(pairs, loss, 0.0).sum(), counted.sum().astype(jnp.float32)
-
-    losses, counts = jax.vmap(one)(logits, assignment, targets)
+    lanes = _of_lanes(assignment, targets)
+    losses, counts = matched_edge_sums(
+        logits, lanes, lanes, targets.successor, (config.alpha, config.gamma), config.successor_mean
+    )
     return config.successor_weight * losses.sum() / jnp.maximum(counts.sum(), 1.0)
+
+
+def _last(assignment: Assignment) -> Assignment:
+    """Return the assignment (B, N) of the last layer."""
+    return jax.tree.map(lambda leaf: leaf[:, -1], assignment)
+
+
+def _of_lanes(assignment: Assignment, targets: SegmentTargets) -> Assignment:
+    """Return an assignment (B, N) in which only lane segments are matched."""
+    return replace(assignment, matched=assignment.matched & (targets.category == LANE))
 
 
 def segment_quality(lines: Float[Array, "n 3 p 3"], truth: Float[Array, "n 3 p 3"]) -> Float[Array, " n"]:

@@ -39,7 +39,7 @@ class AreaDecoderConfig(LineDecoderConfig):
     classes: Literal[2, 3, 4] = AREA_CLASSES
 
 
-PAPER_AREA_DECODER = AreaDecoderConfig(dim=256, layers=6, queries=50, hidden=512, dropout=0.1)
+PAPER_AREA_DECODER = AreaDecoderConfig(dim=256, layers=6, queries=50, class_layers=1, hidden=512, dropout=0.1)
 
 
 class AreaDecoder(nn.Module):

@@ -65,6 +65,9 @@ class BevFormerConfig:
         value_projections: how many times temporal attention projects its value.
         remat: recompute each layer's activations for the gradient instead of keeping them.
         precision: dtype of the projections; parameters, sampling locations and results are float32.
+        initial: values of the queries and of the tables of their positions at the start of training. "mixed": normal of
+            variance 1, and uniform in [0, 1]; "xavier": both Xavier-uniform, as in TopoNet and LaneSegNet, which makes
+            the 20,000 queries small (within 0.017); "normal": both normal of variance 1, as in MapTR.
     """
 
     grid: BevGrid = BevGrid()
@@ -89,6 +92,7 @@ class BevFormerConfig:
     kernel: tuple[Count, Count] = (3, 5)
     memory: Literal["previous", "off"] = "previous"
     motion: Literal["moved", "can_bus"] = "moved"
+    initial: Literal["mixed", "xavier", "normal"] = "mixed"
 
     def limits(self) -> Rules:
         """Channels split over heads, sampling points over anchors."""

@@ -28,6 +28,13 @@ from tflane_jax.scene import CameraViews
 
 # Length of the published code's vector of vehicle motion ("CAN bus").
 MOTION = 18
+_NORMAL, _XAVIER = nn.initializers.normal(1.0), nn.initializers.xavier_uniform()
+# Of queries and position tables, by `BevFormerConfig.initial`.
+_INITIAL = {
+    "mixed": (_NORMAL, nn.initializers.uniform(1.0)),
+    "xavier": (_XAVIER, _XAVIER),
+    "normal": (_NORMAL, _NORMAL),
+}
 
 
 class BevFormer(nn.Module):
@@ -86,14 +93,14 @@ class BevFormer(nn.Module):
                 f"the BEV encoder is configured for {config.levels} levels of at most {config.cameras} cameras and got "
                 f"{len(features)} levels of {len(cameras.valid)}: change `levels` and `cameras` of BevFormerConfig"
             )
-        queries = self.param("queries", nn.initializers.normal(1.0), (grid.rows * grid.columns, config.dim))
+        of_queries, of_positions = _INITIAL[config.initial]
+        queries = self.param("queries", of_queries, (grid.rows * grid.columns, config.dim))
         queries = queries + MotionEmbedding(config.dim, name="motion")(motion)[None]
-        learned = LearnedImageEncoding(grid.rows, grid.columns, config.dim // 2, name="position")
+        learned = LearnedImageEncoding(grid.rows, grid.columns, config.dim // 2, of_positions, name="position")
         position = learned(grid.rows, grid.columns).reshape(-1, config.dim)
 
-        embed = nn.initializers.normal(1.0)
-        by_camera = self.param("cameras", embed, (config.cameras, config.dim))[: len(cameras.valid), None]
-        by_level = self.param("levels", embed, (config.levels, config.dim))
+        by_camera = self.param("cameras", _NORMAL, (config.cameras, config.dim))[: len(cameras.valid), None]
+        by_level = self.param("levels", _NORMAL, (config.levels, config.dim))
         tokens = [
             level.reshape(len(level), -1, config.dim) + by_camera + by_level[None, i : i + 1]
             for i, level in enumerate(features)
@@ -120,9 +127,8 @@ class MotionEmbedding(nn.Module):
     @nn.compact
     def __call__(self, motion: Float[Array, " m"]) -> Float[Array, " c"]:
         """Return the embedding of the motion vector."""
-        init = nn.initializers.xavier_uniform()
-        x = nn.relu(nn.Dense(self.dim // 2, kernel_init=init, name="hidden")(motion))
-        x = nn.relu(nn.Dense(self.dim, kernel_init=init, name="out")(x))
+        x = nn.relu(nn.Dense(self.dim // 2, kernel_init=_XAVIER, name="hidden")(motion))
+        x = nn.relu(nn.Dense(self.dim, kernel_init=_XAVIER, name="out")(x))
         return nn.LayerNorm(epsilon=1e-5, name="norm")(x)
 
 

@@ -74,7 +74,11 @@ def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
     """Return the published sizes of OpenLane-V2's large baseline; SMERF's copy has `control_points=None`."""
     decoder = replace(PAPER_LANE_DECODER, queries=100)
     return BevFormerDetrConfig(
-        encoder=PAPER_CAMERA_ENCODER, decoder=decoder, elements=PAPER_ELEMENT_DECODER, control_points=control_points
+        encoder=PAPER_CAMERA_ENCODER,
+        decoder=decoder,
+        elements=PAPER_ELEMENT_DECODER,
+        initial="xavier",
+        control_points=control_points,
     )
 
 

@@ -59,7 +59,7 @@ class CameraEncoderConfig:
         return self.bev.grid.range
 
 
-PAPER_CAMERA_ENCODER = CameraEncoderConfig(PAPER_IMAGE_ENCODER, BevFormerConfig())
+PAPER_CAMERA_ENCODER = CameraEncoderConfig(PAPER_IMAGE_ENCODER, BevFormerConfig(initial="xavier"))
 
 
 class FrontView(NamedTuple):

@@ -19,6 +19,7 @@ from tflane_jax.models.bev_encoder import BevMemory
 from tflane_jax.models.element_decoder import ElementDecoder, ElementDecoderConfig, ElementOutput
 from tflane_jax.models.encoders import EncoderConfig, encode_example, make_encoder, start_bev_memory
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
+from tflane_jax.models.parameters import with_xavier_layers
 from tflane_jax.models.prior import HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, PriorsConfig, bev_hook, encode, observe, start_memories
 from tflane_jax.scene import Example, Prediction
@@ -46,12 +47,15 @@ class HostConfig:
         range: R_p, the box in which lanes are perceived, metres.
         priors: traffic flow, SD map, markers; none of them gives the vision-only baseline.
         elements: decoder of traffic elements, which needs cameras; None: no traffic elements.
+        initial: kernels of the decoders' transformer layers at the start of training: "lecun" (normal), or "xavier"
+            (uniform), as in the published code.
     """
 
     encoder: EncoderConfig = EvidenceEncoderConfig()
     range: PerceptionRange = PerceptionRange()
     priors: PriorsConfig = PriorsConfig()
     elements: ElementDecoderConfig | None = None
+    initial: Literal["lecun", "xavier"] = "lecun"
 
     open_base: ClassVar[bool] = True
     """Settings of this type accept any subclass, see `config_io.subclasses`."""
@@ -131,6 +135,14 @@ class Host(nn.Module):
     """
 
     config: Any
+
+    @nn.nowrap
+    def init(self, rngs: Any, *args: Any, **kwargs: Any) -> Any:
+        """Return initial variables, as Linen does."""
+        variables = super().init(rngs, *args, **kwargs)
+        if self.config.initial == "lecun":
+            return variables
+        return with_xavier_layers(variables, rngs["params"] if isinstance(rngs, dict) else rngs)
 
     def setup(self):
         config: HostConfig = self.config

@@ -106,14 +106,16 @@ class LaneSegNetConfig(HostConfig):
 
 def paper_config() -> LaneSegNetConfig:
     """Return the published sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 queries of 10 points."""
-    return LaneSegNetConfig(encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_SEGMENT_DECODER)
+    return LaneSegNetConfig(encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_SEGMENT_DECODER, initial="xavier")
 
 
 def paper_bucket_config() -> LaneSegNetConfig:
     """Return the sizes of the map-element-bucket variant: six encoder layers, areas and traffic elements."""
     encoder = replace(PAPER_CAMERA_ENCODER, bev=replace(PAPER_CAMERA_ENCODER.bev, layers=6))
     decoder = replace(PAPER_SEGMENT_DECODER, classes=1)
-    return LaneSegNetConfig(encoder=encoder, decoder=decoder, areas=PAPER_AREA_DECODER, elements=PAPER_ELEMENT_DECODER)
+    return replace(
+        paper_config(), encoder=encoder, decoder=decoder, areas=PAPER_AREA_DECODER, elements=PAPER_ELEMENT_DECODER
+    )
 
 
 class LaneSegNet(Host):

@@ -43,6 +43,7 @@ class LineDecoderConfig:
         points: points P of a line; the decoder has I P queries.
         coordinates: of a point, x and y, or x, y and z.
         classes: of `scene.LineClass`, the first three or four; two for areas (`models.area_decoder`).
+        class_layers: hidden layers of the class branch.
         sampling_points: deformable sampling points per head.
         hidden: channels inside the feed-forward block.
         anchors: "linear": a point starts at the sigmoid of a linear function of its embedding, and its position
@@ -65,6 +66,7 @@ class LineDecoderConfig:
     points: Annotated[int, at_least(2)] = 12
     coordinates: Literal[2, 3] = 2
     classes: Literal[2, 3, 4] = 3
+    class_layers: Count = 2
     sampling_points: Count = 4
     hidden: Count = 128
     anchors: Literal["linear", "spread"] = "linear"
@@ -197,11 +199,13 @@ class LineHeads(nn.Module):
     @nn.compact
     def __call__(self, queries: Float[Array, "i p c"], reference: Float[Array, "i p d"]) -> LineOutput:
         """Return the layer's prediction; `reference` are the points of the layer before, in [0, 1]."""
-        config, hidden, size = self.config, (self.config.dim,) * 2, self.config.coordinates
+        config, size = self.config, self.config.coordinates
         # The initial probability is 0.01 (focal loss prior, Lin et al. 2017).
-        classify = Branch((*hidden, config.classes), norm=True, bias=-math.log(99.0), name="class")
+        classify = Branch(
+            (*(config.dim,) * config.class_layers, config.classes), norm=True, bias=-math.log(99.0), name="class"
+        )
         logits = classify(queries.mean(1))
-        change = Branch((*hidden, size), name="points")(queries)
+        change = Branch((config.dim, config.dim, size), name="points")(queries)
         if config.output != "metric":
             unit = nn.sigmoid(change + inverse_sigmoid(reference))
         else:

@@ -135,13 +135,15 @@ PAPER_RANGE = PerceptionRange((-30.0, 30.0), (-15.0, 15.0), (-2.0, 2.0))
 """60 m along the vehicle's axis and 30 m across it, as the paper has them."""
 PAPER_MAP_ENCODER = CameraEncoderConfig(
     replace(PAPER_IMAGE_ENCODER, stages=(3,), pyramid=FeaturePyramidConfig(256, 1)),
-    BevFormerConfig(BevGrid(PAPER_RANGE, 100, 200), layers=1, levels=1, cameras=6, attention="kernel"),
+    BevFormerConfig(
+        BevGrid(PAPER_RANGE, 100, 200), layers=1, levels=1, cameras=6, attention="kernel", initial="normal"
+    ),
 )
 
 
 def paper_config() -> MapTrConfig:
     """Return the published sizes (tiny, GKT): ResNet-50, six cameras, 200 x 100 cells, 50 lines of 20 points."""
-    return MapTrConfig(encoder=PAPER_MAP_ENCODER, range=PAPER_RANGE, decoder=PAPER_LINE_DECODER)
+    return MapTrConfig(encoder=PAPER_MAP_ENCODER, range=PAPER_RANGE, decoder=PAPER_LINE_DECODER, initial="xavier")
 
 
 class MapTr(Host):

@@ -83,7 +83,12 @@ PAPER_LIFT_ENCODER = CameraEncoderConfig(PAPER_MAP_ENCODER.images, LiftConfig(su
 def paper_config() -> MapTrV2Config:
     """Return the published sizes on nuScenes: ResNet-50, six cameras, 200 x 100 cells, 50 and 300 lines."""
     return MapTrV2Config(
-        encoder=PAPER_LIFT_ENCODER, range=PAPER_RANGE, decoder=PAPER_LINE_DECODER, many=300, line_mask=True
+        encoder=PAPER_LIFT_ENCODER,
+        range=PAPER_RANGE,
+        decoder=PAPER_LINE_DECODER,
+        initial="xavier",
+        many=300,
+        line_mask=True,
     )
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import re
+import zlib
 from typing import Any
 
 import jax
+from jaxtyping import PRNGKeyArray
 
 from tflane_jax.layers.batch_norm import STATISTICS
 
@@ -41,6 +45,33 @@ def with_equal_heads(variables: Any, layers: int) -> Any:
     params = dict(variables["params"])
     copies = {f"heads_{i}": params["heads_0"] for i in range(layers) if "heads_0" in params}
     return {**variables, "params": params | copies}
+
+
+# Kernels of the layers of a host's decoders, also of its parts; not of its encoder. Where and how much to sample starts
+# at zero.
+_LAYERS = re.compile(
+    r"((areas|elements)/)?(layer|encoder|decoder)_\d+/(?!.*(sampling_offsets|attention_weights)/).*kernel"
+)
+_PACKED = re.compile(r".*/(query|key|value)/kernel")
+
+
+def with_xavier_layers(variables: Any, key: PRNGKeyArray) -> Any:
+    """Return initial variables in which the kernels of the decoders' transformer layers are Xavier-uniform.
+
+    PyTorch keeps the projections to queries, keys and values in one matrix, whose bound is smaller.
+    """
+
+    def drawn(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        if not _LAYERS.fullmatch(name):
+            return leaf
+        inputs, outputs = leaf.shape
+        limit = math.sqrt(6.0 / (inputs + (3 if _PACKED.fullmatch(name) else 1) * outputs))
+        return jax.random.uniform(
+            jax.random.fold_in(key, zlib.crc32(name.encode())), leaf.shape, leaf.dtype, -limit, limit
+        )
+
+    return {**variables, "params": jax.tree_util.tree_map_with_path(drawn, variables["params"])}
 
 
 def joined_statistics(variables: Any) -> Params:

@@ -80,7 +80,9 @@ class TopoNetConfig(HostConfig):
 
 def paper_config() -> TopoNetConfig:
     """Return the published sizes: ResNet-50, 7 cameras, 200 x 100 cells, 200 lane and 100 element queries."""
-    return TopoNetConfig(encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_LANE_DECODER, elements=PAPER_ELEMENT_DECODER)
+    return TopoNetConfig(
+        encoder=PAPER_CAMERA_ENCODER, decoder=PAPER_LANE_DECODER, elements=PAPER_ELEMENT_DECODER, initial="xavier"
+    )
 
 
 class TopoNet(Host):

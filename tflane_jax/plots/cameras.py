@@ -142,15 +142,18 @@ def draw_camera(
     Args:
         ax: where to draw.
         example: one example with camera images.
-        number: of the camera.
+        number: of the camera; one without an image is named so.
         lanes, elements: predictions for the example; with either, the truth is not drawn.
         threshold: lowest score of what is drawn.
     """
     views = example.cameras
     assert views is not None
+    if not bool(np.asarray(views.valid)[number]):  # it has no size either
+        ax.set_axis_off()
+        ax.set_title("no image", fontsize=8, loc="left")
+        return
     width, height = (int(side) for side in np.asarray(views.size)[number])
-    image = np.asarray(views.image)[number, :height, :width]
-    draw_image(ax, image, _heading(views, number) if bool(np.asarray(views.valid)[number]) else "no image")
+    draw_image(ax, np.asarray(views.image)[number, :height, :width], _heading(views, number))
     if max(width, height) < _PIXELATED:
         ax.images[-1].set_interpolation("nearest")
     predicted = lanes is not None or elements is not None

@@ -75,7 +75,8 @@ class OptimConfig:
             text, the first pattern that matches decides, and 0 keeps parameters as they are. Every pattern must match.
         warmup_steps: steps of linear rise from `warmup_ratio * lr` to `lr`.
         warmup_ratio, final_ratio: first and last learning rate relative to `lr` (with restarts the last one is theirs).
-        weight_decay: on kernels and embeddings only.
+        weight_decay: on the parameters that `decayed` names.
+        decayed: "kernels" and embeddings, or "all", biases and norms too, as the published camera hosts train.
         decay: "decoupled" from the gradient (AdamW), or "coupled": added to it, after clipping (PyTorch's Adam).
         optimizer: of the kernels that `muon_kernels` names; all other parameters have Adam. "muon" (Jordan et al.
             2024) orthogonalises the updates. None of the three papers uses it; docs/cameras.md has its effect on
@@ -99,6 +100,7 @@ class OptimConfig:
     warmup_ratio: Fraction = 1 / 3
     final_ratio: Fraction = 1e-3
     weight_decay: PositiveOrZero = 0.01
+    decayed: Literal["kernels", "all"] = "kernels"
     decay: Literal["decoupled", "coupled"] = "decoupled"
     optimizer: Literal["adam", "muon"] = "adam"
     muon_kernels: Literal["dense", "dense_and_convolution"] = "dense"
@@ -203,7 +205,9 @@ def make_optimizer(
         ValueError: the learning rate is not yet that of the batch, see `scaled_to_batch`.
     """
     _check(config, steps)
-    decay = optax.masked(_decay_what_learns(config.weight_decay), is_decayed)
+    decay = _decay_what_learns(config.weight_decay)
+    if config.decayed == "kernels":
+        decay = optax.masked(decay, is_decayed)
     adam = _preconditioner(config, whole)
     return optax.chain(
         _clip_by_norm(config.clip_norm),

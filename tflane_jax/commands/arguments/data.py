@@ -88,7 +88,8 @@ def data(commands) -> None:
         "--tracks",
         metavar="DIR",
         type=Path,
-        help="also write the road users' tracks and the ego poses, as Argoverse 2 logs",
+        help="also write the road users' tracks and the ego poses, as Argoverse 2 logs (seven cameras) or nuScenes' "
+        "tables (six)",
     )
     export.set_defaults(takes_overrides=True)
     maps = command(

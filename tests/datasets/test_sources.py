@@ -202,7 +202,7 @@ def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
     for arguments, names in (
         (
             ["eval", "--help"],
-            f"{{procedural,world-cameras,city,street,hills,{logs},real-maps,recorded,front-views,tusimple}}",
+            f"{{procedural,world-cameras,city,street,hills,real-like,{logs},real-maps,recorded,front-views,tusimple}}",
         ),
         (["data", "check", "--help"], f"{{{logs},real-maps,tusimple}}"),
     ):
@@ -213,7 +213,10 @@ def test_help_lists_the_sources_and_a_wrong_name_is_an_error(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["eval", "run", "--data", "toy"])
     assert ended.value.code == 2
-    assert "'toy' is none of procedural, world-cameras, city, street, hills, argoverse2" in capsys.readouterr().err
+    assert (
+        "'toy' is none of procedural, world-cameras, city, street, hills, real-like, argoverse2"
+        in capsys.readouterr().err
+    )
 
 
 def test_tusimples_folder_is_checked(tmp_path, capsys):

@@ -6,12 +6,21 @@ import numpy as np
 import pytest
 
 from tests.shared import shared_path
-from tflane_jax.world.presets import CITY, STREET
+from tflane_jax.datasets.procedural import ProceduralDataset, WorldData
+from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quantities, pooled
+from tflane_jax.world.presets import CITY, REAL_LIKE, STREET
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.networks import build_road_network
 from tflane_jax.world.simulate import WorldConfig, simulate
 
 JUNCTIONS = {SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS, SceneKind.ROUNDABOUT}
+
+# World, frames of history, and what `sums` gave when experiments on it were published.
+AS_PUBLISHED = [
+    (WorldConfig(), 20, (34060, 2914363.51110603, 3218.4698181625568, 571, 81, 122783.36206247966, 1524)),
+    (CITY, 100, (48618, 6014682.7110637305, 3300.551992889188, 575, 81, 952866.7843320188, 7504)),
+    (STREET, 100, (39571, 4988604.099999456, 3289.007818738347, 471, 28, 58270.826282535454, 1111)),
+]
 
 BOXES = ((50.0, 25.0), (30.0, 15.0))
 
@@ -22,6 +31,74 @@ def networks(roads, count):
 
 def test_city_has_the_kinds_of_the_default_world():
     assert CITY.roads.kinds == RoadConfig().kinds
+
+
+def sums(world, history):
+    """Numbers of which a change of the world changes at least one: of twelve networks, and of one scene."""
+    found = networks(world.roads, 12)
+    lines = [
+        line
+        for net in found
+        for line in (
+            *(edge for s in net.map.segments.values() for edge in (s.left, s.right)),
+            *net.map.road_boundaries,
+            *net.map.crossings,
+            *net.map.roads,
+            net.map.buildings,
+            net.parking,
+        )
+    ]
+    log = simulate(5, world, history)
+    return (
+        sum(map(len, lines)),
+        sum(float(np.abs(line).sum()) for line in lines),
+        sum(sum(net.speed_limit.values()) for net in found),
+        sum(len(s.successors) + int(s.left_type) for net in found for s in net.map.segments.values()),
+        sum(len(others) for net in found for others in net.yield_to.values()),
+        float(np.abs(log.actors.position).sum()),
+        int(log.tracks.valid.sum()),
+    )
+
+
+@pytest.mark.parametrize(("world", "history", "expected"), AS_PUBLISHED)
+def test_worlds_of_published_experiments_are_as_they_were(world, history, expected):
+    """Settings that other worlds have must not change a draw of these. Sines may differ in their last bits."""
+    assert sums(world, history) == pytest.approx(expected, rel=1e-7)
+
+
+def test_real_like_roads_are_all_but_junctions_with_many_connectors():
+    found = networks(REAL_LIKE.roads, 60)
+    kinds = [network.kind for network in found]
+    assert {kind for kind, _ in REAL_LIKE.roads.kinds} >= set(kinds)
+    assert {SceneKind.FIVE_LEGS, SceneKind.STAGGERED} <= set(kinds)
+    assert np.mean([kind is SceneKind.ROAD for kind in kinds]) < 0.1
+    connectors, usual = (
+        np.mean([sum(s.is_intersection for s in network.map.segments.values()) for network in some])
+        for some in (found, networks(CITY.roads, 60))
+    )
+    assert connectors > 1.7 * usual
+
+
+# Means over 100 key frames of nine recorded logs (docs/real_roads.md).
+RECORDED = {
+    "lanes": 21.6,
+    "connectors": 11.8,
+    "metres of lane": 604,
+    "topology links": 19.7,
+    "length, m": 27.9,
+    "turn, degrees": 27.7,
+    "visible share": 0.615,
+}
+
+
+@pytest.mark.slow
+def test_frames_of_real_like_hold_as_much_as_recorded_ones():
+    data = WorldData.real_like(train=40).source("train")
+    dataset = ProceduralDataset(replace(data, world=replace(data.world, keyframes=2)))
+    examples = [dataset.example(i) for i in range(len(dataset))]
+    found = pooled([frame_quantities(e) | lane_quantities(e) for e in examples])
+    for quantity, recorded in RECORDED.items():
+        assert np.mean(found[quantity]) == pytest.approx(recorded, rel=0.2), quantity
 
 
 def test_street_has_no_junction_but_small_t_junctions():

@@ -10,8 +10,8 @@ from scipy.spatial import KDTree
 
 from tests.world.crossroads import REACH, STOP, crossroads
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.presets import CITY, STREET
-from tflane_jax.world.roads.networks import RoadConfig, build_road_network
+from tflane_jax.world.presets import CITY, REAL_LIKE, STREET
+from tflane_jax.world.roads.networks import RoadConfig, SceneKind, build_road_network
 from tflane_jax.world.traffic.lane_table import build_lane_table
 from tflane_jax.world.traffic.pedestrians import walk_sidewalks
 from tflane_jax.world.traffic.signals import Signals, draw_signals
@@ -22,9 +22,13 @@ EMPTY = TrafficConfig(
     vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0
 )
 BUSY = replace(TrafficConfig(), vehicles_per_metre=0.05, range=1e3)
-PRESETS = {"city": CITY, "street": STREET}
+PRESETS = {"city": CITY, "street": STREET} | {
+    kind.value: replace(REAL_LIKE, roads=replace(REAL_LIKE.roads, kinds=((kind, 1.0),)))
+    for kind in (SceneKind.FIVE_LEGS, SceneKind.STAGGERED)
+}
 HAND_MADE = ["crossroads", "crossroads yield", "turn"]
 NETWORKS = [*HAND_MADE, 0, 4, 5, 9, ("city", 1), ("city", 4), ("street", 1), ("street", 2)]
+NETWORKS += [(SceneKind.FIVE_LEGS.value, 1), (SceneKind.STAGGERED.value, 2)]
 
 
 @functools.cache

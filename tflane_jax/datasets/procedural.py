@@ -24,7 +24,7 @@ from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.bev.sensor import BevSensorConfig
 from tflane_jax.world.cameras.ring import CameraRigConfig
-from tflane_jax.world.presets import CITY, HILLS, STREET
+from tflane_jax.world.presets import CITY, HILLS, REAL_LIKE, STREET
 from tflane_jax.world.simulate import HISTORY, WorldConfig, simulate
 
 # Scene ids of a split: [first, first + SCENES_PER_SPLIT).
@@ -198,11 +198,21 @@ class WorldData:
         """
         return cls(train, val, test, HILLS, HILLS_EXAMPLE)
 
+    @classmethod
+    def real_like(cls, train: int = 3000, val: int = 25, test: int = 300) -> WorldData:
+        """Return the preset `real-like`: as many lanes, connectors and road users in a frame as in recorded logs.
+
+        The host perceives the box of `city`; examples have room for more of everything.
+        """
+        return cls(train, val, test, REAL_LIKE, REAL_LIKE_EXAMPLE)
+
 
 CITY_EXAMPLE = ExampleConfig(history_hz=2.0, tracks=192)
 """20 frames at 2 Hz, so 10 s."""
 HILLS_EXAMPLE = replace(CITY_EXAMPLE, range=replace(CITY_EXAMPLE.range, z=(-6.0, 6.0)))
 """The same sizes; heights against the vehicle's own, tilted plane."""
+REAL_LIKE_EXAMPLE = replace(CITY_EXAMPLE, lanes=64, segments=128, areas=48, tracks=224, elements=32)
+"""The range and history of `city`, with room for the most that was in a frame of nine recorded logs."""
 STREET_EXAMPLE = replace(
     CITY_EXAMPLE,
     range=PerceptionRange((-30.0, 30.0), (-15.0, 15.0)),
@@ -260,4 +270,7 @@ CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
 """The same world with a ring of cameras, under a name of its own for `tflane data show`."""
 CITY_SOURCE = replace(SOURCE, name="city", choose=lambda choice: WorldData.city(*_PRESET).source(choice.split))
 HILLS_SOURCE = replace(SOURCE, name="hills", choose=lambda choice: WorldData.hills(*_PRESET).source(choice.split))
+REAL_LIKE_SOURCE = replace(
+    SOURCE, name="real-like", choose=lambda choice: WorldData.real_like(*_PRESET).source(choice.split)
+)
 STREET_SOURCE = replace(SOURCE, name="street", choose=lambda choice: WorldData.street(*_PRESET).source(choice.split))

@@ -14,13 +14,13 @@ from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.overlap import frame_drives
-from tflane_jax.datasets.procedural import CITY_EXAMPLE
+from tflane_jax.datasets.procedural import REAL_LIKE_EXAMPLE
 from tflane_jax.datasets.road_maps import chosen_maps
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 
-RECORDED_EXAMPLE = replace(CITY_EXAMPLE, lanes=64, segments=128, areas=48, tracks=224, elements=32)
+RECORDED_EXAMPLE = REAL_LIKE_EXAMPLE
 """The range and history of the preset `city`, with room for the most that was in a frame of nine logs."""
 
 

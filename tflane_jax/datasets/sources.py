@@ -28,6 +28,7 @@ SOURCES: tuple[DataSource[Any], ...] = (
     procedural.CITY_SOURCE,
     procedural.STREET_SOURCE,
     procedural.HILLS_SOURCE,
+    procedural.REAL_LIKE_SOURCE,
     argoverse2.SOURCE,
     openlane_v2.SOURCE,
     nuscenes.SOURCE,

@@ -1,4 +1,5 @@
-"""Fixed worlds: `CITY` and `STREET`, on which models are compared; `HILLS`; `REAL_MAPS`, for recorded maps.
+"""Fixed worlds: `CITY` and `STREET`, on which models are compared; `HILLS`; `REAL_LIKE`, close to recorded logs;
+`REAL_MAPS`, for recorded maps.
 
 All hold enough of a drive for a history of 10 s (20 frames at 2 Hz) before every key frame, and traffic as dense and
 as mixed as in real logs (docs/world.md compares them). They differ in their roads. `WorldData.city` and
@@ -61,6 +62,43 @@ STREET = replace(
 
 HILLS = replace(CITY, terrain=TerrainConfig())
 """`CITY` on hilly ground: the same roads and traffic, scene by scene, with heights."""
+
+REAL_LIKE = replace(
+    CITY,
+    roads=replace(
+        CITY.roads,
+        kinds=(
+            (SceneKind.ROAD, 0.02),
+            (SceneKind.T_JUNCTION, 0.03),
+            (SceneKind.FOUR_WAY, 0.4),
+            (SceneKind.TWO_JUNCTIONS, 0.27),
+            (SceneKind.FIVE_LEGS, 0.13),
+            (SceneKind.STAGGERED, 0.15),
+        ),
+        corner_radius=(3.5, 7.0),
+        junction_distance=(60.0, 70.0),
+        side_lean=3.0,
+        second_sides=0.6,
+        wide_turns=0.45,
+        driveways=2.0,
+        one_way=0.12,
+        median=0.5,
+        bike=0.25,
+        crossings=0.3,
+    ),
+    traffic=replace(
+        CITY.traffic,
+        vehicles_per_metre=0.075,
+        pedestrians_per_metre=0.055,
+        crossers_per_minute=5.0,
+        # Examples are made up to 30 m from the junction, where the box still shows it.
+        ego_top_speed=8.0,
+    ),
+)
+"""Generated roads whose frames hold about as much as those of nine recorded logs: lanes, connectors, road users.
+
+Fitted by hand to the means of these logs (docs/real_roads.md), whose maps it does not contain.
+"""
 
 REAL_MAPS = replace(
     CITY,

@@ -6,7 +6,10 @@ import enum
 from dataclasses import dataclass
 from typing import Annotated
 
-from tflane_jax.limits import SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range
+from tflane_jax.limits import SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range, Rules
+
+CLOSEST_JUNCTIONS = 60.0
+"""Two four-way intersections take up nearly this much of the street between them, metres."""
 
 
 class SceneKind(enum.Enum):
@@ -21,6 +24,8 @@ class SceneKind(enum.Enum):
     FOUR_WAY = "four-way intersection"
     TWO_JUNCTIONS = "two junctions"
     ROUNDABOUT = "roundabout"
+    FIVE_LEGS = "five-leg intersection"
+    STAGGERED = "staggered junction"
 
 
 @dataclass(frozen=True)
@@ -52,11 +57,23 @@ class RoadConfig:
         pocket: length of a turning lane, taper included.
         skew: largest deviation of the arms of an intersection from the right angle.
         arm_offset: largest sideways shift of an arm from the intersection's centre.
-        junction_lanes: largest number of through lanes per direction of a T or four-way intersection's main road.
+        junction_distance: between the centres of two junctions.
+        side_lean: largest deviation of their side streets, and of those of staggered junctions, from the right angle;
+            they also bend by less than this. Much of it lets streets on one side meet, if the junctions are near.
+        stagger: between the two side streets of a staggered junction, along its main road; a little more where the
+            lanes between them would be too short.
+        junction_lanes: largest number of through lanes per direction of an intersection's main road, roundabouts and
+            two junctions aside.
+        least_junction_lanes: smallest number of them; two junctions included.
+        second_sides: probability for each of two junctions to be a four-way intersection, not a T junction.
+        wide_turns: probability for an intersection that a turn may end on every lane of the road that it enters; else
+            each lane that turns leads to one lane.
         one_way, median, bike, parking: probability for a street.
         mid_block_crossing: probability for a street without intersection.
         signals: probability for an intersection.
         crossings: probability for an arm of an intersection.
+        driveways: mean number on 100 m of kerb, where there is room for them.
+        driveway_width, driveway_depth: of a driveway; the depth is counted from the kerb.
         turn_restriction: probability that an arm must not turn left.
         sidewalk: distance of the walking line behind the kerb.
         building_setback: distance of buildings behind the kerb.
@@ -97,7 +114,13 @@ class RoadConfig:
     pocket: Range = (38.0, 46.0)
     skew: PositiveOrZero = 25.0
     arm_offset: PositiveOrZero = 2.0
+    junction_distance: Range = (65.0, 95.0)
+    side_lean: PositiveOrZero = 10.0
+    stagger: Range = (9.0, 60.0)
     junction_lanes: Count = 3
+    least_junction_lanes: Count = 1
+    second_sides: Fraction = 0.25
+    wide_turns: Fraction = 0.0
     one_way: Fraction = 0.2
     median: Fraction = 0.35
     bike: Fraction = 0.25
@@ -105,6 +128,20 @@ class RoadConfig:
     mid_block_crossing: Fraction = 0.3
     signals: Fraction = 0.6
     crossings: Fraction = 0.8
+    driveways: PositiveOrZero = 0.0
+    driveway_width: Range = (3.0, 6.0)
+    driveway_depth: Range = (8.5, 12.0)
     turn_restriction: Fraction = 0.12
     sidewalk: PositiveOrZero = 1.8
     building_setback: Range = (4.0, 10.0)
+
+    def limits(self) -> Rules:
+        """Junctions have room, and lanes a number."""
+        least, most = self.least_junction_lanes, self.junction_lanes
+        yield "least_junction_lanes", least <= most, f"at most junction_lanes ({most})"
+        near = self.junction_distance[0]
+        yield (
+            "junction_distance",
+            near >= CLOSEST_JUNCTIONS,
+            f"at least {CLOSEST_JUNCTIONS:g} m: intersections have room",
+        )

@@ -134,6 +134,7 @@ def blend(
     stop_heading: Float[np.ndarray, " c"],
     count: int,
     radius: Float[np.ndarray, " c"] | float = np.inf,
+    handle: Float[np.ndarray, " c"] | float = 0.4,
 ) -> tuple[Float[np.ndarray, "c count 2"], Float[np.ndarray, "c count"]]:
     """Return curves of `count` points that join poses smoothly, and their headings at these points.
 
@@ -145,6 +146,8 @@ def blend(
         stop, stop_heading: where they end.
         count: of points.
         radius: largest radius of the arc, metres; smaller ones stay nearer to the corner.
+        handle: length of the Bezier handles of an S, as a fraction of the distance between its ends; with longer ones
+            it leaves the straight line later and crosses over more steeply.
     """
     u, v, d = direction(start_heading), direction(stop_heading), stop - start
     turn = np.abs(wrap(stop_heading - start_heading))
@@ -161,7 +164,7 @@ def blend(
     lead, tail = np.where(meets, ahead - first, 0.0), np.where(meets, behind - second, 0.0)
     # Bezier handles of a circular arc are 4/3 tan(turn / 4) of its radius.
     arc = 4.0 / 3.0 * np.tan(turn / 4) / np.where(meets, np.tan(turn / 2), 1.0)
-    first, second = np.where(meets, arc * first, 0.4 * distance), np.where(meets, arc * second, 0.4 * distance)
+    first, second = np.where(meets, arc * first, handle * distance), np.where(meets, arc * second, handle * distance)
     a, b = start + lead[:, None] * u, stop - tail[:, None] * v
     p0, p1, p2, p3 = (p[:, None] for p in (a, a + first[:, None] * u, b - second[:, None] * v, b))
 

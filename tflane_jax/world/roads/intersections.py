@@ -83,6 +83,21 @@ def kerb_corners(
     return corners
 
 
+def radius_beyond(arm: Arm, following: Arm, normal: Float[np.ndarray, "2"], distance: float) -> float:
+    """Return the radius with which the rounded corner between two arms just stays beyond a line.
+
+    Args:
+        arm, following: neighbours in counter-clockwise order, both on the far side of the line.
+        normal: of the line, towards them.
+        distance: of the line from the origin of coordinates, metres.
+    """
+    half = 0.5 * _gap(arm, following)
+    corner = arm.kerb_corner(_kerbs_meet(arm, following)[0], -arm.left)
+    # The rounding ends this much farther out than the corner, for each metre of radius.
+    gained = (1.0 / np.sin(half) - 1.0) * float(direction(arm.heading + half) @ normal)
+    return (distance - float(corner @ normal)) / gained
+
+
 def crossing_ring(arm: Arm, distance: float) -> Float[np.ndarray, "5 2"]:
     """Return the closed ring of the pedestrian crossing in front of the arm's stop line: two kerb-to-kerb edges.
 

@@ -12,7 +12,7 @@ from tflane_jax.world.roads import intersections, roundabouts
 from tflane_jax.world.roads.config import RoadConfig
 from tflane_jax.world.roads.lane_network import LaneNetwork
 from tflane_jax.world.roads.layout_junctions import JunctionPlan, JunctionsPlan, seen_from_end
-from tflane_jax.world.roads.layouts import ArmPlan
+from tflane_jax.world.roads.layouts import ArmPlan, chance
 from tflane_jax.world.roads.movements import Approach, lay_connectors, plan_movements
 from tflane_jax.world.roads.right_of_way import phases, set_priorities
 from tflane_jax.world.roads.roundabouts import Ring
@@ -77,7 +77,7 @@ def lay_out_junctions(rng: np.random.Generator, plan: JunctionsPlan, network: La
             site.islands.append(ring.island())
         else:
             lines = intersections.kerb_corners([a.arm for a in around], distances[index], junction.corner_radius)
-            _lay_intersection(rng, index, junction, here, distances[index], network, site, config)
+            _lay_intersection(rng, index, junction, here, distances[index], lines, network, site, config)
         for k, mouth in enumerate(here):
             corners[id(mouth.incoming)] = lines[k], here[(k + 1) % len(here)].outgoing
         for arm, distance in zip(around, distances[index], strict=True):
@@ -152,13 +152,16 @@ def _lay_intersection(
     junction: JunctionPlan,
     mouths: Sequence[_Mouth],
     distances: Float[np.ndarray, " arms"],
+    corners: Sequence[Float[np.ndarray, "n 2"]],
     network: LaneNetwork,
     site: Site,
     config: RoadConfig,
 ) -> None:
     """Add the connectors of an intersection with their priorities, and its lights and signs."""
     approaches = [m.approach() for m in mouths]
-    movements = plan_movements(approaches)
+    # No draw without the setting, so that its scenes stay what they were.
+    wide = config.wide_turns > 0.0 and chance(rng, config.wide_turns)
+    movements = plan_movements(approaches, "any lane" if wide else "one lane each")
     ids = lay_connectors(
         movements,
         approaches,
@@ -166,6 +169,7 @@ def _lay_intersection(
         config.comfortable_lateral_acceleration,
         config.vertex_spacing,
         corner_radius=junction.corner_radius,
+        corners=corners if junction.nodes or len(mouths) > 4 else (),
     )
     # Traffic lights need at least two phases with incoming traffic.
     used = sorted({p for p, a in zip(phases(approaches), approaches, strict=True) if a.incoming})
@@ -173,7 +177,9 @@ def _lay_intersection(
     set_priorities(ids, movements, approaches, network, index, signalised)
     if signalised:
         green = int(rng.choice(used))
-        site.elements += traffic_lights(approaches, green, beyond=1.7 * float(distances.mean()))
+        # The corners of five legs reach farther into the intersection.
+        beyond = 1.35 if len(mouths) > 4 else 1.7
+        site.elements += traffic_lights(approaches, green, beyond=beyond * float(distances.mean()))
     site.elements += signs(approaches, movements, [m.arm.style.median > 0 for m in mouths])
 
 

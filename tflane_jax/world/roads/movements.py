@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -13,10 +14,14 @@ from tflane_jax.world.roads.curves import blend, right_of, wrap
 from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 
 LEFT, THROUGH, RIGHT = 1, 0, -1
+TurnsEnd = Literal["one lane each", "any lane"]
 # The exit with the smallest turn counts as straight on if it turns by less than this.
 STRAIGHT = np.deg2rad(50.0)
 # Between a turning lane and the kerb at the corner, metres.
 _KERB_CLEARANCE = 0.5
+# Radii tried for turns past an arm, metres, and handles for an S between side streets that lie apart.
+_RADII_PAST = tuple(np.geomspace(40.0, 5.0, 10).tolist())
+_HANDLES = (0.4, 0.5, 0.6, 0.7, 0.8)
 
 
 @dataclass(frozen=True)
@@ -59,14 +64,19 @@ class Movement:
     turn: int
 
 
-def plan_movements(approaches: Sequence[Approach]) -> list[Movement]:
-    """Assign exits to lanes; every reachable outgoing lane gets at least one connector."""
+def plan_movements(approaches: Sequence[Approach], turns_end: TurnsEnd = "one lane each") -> list[Movement]:
+    """Assign exits to lanes; every reachable outgoing lane gets at least one connector.
+
+    Args:
+        approaches: arms in counter-clockwise order.
+        turns_end: on one lane for each lane that turns, or on any lane that the others leave free.
+    """
     movements: list[Movement] = []
     for i, approach in enumerate(approaches):
         ways = _ways(approaches, i)
         lanes = [lane for lane in approach.incoming if lane.vehicle]
         if lanes and ways:
-            movements += _assign_lanes(i, lanes, ways, approaches)
+            movements += _assign_lanes(i, lanes, ways, approaches, turns_end)
         movements += _bike_movements(i, approaches, ways)
     reached = {m.sink.segment for m in movements}
     for j, approach in enumerate(approaches):
@@ -76,29 +86,28 @@ def plan_movements(approaches: Sequence[Approach]) -> list[Movement]:
     return movements
 
 
-def _ways(approaches: Sequence[Approach], arm: int) -> dict[int, int]:
-    """Return the arm to which each existing and allowed turn leads: LEFT, THROUGH or RIGHT -> arm."""
+def _ways(approaches: Sequence[Approach], arm: int) -> dict[int, list[int]]:
+    """Return the arms to which each existing and allowed turn leads: LEFT, THROUGH or RIGHT -> slight turns first.
+
+    Four arms or fewer have at most one on each side, five have two.
+    """
     inbound = approaches[arm].heading + np.pi
     turns = {
         j: float(wrap(other.heading - inbound))
         for j, other in enumerate(approaches)
         if j != arm and any(lane.vehicle for lane in other.outgoing)
     }
-    ways: dict[int, int] = {}
-    if turns:
-        straight = min(turns, key=lambda j: abs(turns[j]))
-        if abs(turns[straight]) < STRAIGHT:
-            ways[THROUGH] = straight
-        for j in sorted(turns, key=lambda j: abs(turns[j])):
-            if j != ways.get(THROUGH):
-                ways.setdefault(LEFT if turns[j] > 0 else RIGHT, j)
+    ways: dict[int, list[int]] = {}
+    for j in sorted(turns, key=lambda j: abs(turns[j])):
+        straight = not ways and abs(turns[j]) < STRAIGHT
+        ways.setdefault(THROUGH if straight else LEFT if turns[j] > 0 else RIGHT, []).append(j)
     if approaches[arm].no_left and len(ways) > 1:
         ways.pop(LEFT, None)
     return ways
 
 
 def _assign_lanes(
-    arm: int, lanes: list[LaneEnd], ways: dict[int, int], approaches: Sequence[Approach]
+    arm: int, lanes: list[LaneEnd], ways: dict[int, list[int]], approaches: Sequence[Approach], turns_end: TurnsEnd
 ) -> list[Movement]:
     """Return the movements of one arm: turning lanes only turn, outer lanes turn or go straight, others go straight."""
     general = [lane for lane in lanes if lane.pocket == 0 or _turn_of(lane) not in ways]
@@ -123,10 +132,14 @@ def _assign_lanes(
             right = general + right
     chosen = {LEFT: left, THROUGH: through, RIGHT: right}
     movements = []
-    for turn, target in ways.items():
+    for turn, target in ((turn, target) for turn, targets in ways.items() for target in targets):
         sinks = [lane for lane in approaches[target].outgoing if lane.vehicle]
-        for lane, sink in _pair(chosen[turn], sinks, turn):
-            movements.append(Movement(arm, target, lane, sink, turn))
+        pairs = _pair(chosen[turn], sinks, turn)
+        if turns_end == "any lane" and turn != THROUGH and pairs:
+            # The lanes beyond those that the pairs reach; the outermost turning lane leads to all of them.
+            k = len(pairs)
+            pairs += [(pairs[-1][0], sink) for sink in (sinks[k:] if turn == LEFT else sinks[: max(len(sinks) - k, 0)])]
+        movements += [Movement(arm, target, lane, sink, turn) for lane, sink in pairs]
     return movements
 
 
@@ -150,12 +163,13 @@ def _sideways(source: LaneEnd, sink: LaneEnd) -> float:
     return abs(float((sink.center - source.center) @ right_of(source.heading)))
 
 
-def _bike_movements(arm: int, approaches: Sequence[Approach], ways: dict[int, int]) -> list[Movement]:
+def _bike_movements(arm: int, approaches: Sequence[Approach], ways: dict[int, list[int]]) -> list[Movement]:
     sources = [lane for lane in approaches[arm].incoming if not lane.vehicle]
     if THROUGH not in ways:
         return []
-    sinks = [lane for lane in approaches[ways[THROUGH]].outgoing if not lane.vehicle]
-    return [Movement(arm, ways[THROUGH], a, b, THROUGH) for a, b in zip(sources, sinks, strict=False)]
+    (target,) = ways[THROUGH]
+    sinks = [lane for lane in approaches[target].outgoing if not lane.vehicle]
+    return [Movement(arm, target, a, b, THROUGH) for a, b in zip(sources, sinks, strict=False)]
 
 
 def _nearest_movement(movements: list[Movement], target: int, lane: LaneEnd) -> list[Movement]:
@@ -174,6 +188,7 @@ def lay_connectors(
     lateral_acceleration: float,
     spacing: float,
     corner_radius: float | None,
+    corners: Sequence[Float[np.ndarray, "_ 2"]] = (),
 ) -> list[int]:
     """Add a connector segment for each movement, tangent to both of its lanes, and return their ids.
 
@@ -184,6 +199,8 @@ def lay_connectors(
         lateral_acceleration: comfortable, m/s^2; limits the speed in curves.
         spacing: largest distance between vertices, metres.
         corner_radius: of the kerbs' roundings, which turns must not cut, metres; None without roundings.
+        corners: kerbs between the arms, given where a turn may lead past an arm, or straight on be an S, which must
+            not cut them either, metres.
     """
     if not movements:
         return []
@@ -197,7 +214,13 @@ def lay_connectors(
     if corner_radius is not None:
         turns = [k for k, m in enumerate(movements) if m.turn != THROUGH]
         radius[turns] = [_largest_radius(movements[k], approaches, corner_radius) for k in turns]
-    center, heading = blend(start, inbound, stop, onward, count, radius)
+    handle = np.full(len(movements), _HANDLES[0])
+    for k, m in enumerate(movements if corners else ()):
+        if m.turn == THROUGH:
+            handle[k] = _clearest(m, corners, [(np.inf, h) for h in _HANDLES])[1]
+        elif _passes_an_arm(m, len(approaches)):
+            radius[k] = _clearest(m, corners, [(r, _HANDLES[0]) for r in _RADII_PAST])[0]
+    center, heading = blend(start, inbound, stop, onward, count, radius, handle)
     share = np.linspace(0.0, 1.0, count)
     widths = np.array([[m.source.width, m.sink.width] for m in movements])
     half = 0.5 * (widths[:, :1] + (widths[:, 1:] - widths[:, :1]) * share)
@@ -240,6 +263,28 @@ def _largest_radius(m: Movement, approaches: Sequence[Approach], corner_radius: 
     # that their centres are (radius - corner_radius - to_kerb) / sin(half_gap) apart.
     slope = 1.0 / np.sin(half_gap)
     return float(((corner_radius + to_kerb) * slope - corner_radius - clear) / max(slope - 1.0, 1e-6))
+
+
+def _passes_an_arm(m: Movement, arms: int) -> bool:
+    """Return whether a turn leads beyond the next arm on its side; arms are in counter-clockwise order."""
+    return (m.target - m.arm) % arms != (1 if m.turn == RIGHT else arms - 1)
+
+
+def _clearest(
+    m: Movement, corners: Sequence[Float[np.ndarray, "_ 2"]], shapes: Sequence[tuple[float, float]]
+) -> tuple[float, float]:
+    """Return the first of some shapes (radius, handle) whose lane is clear of all kerbs, else the clearest."""
+    kerbs = np.concatenate(corners)
+    wanted = 0.5 * max(m.source.width, m.sink.width) + _KERB_CLEARANCE
+    ends = m.source.center[None], np.array([m.source.heading]), m.sink.center[None], np.array([m.sink.heading])
+    clear = []
+    for radius, handle in shapes:
+        line = blend(*ends, 40, radius, handle)[0][0]
+        # At both ends a lane may lie beside the gutter.
+        clear.append(float(np.linalg.norm(line[:, None] - kerbs[None], axis=-1)[4:-4].min()))
+        if clear[-1] > wanted:
+            break
+    return shapes[int(np.argmax(clear))]
 
 
 def _connector_speeds(

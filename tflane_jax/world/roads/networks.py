@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads import roadside
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.roads.driveways import draw_driveways, interrupted, parking_beside
 from tflane_jax.world.roads.intersections import crossing_walk
 from tflane_jax.world.roads.junction_networks import lay_out_junctions
 from tflane_jax.world.roads.lane_network import LaneNetwork
@@ -27,7 +28,14 @@ from tflane_jax.world.roads.through_roads import lay_out_road
 __all__ = ["EgoDrive", "RoadConfig", "RoadNetwork", "SceneKind", "build_road_network"]
 
 _SHORTEST_ROUTE = 120.0
-_JUNCTIONS = (SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS, SceneKind.ROUNDABOUT)
+_JUNCTIONS = (
+    SceneKind.T_JUNCTION,
+    SceneKind.FOUR_WAY,
+    SceneKind.TWO_JUNCTIONS,
+    SceneKind.ROUNDABOUT,
+    SceneKind.FIVE_LEGS,
+    SceneKind.STAGGERED,
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,7 @@ class RoadNetwork:
         signal_phase: connector -> (intersection index, phase index); absent where there are no signals.
         sidewalks: (n, 2) lines on which pedestrians walk, metres.
         walk_across: (2, 2) start and end of the walk over each pedestrian crossing, behind the kerbs.
-        parking: (P, 3) x, y, yaw of kerb-side slots for parked vehicles.
+        parking: (P, 3) x, y, yaw of places for parked vehicles: kerb-side slots and driveways.
         ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; its perception
             range (+-51.2 m x +-25.6 m) stays inside the map all along.
         kind: the central feature; None on a recorded map.
@@ -101,13 +109,15 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
     else:
         plan = None
         site = lay_out_road(plan_road(rng, kind, config), network, config)
+    if config.driveways and site.urban:
+        site.driveways = draw_driveways(rng, site, _stop_lines(network), config)
     density = rng.uniform(0.55, 0.95) if site.urban else rng.uniform(0.0, 0.3)
     boxes = roadside.buildings(rng, site, config.building_setback, density)
     return RoadNetwork(
         map=VectorMap(
             segments=network.segments(),
             crossings=_on_plane(site.crossings),
-            road_boundaries=_on_plane([*site.kerbs, *site.islands]),
+            road_boundaries=_on_plane([*interrupted(site.kerbs, site.driveways), *site.islands]),
             elements=tuple(site.elements),
             buildings=boxes,
             roads=_on_plane(road_lines(site.streets, plan)),
@@ -117,10 +127,16 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         signal_phase=dict(network.signal_phase),
         sidewalks=tuple(roadside.sidewalks(site.kerbs, config.sidewalk)) if site.urban else (),
         walk_across=tuple(crossing_walk(ring, config.sidewalk) for ring in site.crossings),
-        parking=roadside.parking_slots(site),
+        parking=parking_beside(roadside.parking_slots(site), site.driveways),
         ego_routes=network.routes(_SHORTEST_ROUTE),
         kind=kind,
     )
+
+
+def _stop_lines(network: LaneNetwork) -> Float[np.ndarray, "j 2"]:
+    """Return the middles of both ends of every connector."""
+    ends = [0.5 * (d.left[[0, -1]] + d.right[[0, -1]]) for d in network.drafts.values() if d.is_intersection]
+    return np.concatenate([np.zeros((0, 2)), *ends])
 
 
 def _on_plane(lines: Sequence[Float[np.ndarray, "n 2"]]) -> tuple[np.ndarray, ...]:

@@ -52,7 +52,7 @@ def _side_slots(side: Side, site: Site) -> Float[np.ndarray, "p 3"]:
 
 
 def buildings(rng: np.random.Generator, site: Site, setback: Range, density: float) -> Float[np.ndarray, "b 5"]:
-    """Return x, y, length, width and yaw of buildings along the kerbs, clear of every road.
+    """Return x, y, length, width and yaw of buildings along the kerbs, clear of every road and driveway.
 
     Args:
         rng: stream.
@@ -60,7 +60,9 @@ def buildings(rng: np.random.Generator, site: Site, setback: Range, density: flo
         setback: behind the kerb, metres.
         density: probability that a plot is built on.
     """
-    return buildings_along(rng, site.kerbs, [s.forward.line.xy[::2] for s in site.streets], setback, density)
+    used = [s.forward.line.xy[::2] for s in site.streets]
+    used += [points_at(one.edge, np.arange(0.0, arc_length(one.edge)[-1], 2.0)) for one in site.driveways]
+    return buildings_along(rng, site.kerbs, used, setback, density)
 
 
 def buildings_along(

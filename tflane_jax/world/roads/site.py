@@ -11,6 +11,24 @@ from tflane_jax.scene.logs import MapElement
 from tflane_jax.world.roads.streets import Street
 
 
+@dataclass(frozen=True)
+class Driveway:
+    """A short way from the road to a plot, across the kerb.
+
+    Attributes:
+        kerb: number of the kerb that it interrupts.
+        start, stop: distances along that kerb where its edge leaves and meets it, metres.
+        edge: (n, 2) its edge, from the kerb around its far end and back to the kerb, metres.
+        slot: x, y, yaw of the vehicle that stands in it.
+    """
+
+    kerb: int
+    start: float
+    stop: float
+    edge: Float[np.ndarray, "n 2"]
+    slot: Float[np.ndarray, "3"]
+
+
 @dataclass
 class Site:
     """Streets, kerbs, crossings and traffic elements produced by the layout so far.
@@ -21,6 +39,7 @@ class Site:
         islands: closed rings inside the drivable surface (medians, roundabout islands).
         crossings: closed rings of pedestrian crossings.
         elements: traffic lights and signs.
+        driveways: gaps in the kerbs that lead to a plot.
         urban: pedestrians walk behind the kerbs, and buildings are close to the road.
     """
 
@@ -29,4 +48,5 @@ class Site:
     islands: list[Float[np.ndarray, "n 2"]] = field(default_factory=list)
     crossings: list[Float[np.ndarray, "5 2"]] = field(default_factory=list)
     elements: list[MapElement] = field(default_factory=list)
+    driveways: list[Driveway] = field(default_factory=list)
     urban: bool = True

@@ -121,7 +121,7 @@ def _cuts(plan: SidePlan, length: float, ego: tuple[float, float], solid: float)
     cuts = sorted(fixed)
     lanes = plan.lanes + len(plan.extras)
     for movable in (*((solid,) if lanes > 1 else ()), *ego):
-        if min(abs(movable - c) for c in cuts) > _CLOSEST_CUTS:
+        if 0.0 < movable < length and min(abs(movable - c) for c in cuts) > _CLOSEST_CUTS:
             cuts.append(movable)
     return np.array(sorted(cuts))
 

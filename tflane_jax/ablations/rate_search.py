@@ -25,13 +25,14 @@ from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.training.records import read_records
 
 
-def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, quick: bool = False) -> Path:
+def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, cores: int | None = None, quick: bool = False) -> Path:
     """Train what is missing, and write and print the score of every rate; the same command resumes a search.
 
     Args:
         table: with a search.
         out: folder of all tables and their runs.
         jobs: trainings at a time.
+        cores: of each training; None for equal shares of all.
         quick: few updates on few data, below `<out>/quick`: a smoke test, no result.
 
     Returns:
@@ -40,11 +41,11 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, quick: bool = F
     Raises:
         UserError: the table has no search, or no rate of a row could be trained.
     """
-    plan = plan_search(table, out, jobs=jobs, quick=quick)
+    plan = plan_search(table, out, jobs=jobs, cores=cores, quick=quick)
     assert table.search is not None
     every = [job for by_rate in plan.values() for job in by_rate.values()]
     print(f"{table.name}: {len(every)} trainings for the learning rates of {len(plan)} rows", flush=True)
-    failures = train_all(every, jobs)
+    failures = train_all(every, jobs, cores)
     rows = rated(table.search, plan)
     folder = (out / "quick" if quick else out) / table.name
     title = (
@@ -58,14 +59,16 @@ def search_rates(table: PaperTable, out: Path, *, jobs: int = 1, quick: bool = F
     return path
 
 
-def plan_search(table: PaperTable, out: Path, *, jobs: int = 1, quick: bool = False) -> dict[str, dict[float, Job]]:
+def plan_search(
+    table: PaperTable, out: Path, *, jobs: int = 1, cores: int | None = None, quick: bool = False
+) -> dict[str, dict[float, Job]]:
     """Return the training of each row of the search and each rate.
 
     Raises UserError where one of them must fail. The arguments are those of `search_rates`.
     """
     if table.search is None:
         raise UserError(f"table {table.name} has no search for learning rates: leave --search out")
-    store, threads = (out / "quick" if quick else out) / "runs", worker_threads(jobs)
+    store, threads = (out / "quick" if quick else out) / "runs", worker_threads(jobs, cores)
     chosen = [row for row in table.rows if row.name in table.search.rows]
     plan: dict[str, dict[float, Job]] = {}
     for name, config in table.configs(chosen, quick=quick).items():

@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
         from tflane_jax.ablations.rate_search import search_rates
 
         for table in chosen:
-            search_rates(table, options.out, jobs=jobs, quick=options.quick)
+            search_rates(table, options.out, jobs=jobs, cores=options.cores, quick=options.quick)
         return 0
     from tflane_jax.ablations.reuse import find_archive
     from tflane_jax.ablations.table_plan import plan_table

@@ -108,12 +108,14 @@ def twice(case, axes, *, outputs=("output",), axis=0):
     )
 
 
+@pytest.mark.slow
 def test_a_batch_of_two_through_the_encoder():
     case = public("bevformer_encoder_2layer_noprev")
     axes = {"bev_query": 1, "feats": 2, "bev_pos": 1, "shift": 0, "lidar2img": 0, "can_bus": 0}
     test_bevformer_golden.check_encoder(twice(case, axes))
 
 
+@pytest.mark.slow
 def test_a_batch_of_two_through_the_constructer():
     case = public("bev_constructer_toponet_noprev")
     axes = dict.fromkeys(("feat0", "feat1", "lidar2img", "can_bus", "lidar2global_rotation"), 0)

@@ -142,7 +142,7 @@ def test_a_run_of_an_accelerator_is_no_run_of_a_cpu(tmp_path, monkeypatch):
     assert job.difference() == f"device: {gpu} there, None here"
     with pytest.raises(UserError, match=r"row: \S+ holds another run \(device: gpu: NVIDIA H100 x 1 there"):
         check_rows({"row": [job]})
-    monkeypatch.setattr(provenance, "_device", lambda: gpu)
+    monkeypatch.setattr(provenance, "_device", lambda devices: gpu)
     setting = provenance.thread_setting(1)
     assert setting == {"cores": 1, "device": gpu} | {
         name: setting[name] for name in setting.keys() - {"cores", "device"}

@@ -183,6 +183,7 @@ def test_dropout_follows_the_key(toponet):
     assert losses[0] == losses[1] != losses[2]
 
 
+@pytest.mark.slow
 def test_a_stream_equals_the_scan_over_its_sequence(toponet):
     task, params = toponet.task, toponet.params
     frames = [make_camera_example(s).replace(has_previous=np.asarray(s not in (0, 2))) for s in range(4)]

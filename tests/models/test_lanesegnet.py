@@ -147,6 +147,7 @@ def test_sizes_that_do_not_fit_are_named(change, message):
         replace(SEGMENTS, **change).build()
 
 
+@pytest.mark.slow
 def test_it_trains_with_proposals_and_denoising_and_all_their_parameters_learn():
     decoder = replace(SMALL_SEGMENTS.decoder, proposals=LaneProposalConfig(count=4, hidden=8))
     model = replace(SMALL_SEGMENTS, decoder=decoder, denoising=DenoisingConfig(copies=1))

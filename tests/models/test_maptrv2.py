@@ -66,6 +66,7 @@ def test_attention_runs_along_lines_and_among_lines_at_the_same_place():
     assert not apart[1:].any()
 
 
+@pytest.mark.slow
 def test_it_trains_and_all_its_parameters_learn(params):
     batch = stack_examples([make_line_example(), make_line_example(1, lanes=0, crossings=0)])
     run = jax.jit(jax.value_and_grad(TASK.loss, has_aux=True))

@@ -88,6 +88,7 @@ def _at(tree, path):
     return tree
 
 
+@pytest.mark.slow
 def test_training_reaches_the_parameters_of_a_new_prior():
     task = LaneGraphTask(replace(BASELINE, priors=WithToy(crossings=CrossingsConfig())))
     batch = jax.tree.map(jnp.asarray, stack_examples([with_crossings(make_example(i), 2, i) for i in range(2)]))

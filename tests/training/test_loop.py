@@ -300,7 +300,7 @@ def test_two_processes_never_share_a_folder(tmp_path):
         ({"steps": 0}, "steps"),
         ({"batch_size": 0}, "batch_size"),
         ({"accumulate": 0}, "accumulate"),
-        ({"batch_size": 4, "accumulate": 3}, "batch_size"),
+        ({"batch_size": 4, "accumulate": 3}, "accumulate"),
         ({"log_every": 0}, "log_every"),
         ({"seeds": ()}, "seeds"),
         ({"seeds": (1, 1)}, "seeds"),

@@ -67,14 +67,14 @@ def test_worlds_of_published_experiments_are_as_they_were(world, history, expect
 
 
 def test_real_like_roads_are_all_but_junctions_with_many_connectors():
-    found = networks(REAL_LIKE.roads, 60)
+    found = networks(REAL_LIKE.roads, 40)
     kinds = [network.kind for network in found]
     assert {kind for kind, _ in REAL_LIKE.roads.kinds} >= set(kinds)
     assert {SceneKind.FIVE_LEGS, SceneKind.STAGGERED} <= set(kinds)
     assert np.mean([kind is SceneKind.ROAD for kind in kinds]) < 0.1
     connectors, usual = (
         np.mean([sum(s.is_intersection for s in network.map.segments.values()) for network in some])
-        for some in (found, networks(CITY.roads, 60))
+        for some in (found, networks(CITY.roads, 40))
     )
     assert connectors > 1.7 * usual
 

@@ -92,7 +92,7 @@ def _on_lanesegnet(
         quoted=quoted,
         seeds=5,
         steps=2000,
-        minutes=8.0,
+        minutes=10.0,
     )
 
 
@@ -114,7 +114,7 @@ TABLES = (
         _SEGMENTS,
         "all/mAP",
         steps=2000,
-        minutes=8.0,
+        minutes=10.0,
         quoted=_quoted(
             _LANESEGNET,
             _SEGMENT_COLUMNS,

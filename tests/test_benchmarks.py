@@ -18,7 +18,7 @@ from tests.models.cases import CAMERA_TOPONET, make_camera_example
 from tests.models.test_marker_fusion import CONFIG as MARKERS
 from tests.parameters import random_params
 from tests.shared import ROOT
-from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config import WorldData, apply_overrides, load_config
 from tflane_jax.config_io import to_text
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.procedural import ProceduralConfig
@@ -28,6 +28,7 @@ from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.markers.square_pose import solve_square
 from tflane_jax.models.parameters import split_statistics
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.run_checks import check_run
 from tflane_jax.runs import check_origin
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -215,13 +216,15 @@ def test_table_is_aligned():
 
 @pytest.mark.parametrize("name", paper_sizes.CONFIGS)
 def test_a_paper_size_is_trained_briefly_on_data_that_are_there(name, tmp_path):
-    config = load_config(name)
+    config = paper_sizes.measurable(name)
     short = apply_overrides(config, paper_sizes.settings(config, tmp_path))
     assert (short.training.steps, short.training.batch_size) == (paper_sizes.UPDATES, 1)
     make_optimizer(short.optim, short.training.steps)  # raises where the schedule does not fit
     check_origin(short)  # raises where layers would be frozen at random
     unfrozen = apply_overrides(config, ["--task.model.encoder.images.frozen_stages", "0"])
     assert short.task == unfrozen.task
+    if isinstance(short.data, WorldData):  # the others' folders are not there
+        check_run(short)
 
 
 def test_loading_is_compared_with_the_update_for_each_example(monkeypatch):

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.marker_scene_pictures import Cell, Gap, Sighting, save_confidence, save_gaps, sighting
 from benchmarks.timing import machine, markdown_table, save
 from tflane_jax.config import RunConfig, WorldData, load_config
 from tflane_jax.datasets.marker_cache import search_views
@@ -44,18 +45,17 @@ from tflane_jax.models.marker_fusion import MarkerPrior
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.runs import open_run, train_run
-from tflane_jax.scene import CameraViews, Example, MarkerObservations, Prediction, stack_examples
+from tflane_jax.scene import CameraViews, Example, MarkerObservations, Prediction
 from tflane_jax.scene.logs import KeyFrame, Log
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model
+from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.runtime import configure_jax
 from tflane_jax.world.cameras.sensor import render_cameras
 
 CONFIG = "markers/camera_clips:pixels"
 WITH, WITHHELD, WITHOUT = "markers", "boards withheld", "model without markers"
 SCORES = ("recall", "DET_l", "TOP_ll")
-# Frames in the picture, from scenes of their own.
-_SHOWN = 4
 
 
 class Frame(NamedTuple):
@@ -74,17 +74,6 @@ class Frame(NamedTuple):
     views: CameraViews
     truth: Example
     store: MarkerStore
-
-
-@dataclass
-class _Gap:
-    """A frame without a board in sight whose lanes come from memory, with the predictions of each row."""
-
-    gate: float
-    scene: int
-    title: str
-    truth: Example
-    found: dict[str, Prediction]
 
 
 def frames(source: ProceduralConfig, pixels: PixelConfig) -> Iterator[Frame]:
@@ -173,7 +162,7 @@ def _check(step: DriveStep, example: Example, guidance: MarkerGuidance, answer: 
 def measure(
     source: ProceduralConfig, model: DriveModel, other: DriveModel | None, out: Path
 ) -> tuple[dict[str, dict[str, dict[str, float]]], dict[str, int]]:
-    """Drive through the scenes, draw a picture, and return scores by row and group, and the frames of each group."""
+    """Drive through the scenes, draw pictures, and return scores by row and group, and the frames of each group."""
     markers = source.example.markers
     if markers is None or model.task.model.priors.markers is None or source.example.cameras is None:
         raise UserError(f"this model reads no markers in images: take a run of {CONFIG}")
@@ -184,7 +173,10 @@ def measure(
     if other is not None:
         streams[WITHOUT] = Stream(other, jax.jit(other.task.step))
     metrics = {name: LaneGraphMetrics(frame_groups=Sightings.groups) for name in streams}
-    sightings, count, shown, scene = Sightings(), dict.fromkeys(Sightings.groups, 0), [], 0
+    sightings, count, scene = Sightings(), dict.fromkeys(Sightings.groups, 0), 0
+    gaps: list[Gap] = []
+    cells: list[Cell] = []
+    latest: Sighting | None = None
     nothing = MarkerObservations.empty(config.markers, config.lanes, config.points)
     total = source.scenes * source.world.keyframes
     for frame in tqdm(frames(source, pixels), desc="drive", unit="frame", total=total):
@@ -195,6 +187,7 @@ def measure(
             for each in (parts, *streams.values()):
                 each.restart()
             drive.restart(reader)
+            latest = None
         scene, moment = frame.scene, frame.moment
         searched = search_views(frame.views, config.detector)
         step = drive.step(frame.views, moment.timestamp_ns, moment.global_from_ego, searched)
@@ -206,31 +199,15 @@ def measure(
         count[group] += 1
         for name, metric in metrics.items():
             metric.update(found[name], frame.truth, [group])
-        if group == "gap" and guidance.valid.any():
-            gate = float(guidance.gate)
-            title = f"scene {scene} at {moment.timestamp_ns / 1e9:.1f} s, confidence in memory {gate:.2f}"
-            shown.append(_Gap(gate, scene, title, frame.truth, found))
-    _draw(shown, source, out / "marker_scenes.png")
+        latest = sighting(frame.views, moment, step) or latest
+        cells.append(Cell(scene, group, float(guidance.gate)))
+        if group == "gap" and guidance.valid.any() and latest is not None:
+            gaps.append(Gap(scene, moment, latest, frame.truth, guidance, found))
+    assert drive is not None
+    print("\nwritten to", save_confidence(out / "marker_scenes_confidence.png", cells, drive.interval))
+    picture = save_gaps(out / "marker_scenes_gaps.png", gaps, source)
+    print("no picture of gaps: no board was seen and then lost" if picture is None else f"written to {picture}")
     return {name: metric.compute() for name, metric in metrics.items()}, count
-
-
-def _draw(shown: list[_Gap], source: ProceduralConfig, path: Path) -> None:
-    """Draw the gap of each scene in which memory is trusted most, whichever model is better there."""
-    from tflane_jax.plots import save_examples
-
-    best = {each.scene: each for each in sorted(shown, key=lambda each: each.gate)}
-    chosen = sorted(best.values(), key=lambda each: -each.gate)[:_SHOWN]
-    if not chosen:
-        print("no picture: in these scenes no board was seen and then lost")
-        return
-    found = {
-        name: jax.tree.map(lambda *leaves: np.stack(leaves), *(each.found[name].centerlines for each in chosen))
-        for name in chosen[0].found
-    }
-    examples = stack_examples([each.truth for each in chosen])
-    titles = [each.title for each in chosen]
-    example = source.example
-    print("written to", save_examples(path, examples, found, titles=titles, ground=example.ground, view=example.range))
 
 
 def tiny_config() -> RunConfig:
@@ -268,8 +245,9 @@ def run(out: Path, folder: Path | None, without: Path | None = None, scenes: int
     """Print and write the table and the picture of a run, of a tiny training without one; return the record."""
     if folder is None:
         folder = out / "tiny"
-        if not folder.exists():
-            train_run(tiny_config(), folder, progress=False)
+        # One that was stopped begins again.
+        if not Checkpoints(folder / "checkpoints").steps():
+            train_run(tiny_config(), folder, start="overwrite" if folder.exists() else "new", progress=False)
     model = opened(folder, scenes)
     scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out)
     groups = {"all": sum(count.values())} | count

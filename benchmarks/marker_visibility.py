@@ -1,9 +1,13 @@
 """Which boards a vehicle sees, by how they are placed and by what hides them.
 
     python -m benchmarks.marker_visibility --scenes 40
+    python -m benchmarks.marker_visibility --scenes 40 --at-once     # boards of a frame, in the configurations
 
 Scenes of the test split with boards on both sides of junctions, eight key frames half a second apart, no noise. "field
 of view" is the simulation that knows neither the upper edge of an image nor masts, signs, lamp posts and trees.
+
+--at-once counts the boards that are detected in one frame with noise, and their lanes in the perception range: what the
+capacities `MarkerConfig.markers` and `MarkerPriorConfig.lanes` cut off.
 """
 
 from __future__ import annotations
@@ -16,9 +20,13 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.timing import markdown_table
-from tflane_jax.datasets.procedural import FIRST_SCENE
+from tflane_jax.config import WorldData, load_config
+from tflane_jax.datasets.marker_observations import markers_of, store_of_log
+from tflane_jax.datasets.procedural import FIRST_SCENE, ProceduralConfig, ProceduralDataset
+from tflane_jax.markers.observe import observe
 from tflane_jax.markers.simulation import PERFECT, simulate_detections
 from tflane_jax.scene.logs import KeyFrame, Log
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, NUSCENES_RING
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.simulate import WorldConfig, simulate
@@ -28,6 +36,18 @@ SIMULATIONS = {
     "Argoverse 2": replace(PERFECT, cameras=ARGOVERSE2_RING, occlusion="bodies"),
     "nuScenes": replace(PERFECT, cameras=NUSCENES_RING, occlusion="bodies"),
 }
+# Whose boards are counted, and more boards and lanes than a frame has.
+CONFIGS = ("markers/toponet_markers", "markers/camera_clips")
+_MOST, _LANES = 8, 64
+_AT_ONCE = (
+    *("configuration", "frames", "0 boards", "1", "2", "3 or more", "most"),
+    *(
+        "lanes of the nearest two, median",
+        "more than the prior takes",
+        "the same, with 3 or more boards",
+        "only the third is right",
+    ),
+)
 _BANDS = ((0.0, 8.0), (8.0, 25.0), (25.0, 60.0))
 
 
@@ -55,11 +75,49 @@ def measure(site: Literal["junction", "clear"], scenes: int) -> list[list[str]]:
     return [[site, name, f"{seeing[name] / frames:.1%}", *map(str, boards[name].tolist())] for name in SIMULATIONS]
 
 
+def at_once(name: str, scenes: int) -> list[str]:
+    """Return a row of the second table: boards and lanes of the frames of a configuration's test split."""
+    config = load_config(name)
+    assert isinstance(config.data, WorldData)
+    assert isinstance(config.task, LaneGraphTask)
+    source = config.data.source("test")
+    assert isinstance(source, ProceduralConfig)
+    markers, prior = source.example.markers, config.task.model.priors.markers
+    assert markers is not None
+    assert prior is not None
+    boards, lanes, third = [], [], 0
+    for log in ProceduralDataset(replace(source, scenes=scenes)).drives():
+        store = store_of_log(log, radius=markers.radius, bike_lanes=source.example.bike_lanes == "include")
+        for moment in log.keyframes:
+            found = simulate_detections(log, moment, markers_of(log), markers.simulation)
+            seen = observe(found, store, source.example.range, markers=_MOST, lanes=_LANES, points=2).markers
+            each = seen.lane_valid.sum(-1)
+            boards.append(int(found.valid.sum()))
+            lanes.append(int(each[: markers.markers].sum()))
+            # The nearest ones have jumped, a farther one has not.
+            order = np.argsort(np.hypot(*found.pose[found.valid][:, :2, 3].T), kind="stable")
+            jumped = found.jump[found.valid][order]
+            third += bool(jumped[: markers.markers].all() and not jumped[markers.markers :].all())
+    count, more = np.array(boards), np.array(boards) > markers.markers
+    shares = [f"{(count == k).mean():.1%}" for k in range(3)] + [f"{(count >= 3).mean():.1%}", str(count.max())]
+    with_lanes = np.array(lanes)[count > 0]
+    full = (np.array(lanes)[more] >= prior.prior.lanes).mean() if more.any() else np.nan
+    return [
+        *(name, str(len(boards)), *shares, f"{np.median(with_lanes):.0f}"),
+        *(f"{(with_lanes > prior.prior.lanes).mean():.1%}", f"{full:.1%}", str(third)),
+    ]
+
+
 def main() -> None:
     """Parse the command line, measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=40)
-    scenes = parser.parse_args().scenes
+    parser.add_argument("--at-once", action="store_true", help="count the boards of a frame instead")
+    options = parser.parse_args()
+    scenes: int = options.scenes
+    if options.at_once:
+        print(markdown_table(_AT_ONCE, [at_once(name, scenes) for name in CONFIGS]))
+        return
     bands = [f"boards at {low:g} to {high:g} m" for low, high in _BANDS]
     rows = measure("junction", scenes) + measure("clear", scenes)
     print(markdown_table(["site", "visible", "frames that see one", *bands], rows))

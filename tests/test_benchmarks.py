@@ -11,7 +11,16 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import collectives, loading, lstr_layers, marker_occlusion, marker_scenes, metrics, paper_sizes
+from benchmarks import (
+    collectives,
+    loading,
+    lstr_layers,
+    marker_composites,
+    marker_occlusion,
+    marker_scenes,
+    metrics,
+    paper_sizes,
+)
 from benchmarks.gpu import matching, steps
 from benchmarks.timing import compile_jax, interleave, markdown_table, summarise
 from tests.models.cases import CAMERA_TOPONET, make_camera_example
@@ -89,18 +98,44 @@ def test_frames_of_the_metrics_hold_hits_and_misses(tmp_path):
 @pytest.mark.parametrize("damage", ["none", "bar 10 %"])
 def test_composites_show_the_board_where_they_say(damage, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("TFLANE_SHARED", str(tmp_path))
-    photo = marker_occlusion.photographs()[0]
+    photo = marker_composites.photographs()[0]
     assert "invented pictures" in capsys.readouterr().out
-    drawn = [marker_occlusion.composite(photo, 10.0, damage, np.random.default_rng(seed)) for seed in range(2)]
+    drawn = [marker_composites.composite(photo, 10.0, damage, np.random.default_rng(seed)) for seed in range(2)]
     for each in drawn:
         found = marker_occlusion.search(each.image, "OpenCV")
         if damage == "none":
             assert found.marker_id.tolist() == [each.marker_id]
             assert np.abs(found.corners[0] - each.outline).max() < 1.0
-            fit = solve_square(found.corners[0], each.camera, marker_occlusion.CAMERA)
+            fit = solve_square(found.corners[0], each.camera, marker_composites.CAMERA)
             assert abs(fit.camera_from_marker[0, 2, 3] - 10.0) < 0.4
         else:
             assert not len(found.marker_id)
+
+
+def test_a_whole_composite_is_the_photograph_around_its_part():
+    photo = np.random.default_rng(0).integers(0, 255, (900, 1600, 3), np.uint8)
+    whole, part = (
+        marker_composites.composite(photo, 20.0, "corner", np.random.default_rng(1), shown, 5)
+        for shown in ("whole", "part")
+    )
+    assert whole.image.shape == photo.shape
+    assert whole.ids == part.ids
+    assert len(whole.ids) == 5
+    assert whole.marker_id in whole.ids
+    x, y = np.round(whole.outline[0] - part.outline[0]).astype(int)
+    height, width = part.image.shape[:2]
+    np.testing.assert_array_equal(whole.image[y : y + height, x : x + width], part.image)
+    np.testing.assert_allclose(whole.camera[:2, 2] - part.camera[:2, 2], (x, y))
+    # Away from the board the photograph is untouched.
+    assert (whole.image != photo).any(-1).mean() < 0.02
+
+
+def test_a_sample_of_composites_has_every_damage():
+    every = [(photo, 10.0, kind, 0) for photo in range(3) for kind in range(len(marker_composites.DAMAGE))]
+    some = marker_composites.spread(every, 12)
+    assert len(set(some)) == 12
+    kinds = [kind for _, _, kind, _ in some]
+    assert {kinds.count(kind) for kind in range(len(marker_composites.DAMAGE))} == {1, 2}
 
 
 def test_a_drive_that_is_not_its_parts_is_noticed():

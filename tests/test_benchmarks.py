@@ -166,7 +166,7 @@ def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monk
         example=ExampleConfig(range=model.range, sensor=None, cameras=rig, markers=markers),
     )
     drive = DriveModel(task, random_params(task.init, make_camera_example()), source)
-    scores, frames = marker_scenes.measure(source, drive, drive, tmp_path)
+    scores, frames = marker_scenes.measure(source, drive, drive, tmp_path, marker_scenes.Clock())
     assert sum(frames.values()) == 6
     assert list(scores) == [marker_scenes.WITH, marker_scenes.WITHHELD, marker_scenes.WITHOUT]
     assert scores[marker_scenes.WITHHELD] == scores[marker_scenes.WITHOUT]

@@ -25,6 +25,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 from benchmarks.marker_composites import (
     CAMERA,
@@ -70,7 +71,7 @@ def run(out: Path, selection: Selection, most: int, only: Sequence[str] = DETECT
         for detector in only:
             false[detector] += len(search(photo, detector, known).marker_id)
     count = 0
-    for each in composites(photos, selection):
+    for each in tqdm(composites(photos, selection), desc="composites", unit="image"):
         count += 1
         for detector in only:
             start = time.process_time()

@@ -161,7 +161,7 @@ def _entries() -> list[Any]:
 
 
 def save_confidence(path: Path, cells: Sequence[Cell], interval: float) -> Path:
-    """Draw a table of scenes by frames: the colour is c of Eq. (3), the letter the group.
+    """Draw a table of scenes by frames: c of Eq. (3), in a colour for each group, the darker the more trusted.
 
     Args:
         path: of the picture.
@@ -170,9 +170,8 @@ def save_confidence(path: Path, cells: Sequence[Cell], interval: float) -> Path:
     """
     scenes = sorted({each.scene for each in cells})
     frames = max(sum(each.scene == scene for each in cells) for scene in scenes)
-    figure, axes = new_figure(panel=(0.62 * frames + 1.6, 0.3 * len(scenes) + 1.0))
+    figure, axes = new_figure(panel=(0.62 * frames + 1.6, 0.3 * len(scenes) + 0.8), footer=0.3)
     ax = axes[0, 0]
-    ax.set_facecolor("white")
     for row, scene in enumerate(scenes):
         for column, each in enumerate(cell for cell in cells if cell.scene == scene):
             _draw_cell(ax, column, row, each)
@@ -182,7 +181,12 @@ def save_confidence(path: Path, cells: Sequence[Cell], interval: float) -> Path:
     ax.tick_params(length=0, labelsize=7)
     ax.set_xlabel("time in the scene, s", fontsize=8)
     ax.set_ylabel("scene", fontsize=8)
-    ax.set_title("confidence c by frame: s a board is seen, g gap, empty: none so far", fontsize=8, loc="left")
+    ax.set_title("confidence c of the lanes that enter the model, Eq. (3)", fontsize=8, loc="left")
+    from matplotlib.patches import Patch
+
+    names = {"seen": "a board is read", "gap": "gap: from memory", "before": "no board so far"}
+    entries = [Patch(facecolor=_shade(Cell(0, group, 0.8)), label=name) for group, name in names.items()]
+    figure.legend(handles=entries, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
     return save_figure(figure, path)
 
 
@@ -192,15 +196,14 @@ def _draw_cell(ax: Any, column: int, row: int, cell: Cell) -> None:
     shade = _shade(cell)
     ax.add_patch(Rectangle((column - 0.48, row - 0.46), 0.96, 0.92, facecolor=shade, lw=0))
     if cell.group != "before":
-        text = f"{cell.group[0]} {cell.gate:.2f}"
         dark = float(np.mean(shade)) < 0.5
-        ax.text(column, row, text, ha="center", va="center", fontsize=6.5, color="white" if dark else ROAD)
+        ax.text(column, row, f"{cell.gate:.2f}", ha="center", va="center", fontsize=7, color="white" if dark else ROAD)
 
 
 def _shade(cell: Cell) -> Float[np.ndarray, "3"]:
     """Return white for no board so far; green for boards in sight, orange for gaps, the darker the more trusted."""
     if cell.group == "before":
-        return np.array([0.94, 0.94, 0.94])
+        return np.array([0.86, 0.86, 0.86])
     full = np.array([0.10, 0.55, 0.24]) if cell.group == "seen" else np.array([0.85, 0.45, 0.05])
     light = np.array([0.97, 0.97, 0.97])
     return light + min(max(cell.gate, 0.0), 1.0) * (full - light)

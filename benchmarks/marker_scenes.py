@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -289,19 +289,24 @@ def run(out: Path, folder: Path | None, without: Path | None = None, scenes: int
     model = tiny(scenes) if folder is None else opened(folder, scenes)
     clock = Clock()
     scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out, clock)
-    groups = {"all": sum(count.values())} | count
-    header = ["model", *(f"{score}, {group} ({n})" for group, n in groups.items() for score in SCORES)]
-    rows = [
-        [name, *(f"{100 * of_model[group][score]:.1f}" for group in groups for score in SCORES)]
-        for name, of_model in scores.items()
-    ]
-    table = markdown_table(header, rows)
+    table = scores_table(scores, count)
     print(f"\n{scenes} scenes; every frame equals the composition of its parts\n\n{table}")
     print(f"\n{clock}")
     record = {"machine": machine(), "model": None if folder is None else str(folder), "scenes": scenes}
     record |= {"frames": count, "scores": scores, "cpu_seconds": clock.frames}
     save(out, "marker_scenes", record, f"{table}\n\n{clock}")
     return record
+
+
+def scores_table(scores: Mapping[str, Mapping[str, Mapping[str, float]]], count: Mapping[str, int]) -> str:
+    """Return a row for each group of frames and model, in percent; groups without frames are left out."""
+    groups = {"all": sum(count.values())} | {group: n for group, n in count.items() if n}
+    rows = [
+        [group, str(n), name, *(f"{100 * of_model[group][score]:.1f}" for score in SCORES)]
+        for group, n in groups.items()
+        for name, of_model in scores.items()
+    ]
+    return markdown_table(["frames", "number", "model", *SCORES], rows)
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from benchmarks import (
     lstr_layers,
     marker_composites,
     marker_occlusion,
+    marker_scene_pictures,
     marker_scenes,
     metrics,
     paper_sizes,
@@ -31,6 +32,7 @@ from tflane_jax.config import apply_overrides, load_config
 from tflane_jax.config_io import to_text
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.markers.detection import DetectedMarkers
 from tflane_jax.markers.image_search import DetectorConfig
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.simulation import MarkerConfig
@@ -38,7 +40,7 @@ from tflane_jax.markers.square_pose import solve_square
 from tflane_jax.models.parameters import split_statistics
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.runs import check_origin
-from tflane_jax.scene import MarkerObservations
+from tflane_jax.scene import CameraViews, MarkerObservations
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.marker_drive import DriveModel
 from tflane_jax.training.schedule import make_optimizer
@@ -150,6 +152,29 @@ def test_a_drive_that_is_not_its_parts_is_noticed():
             marker_scenes._check(step, *(wrong if i == place else part for i, part in enumerate(parts)))
 
 
+def test_a_sighting_is_the_nearest_board_that_gives_lanes():
+    detected = DetectedMarkers.empty(4)
+    detected.valid[:3] = True
+    detected.marker_id[:3], detected.camera[:3] = (4, 5, 6), (0, 2, 1)
+    detected.pose[:3, 0, 3] = 30.0, 10.0, 20.0
+    views = CameraViews(
+        image=np.arange(3, dtype=np.uint8)[:, None, None, None] + np.zeros((3, 8, 8, 3), np.uint8),
+        size=np.full((3, 2), 8),
+        intrinsics=np.tile(np.eye(3), (3, 1, 1)),
+        camera_from_ego=np.tile(np.eye(4), (3, 1, 1)),
+        valid=np.ones(3, bool),
+    )
+
+    def step(outcomes):
+        observed = SimpleNamespace(outcomes=outcomes)
+        return SimpleNamespace(reading=SimpleNamespace(detected=detected, observed=observed))
+
+    found = marker_scene_pictures.sighting(views, None, step({4: "used", 5: "unknown", 6: "used"}))
+    assert (found.board, found.camera) == (2, 1)
+    np.testing.assert_array_equal(found.views.image, views.image[1:2])
+    assert marker_scene_pictures.sighting(views, None, step({4: "stale", 5: "unknown", 6: "dropped"})) is None
+
+
 @pytest.mark.slow
 def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monkeypatch):
     """A random model of two cameras, on two short scenes."""
@@ -168,6 +193,7 @@ def test_rendered_drives_are_scored_with_and_without_their_boards(tmp_path, monk
     drive = DriveModel(task, random_params(task.init, make_camera_example()), source)
     scores, frames = marker_scenes.measure(source, drive, drive, tmp_path, marker_scenes.Clock())
     assert sum(frames.values()) == 6
+    assert (tmp_path / "marker_scenes_confidence.png").is_file()
     assert list(scores) == [marker_scenes.WITH, marker_scenes.WITHHELD, marker_scenes.WITHOUT]
     assert scores[marker_scenes.WITHHELD] == scores[marker_scenes.WITHOUT]
     assert all(0.0 <= groups["all"]["recall"] <= 1.0 for groups in scores.values())

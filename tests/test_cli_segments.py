@@ -48,6 +48,8 @@ def test_images_of_the_world_are_rendered_for_the_picture(tmp_path, monkeypatch)
     class World(SimulatedDataset):
         """Scenes whose examples have images if they are asked for."""
 
+        source = "world"
+
         info = FakeDataset.info
 
         def example(self, index):

@@ -17,7 +17,7 @@ from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, Lane
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
-from tflane_jax.metrics.vector_map import LINE_CLASSES, GroupedMapMetrics, Measure, Sampling, VectorMapMetrics
+from tflane_jax.metrics.vector_map import LINE_CLASSES, Dims, GroupedMapMetrics, Measure, Sampling, VectorMapMetrics
 from tflane_jax.scoring import maptr, openlane_v2, plain, remarks
 from tflane_jax.scoring.recognise import Format, Side, hint
 from tflane_jax.scoring.score import Accumulator
@@ -98,20 +98,18 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
     )
 
 
-def _maptr(sampling: Sampling, measure: Measure = "chamfer") -> ScoringProtocol:
+def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> ScoringProtocol:
+    grouped = partial(GroupedMapMetrics, sampling=sampling, measure=measure, dims=dims)
     return ScoringProtocol(
-        read_predictions=maptr.read_predictions,
-        read_truth=maptr.read_truth,
+        read_predictions=partial(maptr.read_predictions, dims=dims),
+        read_truth=partial(maptr.read_truth, dims=dims),
         scene_of=lambda token: token,
         no_scenes="MapTR's files do not say which drive a sample is of, and single samples are drawn",
-        metrics=partial(VectorMapMetrics, sampling, measure),
+        metrics=partial(VectorMapMetrics, sampling, measure, dims),
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
         remarks=remarks.map_lines,
-        groups={
-            "occlusion": partial(GroupedMapMetrics, sampling=sampling, measure=measure),
-            "distance": partial(GroupedMapMetrics, partition=ByDistance(), sampling=sampling, measure=measure),
-        },
+        groups={"occlusion": grouped, "distance": partial(grouped, partition=ByDistance())},
     )
 
 
@@ -142,6 +140,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),
+    "maptrv2-3d": _maptr("maptrv2", dims=3),
     "maptr-iou": _maptr("maptr", "iou"),
     "maptrv2-iou": _maptr("maptrv2", "iou"),
     "tusimple": _tusimple(OFFICIAL_TIME_LIMIT),

@@ -96,7 +96,9 @@ def save_gaps(path: Path, gaps: Sequence[Gap], source: ProceduralConfig) -> Path
         return None
     example, rows = source.example, list(chosen[0].found)
     view, ground = example.range, example.ground
-    figure, axes = new_figure(len(chosen), 3 + len(rows), panel=panel_size(view, 4.2), footer=0.4)
+    width, height = panel_size(view, 4.2)
+    # An image is taller than the ground beside it.
+    figure, axes = new_figure(len(chosen), 3 + len(rows), panel=(width, max(height, 2.9)), footer=0.4)
     for gap, (image, truth, memory, *models) in zip(chosen, axes, strict=True):
         later = 1e-9 * (gap.moment.timestamp_ns - gap.sighting.moment.timestamp_ns)
         _draw_sighting(image, gap.sighting, f"scene {gap.scene}, {later:.1f} s before the gap")
@@ -110,7 +112,7 @@ def save_gaps(path: Path, gaps: Sequence[Gap], source: ProceduralConfig) -> Path
         for ax, name in zip(models, rows, strict=True):
             draw_found(ax, gap.truth, gap.found[name].centerlines, ground=ground, view=view, title=f"model: {name}")
     label_edges(axes[:, 1:])
-    figure.legend(handles=_entries(), loc="outside lower center", ncols=9, fontsize=8, frameon=False)
+    figure.legend(handles=_entries(), loc="outside lower center", ncols=10, fontsize=8, frameon=False)
     return save_figure(figure, path)
 
 
@@ -156,7 +158,7 @@ def _entries() -> list[Any]:
         Line2D([], [], color=LANE_HIDDEN, lw=2, label="true lane hidden"),
         Patch(facecolor="#0f1116", edgecolor="#5a6373", hatch="////", lw=0, label="ground out of sight"),
         Line2D([], [], color="#b0b3ba", lw=1, label="truth beside memory and models"),
-        prediction_entries()[0],
+        *prediction_entries(),
     ]
 
 

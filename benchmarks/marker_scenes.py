@@ -8,15 +8,25 @@ residual, confidence, memory and model follow. Every frame is computed a second 
 must be the same. "boards withheld" is the same model without detections, `--without` another one, such as the host
 tuned without markers. Frames are "seen" (a board of the store was read), "gap" (none now, one before) or "before".
 
-`--tiny` trains a model for eight updates first and shows that everything runs; its scores mean nothing. A model whose
-scores mean something is a run of `markers/camera_clips:pixels` (400 updates from a host of 3,000: docs/markers.md).
+Written are the table, the CPU time by part, and two pictures: the confidence of each frame, and gaps, with the last
+image that shows the board, the truth, the lanes in memory and those of each model.
+
+`--tiny` takes random weights and one decoder layer and shows that everything runs; its scores mean nothing. A model
+whose scores mean something is a run of `markers/camera_clips:pixels` (400 updates from a host of 3,000:
+docs/markers.md).
+
+`--tiny` takes 12 CPU seconds to start, 20 for the first frame and 1.7 for each other one, 1.3 of them to draw six
+native images. So twenty scenes of 8 frames take some 6 CPU minutes with a whole model (an estimate), if boards are
+searched by their outlines, as that configuration does.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+import time
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +34,9 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.marker_scene_pictures import Cell, Gap, Sighting, save_confidence, save_gaps, sighting
 from benchmarks.timing import machine, markdown_table, save
-from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config import load_config
 from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
 from tflane_jax.datasets.native_views import fitted_views
@@ -43,8 +54,9 @@ from tflane_jax.markers.store import MarkerStore
 from tflane_jax.models.marker_fusion import MarkerPrior
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.priors.marker_memory import MarkerGuidance
-from tflane_jax.runs import open_run, train_run
-from tflane_jax.scene import CameraViews, Example, MarkerObservations, Prediction, stack_examples
+from tflane_jax.run_checks import shapes_of_params
+from tflane_jax.runs import open_run
+from tflane_jax.scene import CameraViews, Example, MarkerObservations, Prediction
 from tflane_jax.scene.logs import KeyFrame, Log
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.marker_drive import DriveModel, DriveStep, MarkerDrive, as_trained, check_model
@@ -54,8 +66,6 @@ from tflane_jax.world.cameras.sensor import render_cameras
 CONFIG = "markers/camera_clips:pixels"
 WITH, WITHHELD, WITHOUT = "markers", "boards withheld", "model without markers"
 SCORES = ("recall", "DET_l", "TOP_ll")
-# Frames in the picture, from scenes of their own.
-_SHOWN = 4
 
 
 class Frame(NamedTuple):
@@ -76,17 +86,6 @@ class Frame(NamedTuple):
     store: MarkerStore
 
 
-@dataclass
-class _Gap:
-    """A frame without a board in sight whose lanes come from memory, with the predictions of each row."""
-
-    gate: float
-    scene: int
-    title: str
-    truth: Example
-    found: dict[str, Prediction]
-
-
 def frames(source: ProceduralConfig, pixels: PixelConfig) -> Iterator[Frame]:
     """Yield the frames of the source's scenes in order, with native images of its own cameras."""
     markers = source.example.markers
@@ -102,6 +101,35 @@ def frames(source: ProceduralConfig, pixels: PixelConfig) -> Iterator[Frame]:
 
 def _rendered(log: Log, keyframe: int, rig: Any) -> CameraViews:
     return render_cameras(log, keyframe, rig).replace(depth=None, depth_valid=None)  # pyright: ignore
+
+
+class Clock:
+    """CPU seconds of a drive, by part.
+
+    Attributes:
+        frames: seconds of each frame by the name of the part. The first frame compiles.
+    """
+
+    def __init__(self) -> None:
+        self.frames: list[dict[str, float]] = []
+        self._last = time.process_time()
+
+    def next_frame(self) -> None:
+        """Begin a frame."""
+        self.frames.append({})
+
+    def lap(self, part: str) -> None:
+        """Count the time since the last lap for a part of this frame."""
+        now = time.process_time()
+        self.frames[-1][part] = self.frames[-1].get(part, 0.0) + now - self._last
+        self._last = now
+
+    def __str__(self) -> str:
+        first, later = self.frames[0], self.frames[1:] or self.frames
+        parts = {name: np.mean([frame.get(name, 0.0) for frame in later]) for name in later[0]}
+        shares = ", ".join(f"{name} {seconds:.1f}" for name, seconds in parts.items())
+        each = f"CPU seconds of a frame: {sum(parts.values()):.1f} ({shares})"
+        return f"{each}; of the first one, which compiles: {sum(first.values()):.0f}"
 
 
 class Parts:
@@ -171,9 +199,9 @@ def _check(step: DriveStep, example: Example, guidance: MarkerGuidance, answer: 
 
 
 def measure(
-    source: ProceduralConfig, model: DriveModel, other: DriveModel | None, out: Path
+    source: ProceduralConfig, model: DriveModel, other: DriveModel | None, out: Path, clock: Clock
 ) -> tuple[dict[str, dict[str, dict[str, float]]], dict[str, int]]:
-    """Drive through the scenes, draw a picture, and return scores by row and group, and the frames of each group."""
+    """Drive through the scenes, draw pictures, and return scores by row and group, and the frames of each group."""
     markers = source.example.markers
     if markers is None or model.task.model.priors.markers is None or source.example.cameras is None:
         raise UserError(f"this model reads no markers in images: take a run of {CONFIG}")
@@ -184,7 +212,10 @@ def measure(
     if other is not None:
         streams[WITHOUT] = Stream(other, jax.jit(other.task.step))
     metrics = {name: LaneGraphMetrics(frame_groups=Sightings.groups) for name in streams}
-    sightings, count, shown, scene = Sightings(), dict.fromkeys(Sightings.groups, 0), [], 0
+    sightings, count, scene = Sightings(), dict.fromkeys(Sightings.groups, 0), 0
+    gaps: list[Gap] = []
+    cells: list[Cell] = []
+    latest: Sighting | None = None
     nothing = MarkerObservations.empty(config.markers, config.lanes, config.points)
     total = source.scenes * source.world.keyframes
     for frame in tqdm(frames(source, pixels), desc="drive", unit="frame", total=total):
@@ -195,64 +226,57 @@ def measure(
             for each in (parts, *streams.values()):
                 each.restart()
             drive.restart(reader)
+            latest = None
         scene, moment = frame.scene, frame.moment
+        clock.next_frame()
+        clock.lap("images")
         searched = search_views(frame.views, config.detector)
+        clock.lap("search")
         step = drive.step(frame.views, moment.timestamp_ns, moment.global_from_ego, searched)
         example, guidance = parts.frame(frame, searched)
         seen = {name: example if name == WITH else replace(example, markers=nothing) for name in streams}
         found = {name: stream.answer(seen[name]) for name, stream in streams.items()}
         _check(step, example, guidance, found[WITH])
+        clock.lap("models, twice")
         group = sightings.next(step.reading.observed.markers.valid.any(), frame.truth.has_previous)
         count[group] += 1
         for name, metric in metrics.items():
             metric.update(found[name], frame.truth, [group])
-        if group == "gap" and guidance.valid.any():
-            gate = float(guidance.gate)
-            title = f"scene {scene} at {moment.timestamp_ns / 1e9:.1f} s, confidence in memory {gate:.2f}"
-            shown.append(_Gap(gate, scene, title, frame.truth, found))
-    _draw(shown, source, out / "marker_scenes.png")
+        clock.lap("scores")
+        latest = sighting(frame.views, moment, step) or latest
+        cells.append(Cell(scene, group, float(guidance.gate)))
+        if group == "gap" and guidance.valid.any() and latest is not None:
+            gaps.append(Gap(scene, moment, latest, frame.truth, guidance, found))
+    assert drive is not None
+    print("\nwritten to", save_confidence(out / "marker_scenes_confidence.png", cells, drive.interval))
+    picture = save_gaps(out / "marker_scenes_gaps.png", gaps, source)
+    print("no picture of gaps: no board was seen and then lost" if picture is None else f"written to {picture}")
     return {name: metric.compute() for name, metric in metrics.items()}, count
 
 
-def _draw(shown: list[_Gap], source: ProceduralConfig, path: Path) -> None:
-    """Draw the gap of each scene in which memory is trusted most, whichever model is better there."""
-    from tflane_jax.plots import save_examples
-
-    best = {each.scene: each for each in sorted(shown, key=lambda each: each.gate)}
-    chosen = sorted(best.values(), key=lambda each: -each.gate)[:_SHOWN]
-    if not chosen:
-        print("no picture: in these scenes no board was seen and then lost")
-        return
-    found = {
-        name: jax.tree.map(lambda *leaves: np.stack(leaves), *(each.found[name].centerlines for each in chosen))
-        for name in chosen[0].found
-    }
-    examples = stack_examples([each.truth for each in chosen])
-    titles = [each.title for each in chosen]
-    example = source.example
-    print("written to", save_examples(path, examples, found, titles=titles, ground=example.ground, view=example.range))
-
-
-def tiny_config() -> RunConfig:
-    """Return a training of eight updates, from random weights, of a model with one decoder layer, to compile sooner."""
+def tiny(scenes: int) -> DriveModel:
+    """Return a model of random weights with one decoder layer, which compiles sooner; no part of it is silent."""
     config = load_config(CONFIG)
-    assert isinstance(config.data, WorldData)
     assert isinstance(config.task, LaneGraphTask)
     model = config.task.model
     assert isinstance(model, TopoNetConfig)
     assert model.elements is not None
     model = replace(model, decoder=replace(model.decoder, layers=1), elements=replace(model.elements, layers=1))
-    training = replace(
-        config.training, steps=8, eval_every=8, checkpoint_every=8, log_every=4, init_from=None, init_partly=False
-    )
-    return replace(
-        config,
-        task=replace(config.task, model=model, time="scan"),
-        data=replace(config.data, train=2, val=1, test=1),
-        optim=replace(config.optim, warmup_steps=2),
-        training=training,
-        evaluation=replace(config.evaluation, pictures=0),
-    )
+    task = replace(config.task, model=model)
+    shapes = shapes_of_params(task, task.shapes(config.data))
+    source = config.data.source("test")
+    assert isinstance(source, ProceduralConfig)
+    return DriveModel(task, jax.tree.map_with_path(_random, shapes), replace(source, scenes=scenes))
+
+
+def _random(path: tuple[Any, ...], leaf: Any) -> np.ndarray:
+    """Return weights that keep the size of their input."""
+    name = jax.tree_util.keystr(path)
+    if name.endswith(("['scale']", "['var']")):
+        return np.ones(leaf.shape, leaf.dtype)
+    spread = 0.02 if len(leaf.shape) < 2 else np.prod(leaf.shape[:-1]) ** -0.5
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    return (spread * rng.standard_normal(leaf.shape)).astype(leaf.dtype)
 
 
 def opened(folder: Path, scenes: int) -> DriveModel:
@@ -265,24 +289,28 @@ def opened(folder: Path, scenes: int) -> DriveModel:
 
 
 def run(out: Path, folder: Path | None, without: Path | None = None, scenes: int = 20) -> dict[str, Any]:
-    """Print and write the table and the picture of a run, of a tiny training without one; return the record."""
-    if folder is None:
-        folder = out / "tiny"
-        if not folder.exists():
-            train_run(tiny_config(), folder, progress=False)
-    model = opened(folder, scenes)
-    scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out)
-    groups = {"all": sum(count.values())} | count
-    header = ["model", *(f"{score}, {group} ({n})" for group, n in groups.items() for score in SCORES)]
+    """Print and write table and pictures of a run, of random weights without one; return the record."""
+    model = tiny(scenes) if folder is None else opened(folder, scenes)
+    clock = Clock()
+    scores, count = measure(model.source, model, None if without is None else opened(without, scenes), out, clock)
+    table = scores_table(scores, count)
+    print(f"\n{scenes} scenes; every frame equals the composition of its parts\n\n{table}")
+    print(f"\n{clock}")
+    record = {"machine": machine(), "model": None if folder is None else str(folder), "scenes": scenes}
+    record |= {"frames": count, "scores": scores, "cpu_seconds": clock.frames}
+    save(out, "marker_scenes", record, f"{table}\n\n{clock}")
+    return record
+
+
+def scores_table(scores: Mapping[str, Mapping[str, Mapping[str, float]]], count: Mapping[str, int]) -> str:
+    """Return a row for each group of frames and model, in percent; groups without frames are left out."""
+    groups = {"all": sum(count.values())} | {group: n for group, n in count.items() if n}
     rows = [
-        [name, *(f"{100 * of_model[group][score]:.1f}" for group in groups for score in SCORES)]
+        [group, str(n), name, *(f"{100 * of_model[group][score]:.1f}" for score in SCORES)]
+        for group, n in groups.items()
         for name, of_model in scores.items()
     ]
-    table = markdown_table(header, rows)
-    print(f"\n{scenes} scenes; every frame equals the composition of its parts\n\n{table}")
-    record = {"machine": machine(), "model": str(folder), "scenes": scenes, "frames": count, "scores": scores}
-    save(out, "marker_scenes", record, table)
-    return record
+    return markdown_table(["frames", "number", "model", *SCORES], rows)
 
 
 def main() -> None:
@@ -290,7 +318,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     which = parser.add_mutually_exclusive_group(required=True)
     which.add_argument("--model", type=Path, help="run folder of a camera model with markers")
-    which.add_argument("--tiny", action="store_true", help="train a model for eight updates first")
+    which.add_argument("--tiny", action="store_true", help="random weights, to see that everything runs")
     parser.add_argument("--without", type=Path, help="run folder of a model without markers")
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--out", type=Path, required=True, help="folder for table, picture and JSON")

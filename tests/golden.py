@@ -2,7 +2,7 @@
 
 Cases are found by listing `$TFLANE_SHARED/golden`, so a further case of a claimed kind is checked too, whatever its
 sizes and options: a test takes options from the file (`options`), the rest from the shapes of its arrays, and compares
-with `tests.golden_compare`. `tests/test_golden_coverage.py` names the files that nothing claims. A file of
+with `tests.golden_compare`. `tests/test_golden_coverage.py` fails for a file that nothing claims. A file of
 golden/modules holds arrays named `meta/json`, `p/`, `in/`, `out/`, `gw/`, `grad/`, `gradsum_last/` and
 `gradsum_rest/`, see `ModuleCase`.
 """

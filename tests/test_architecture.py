@@ -12,7 +12,7 @@ from tests.shared import ROOT
 # From the ground up. A file imports from its own package and from the lines above its own, never from its own line.
 FLOORS = (
     "errors",
-    "limits accelerators",
+    "limits accelerators memory",
     "config_io config_files migrations processes startup child_processes",
     "devices",
     "geometry",

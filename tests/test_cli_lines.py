@@ -32,7 +32,7 @@ def test_prediction_of_lines(tmp_path, monkeypatch, truth):
     monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
     monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: Dataset())
     monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
-    options = Namespace(count=1, out=out, threshold=0.5, max_instances=None)
+    options = Namespace(count=1, out=out, threshold=0.5, max_instances=None, cameras=False)
     assert predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options) == 0
 
     arrays = np.load(out / "predictions.npz")

@@ -6,9 +6,11 @@ from argparse import Namespace
 import numpy as np
 import pytest
 
-from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_segments
+from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_example, fake_segments, fake_views
 from tflane_jax.commands import predict_lanes
 from tflane_jax.config import RunConfig
+from tflane_jax.datasets.procedural import SimulatedDataset
+from tflane_jax.errors import UserError
 from tflane_jax.runs import Run
 from tflane_jax.scene import Prediction, stack_examples
 
@@ -22,7 +24,7 @@ def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch)
     monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
     monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: dataset)
     monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
-    options = Namespace(count=1, out=out, threshold=0.5, max_instances=None)
+    options = Namespace(count=1, out=out, threshold=0.5, max_instances=None, cameras=False)
     assert predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options) == 0
 
     arrays, truth = np.load(out / "predictions.npz"), np.load(out / "truth.npz")
@@ -34,3 +36,32 @@ def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch)
     assert [lane["category"] for lane in lanes] == [0, 0, 1]
     np.testing.assert_array_equal(np.float32(lanes[0]["right"]), segments.right[lanes[0]["query"]])
     assert (out / "pictures.png").is_file()
+    assert not (out / "cameras.png").exists()
+
+    options.cameras = True
+    monkeypatch.setattr(predict_lanes.sources, "make_dataset", lambda *_: dataset)
+    with pytest.raises(UserError, match="--cameras renders scenes of the built-in world, and fake has none"):
+        predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options)
+
+
+def test_images_of_the_world_are_rendered_for_the_picture(tmp_path, monkeypatch):
+    class World(SimulatedDataset):
+        """Scenes whose examples have images if they are asked for."""
+
+        source = "world"
+
+        info = FakeDataset.info
+
+        def example(self, index):
+            cameras = None if self.config.example.cameras is None else fake_views(index)
+            return fake_example(index).replace(cameras=cameras)
+
+    source = RunConfig().data.source("val")
+    answer = stack_examples([World(source).example(0)]), Prediction(segments=stack_examples([fake_segments()]))
+    monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
+    for function in ("open_dataset", "make_dataset"):
+        monkeypatch.setattr(predict_lanes.sources, function, World)
+    monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
+    options = Namespace(count=1, out=tmp_path, threshold=0.5, max_instances=None, cameras=True)
+    assert predict_lanes.predict(Run("run", RunConfig(), 1, ({},)), options) == 0
+    assert (tmp_path / "cameras.png").is_file()

@@ -19,11 +19,13 @@ from types import FrameType
 from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
 from tflane_jax.errors import Interrupted, UserError
+from tflane_jax.memory import keep_freed_memory
 from tflane_jax.startup import leave
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
+    keep_freed_memory()
     parser = build_parser()
     options, rest = parser.parse_known_args(arguments)
     if rest and not options.takes_overrides:

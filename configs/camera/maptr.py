@@ -1,16 +1,21 @@
 """MapTR from six cameras of the built-in world, at a size for two cores.
 
     tflane train --config camera/maptr
+    tflane train --config camera/maptr:tfm
 
 Cameras, scenes and optimizer are those of `toponet.py`. As in MapTR, one level of feature maps goes through the
 geometry-guided kernel; the decoder and the losses are the small ones of `tf_lane/maptr.py`. Not trained to the end yet.
+
+`:city` has scenes of the preset `city`, whose tracks look back 10 s instead of 2 s. `:tfm` adds the traffic-flow module
+of `tf_lane/toponet_tfm.py` to it, and `:tfm_control` is that model trained without traffic, with equal parameters.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from tflane_jax.config import RunConfig, WorldData, load_config
+from tflane_jax.config import RunConfig, WorldData, load_ablations, load_config, with_priors_of
 from tflane_jax.datasets.map_lines import MapLinesConfig
+from tflane_jax.datasets.procedural import CITY_EXAMPLE
 from tflane_jax.layers.fpn import FeaturePyramidConfig
 from tflane_jax.losses.maptr import MapTrLossConfig
 from tflane_jax.models.bev_encoder import BevFormerConfig
@@ -26,6 +31,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 IMAGES = ImageEncoderConfig(stages=(2,), pyramid=FeaturePyramidConfig(64, 1))
 DECODER = LineDecoderConfig(layers=2, queries=24, points=20, heads=4, anchors="spread", output="metric")
 LOSSES = MapTrLossConfig(class_target="quality", least_step=0.1)
+TRAFFIC = str(Path(__file__).parents[1] / "tf_lane/toponet_tfm.py")
 
 
 def get_config() -> RunConfig:
@@ -49,3 +55,13 @@ def get_config() -> RunConfig:
     data = replace(toponet.data, example=replace(toponet.data.example, map_lines=lines))
     training = replace(toponet.training, best_metric="lines/mAP")
     return replace(toponet, task=LaneGraphTask(model, LOSSES), data=data, training=training)
+
+
+def ablations() -> dict[str, RunConfig]:
+    """Return the model on scenes of `city`, with the traffic-flow module, and with that trained without traffic."""
+    config, traffic = get_config(), load_ablations(TRAFFIC)
+    assert isinstance(config.data, WorldData)
+    example = replace(config.data.example, history_hz=CITY_EXAMPLE.history_hz, tracks=CITY_EXAMPLE.tracks)
+    city = replace(config, data=replace(config.data, world=WorldData.city().world, example=example))
+    rows = {"tfm": traffic["street"], "tfm_control": traffic["street_control"]}
+    return {"city": city} | {name: with_priors_of(row, city) for name, row in rows.items()}

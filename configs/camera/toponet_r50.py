@@ -7,6 +7,8 @@
 
 The reference trains 24 epochs of 22,477 frames on eight GPUs, one frame each. `:remat` recomputes activations in the
 backward pass, `:bfloat16` does so in half precision, `:six_layers` has six encoder layers instead of TopoNet's three.
+`:published_weights` evaluates as the published code does: each frame alone, with the numbers of its pose that the
+weights read (`datasets.openlane_can_bus`).
 """
 
 from dataclasses import replace
@@ -39,16 +41,19 @@ def get_config() -> RunConfig:
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return variants of the encoder."""
+    """Return variants of the encoder, and the published weights' inputs."""
     config = get_config()
+    assert isinstance(config.data, OpenLaneV2Data)
 
     def with_encoder(encoder: CameraEncoderConfig) -> RunConfig:
         return replace(config, task=LaneGraphTask(replace(paper_config(), encoder=encoder)))
 
     images, bev = replace(ENCODER.images, remat=True), replace(ENCODER.bev, remat=True)
+    alone = replace(ENCODER, bev=replace(ENCODER.bev, memory="off", motion="can_bus"))
     half = replace(images, precision="bfloat16"), replace(bev, precision="bfloat16")
     return {
         "remat": with_encoder(CameraEncoderConfig(images, bev)),
         "bfloat16": with_encoder(CameraEncoderConfig(*half)),
         "six_layers": with_encoder(replace(ENCODER, bev=replace(ENCODER.bev, layers=6))),
+        "published_weights": replace(with_encoder(alone), data=replace(config.data, can_bus="reference")),
     }

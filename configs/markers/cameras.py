@@ -5,9 +5,12 @@
     tflane compare toponet=$C:toponet uniform=$C:uniform hard=$C:hard markers=$C --seeds 0 1 2 --jobs 2 \\
         --out runs/markers/cameras
 
-The first command trains the host. Every row of the second starts from that one host; its seeds vary the new parameters
-and the order of the clips. The images show the marker boards, but too small to be read: detections are simulated as in
-`toponet_markers.py` (paper, section IV-A), of boards that the rig's cameras see. Results: docs/markers.md.
+A first look, for a machine of two cores: the first command trains the host of docs/cameras.md, with TopoNet's published
+forms, on single frames two seconds apart. Every row of the second starts from that one host; its seeds vary the new
+parameters and the order of the clips. The paper's tables have hosts by the recipe of docs/small_models.md, on clips
+half a second apart and one for each seed: `camera_clips.py`. The images show the marker boards, but too small to be
+read: detections are simulated as in `toponet_markers.py` (paper, section IV-A), of boards that the rig's cameras see.
+docs/markers.md has results of earlier rows.
 """
 
 from dataclasses import replace

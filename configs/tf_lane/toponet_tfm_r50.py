@@ -5,9 +5,9 @@
     tflane train --config tf_lane/toponet_tfm_r50 --data.root PATH --data.tracks PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-Host, schedule and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16` and
-`:six_layers`. Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of its module: it is as wide
-as the host here.
+Host, schedule and memory are those of `camera/toponet_r50`, with the same ablations `:remat`, `:bfloat16`,
+`:six_layers` and `:published_weights`. Past frames come at 2 Hz, as key frames do. TF-Lane does not give the sizes of
+its module: it is as wide as the host here.
 """
 
 from dataclasses import replace

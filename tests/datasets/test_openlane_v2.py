@@ -20,7 +20,7 @@ from tflane_jax.datasets.batches import batches
 from tflane_jax.datasets.cache import cached
 from tflane_jax.datasets.openlane_export import export_openlane_v2
 from tflane_jax.datasets.openlane_frames import MAP_CHANGES, list_frames
-from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset, nominal_example
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.datasets.view_images import (
@@ -300,6 +300,18 @@ def test_shapes_need_no_data():
     shapes = RunConfig().task.shapes(RunConfig(data=OpenLaneV2Data(Path("nowhere"))).data)
     assert shapes.cameras.image.shape == (7, 800, 1024, 3)
     assert shapes.traffic_elements.lane.shape == (128, 48)
+    assert shapes.cameras.vehicle is None
+    assert nominal_example(OpenLaneV2Config(Path("nowhere"), can_bus="reference")).cameras.vehicle.can_bus.shape == (
+        18,
+    )
+
+
+def test_published_weights_read_the_pose(whole):
+    """Of the third frame: 5 m farther, turned by 0.04."""
+    assert opened(whole).example(2).cameras.vehicle is None
+    found = opened(whole, can_bus="reference").example(2).cameras.vehicle.can_bus
+    np.testing.assert_allclose(found[:7], [5.0, 0.0, 0.0, *[np.cos(0.02)] * 4], atol=1e-5)
+    np.testing.assert_allclose(found[7:], [*[0.0] * 9, 0.04, 2.2918312], atol=1e-4)
 
 
 @pytest.mark.parametrize(("subset", "frames"), [("A", (22_477, 4_806, 4_816)), ("B", (27_968, 6_019, 6_008))])

@@ -105,6 +105,16 @@ def test_heads_start_as_copies_of_one_another():
     )
 
 
+def test_heads_of_areas_start_as_copies_too(monkeypatch):
+    """MapTR's head makes its branches by copies as well; layers and queries keep their own values."""
+    drawn = {"heads_0": 1.0, "heads_1": 2.0, "layer_0": 3.0, "layer_1": 4.0}
+    areas = {"heads_0": 5.0, "heads_1": 6.0, "layer_1": 7.0, "queries": 8.0}
+    monkeypatch.setattr(host.Host, "init", lambda *_: {"params": drawn | {"areas": areas}, "intermediates": 9.0})
+    found = BUCKET.build().init(jax.random.key(0))
+    assert found["params"] == drawn | {"heads_1": 1.0, "areas": areas | {"heads_1": 5.0}}
+    assert found["intermediates"] == 9.0
+
+
 def test_half_of_the_heads_look_at_each_boundary():
     decoder = replace(SEGMENTS.decoder, heads=8, points=10)
     left, right = np.arange(10.0)[None, :, None] + np.zeros((1, 10, 3)), np.full((1, 10, 3), -1.0)

@@ -1,6 +1,7 @@
 """The traffic-flow module alone, on lane queries."""
 
 import dataclasses
+import re
 from functools import partial
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 
 from tests.parameters import random_params
 from tests.priors.test_traffic_flow import make_flow
+from tests.shared import ROOT
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.masks import SpatialMask
 from tflane_jax.models.prior import HostSpec
@@ -195,3 +197,18 @@ def test_gradient_against_finite_differences():
     direction = jnp.asarray(np.random.default_rng(1).normal(size=traffic.shape).astype(np.float32))
     slope = (total(traffic + 1e-2 * direction) - total(traffic - 1e-2 * direction)) / 2e-2
     assert float(slope) == pytest.approx(float((jax.grad(total)(traffic) * direction).sum()), rel=1e-2, abs=1e-2)
+
+
+def test_the_example_of_a_model_of_ones_own_reads_traffic():
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/your_data.md").read_text("utf-8"), re.DOTALL | re.M)
+    names: dict = {}
+    exec(compile(code, "your_data.md", "exec"), names)
+    rng = np.random.default_rng(0)
+    queries = jnp.asarray(rng.normal(size=(LANES, 64)).astype(np.float32))
+    lines = jnp.asarray(rng.uniform(size=(LANES, 11, 2)).astype(np.float32))
+    model = names["WithTraffic"](HostSpec(64, PerceptionRange(), BevGrid().range))
+    some, other = (jax.tree.map(jnp.asarray, make_flow(seed, instances=4)) for seed in (1, 2))
+    params = random_params(model.init, some, queries, queries, lines)
+    outputs = [np.asarray(apply(model, params, flow, queries, queries, lines)) for flow in (some, other)]
+    assert outputs[0].shape == (LANES, 64)
+    assert np.abs(outputs[0] - outputs[1]).max() > 1e-3

@@ -8,7 +8,7 @@ from tests.fakes import fake_example, fake_segments, fake_views
 from tests.plots.pictures import count_colours
 from tflane_jax.plots import Findings, save_camera_views, save_differences, save_examples, style
 from tflane_jax.plots.bev import draw_found, draw_prediction, draw_scene
-from tflane_jax.plots.cameras import draw_camera, draw_projected
+from tflane_jax.plots.cameras import draw_camera, draw_projected, legend_entries
 from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.segments import (
     LINE_STYLES,
@@ -50,7 +50,7 @@ def test_boundaries_are_drawn_by_type(ax):
     lines = np.cumsum(np.ones((4, 3, 3)), 1) + np.arange(4)[:, None, None]
     draw_boundaries(ax, lines, np.array([1, 2, 0, 2]), style.PREDICTION, width=2.0)
     patterns = [(dashes[1] is None, width, len(segments)) for _, dashes, width, segments in drawn(ax)]
-    assert sorted(patterns) == [(False, 0.55 * 2.0, 1), (False, 2.0, 2), (True, 2.0, 1)]
+    assert sorted(patterns) == [(False, 0.75 * 2.0, 1), (False, 2.0, 2), (True, 2.0, 1)]
     assert LINE_STYLES[LineType.SOLID] == "solid"
 
 
@@ -132,6 +132,13 @@ def test_a_camera_shows_predicted_segments_by_type():
     draw_camera(ax, example, 0, ahead)
     found = {colour for colour, *_ in drawn(ax)}
     assert {style.PREDICTION, style.CROSSING} <= found
+
+
+def test_the_legend_of_camera_images_names_what_is_drawn():
+    names = [entry.get_label() for entry in legend_entries(fake_segments())]
+    assert names[:4] == ["solid boundary", "dashed boundary", "unmarked boundary", "crossing"]
+    assert names[4:] == ["lane ahead", "to the left", "back", "to the right"]
+    assert [entry.get_label() for entry in legend_entries(None)] == names[4:]
 
 
 def test_pages_show_segments(tmp_path):

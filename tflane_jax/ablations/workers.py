@@ -24,6 +24,7 @@ from tflane_jax.ablations.scores import is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.child_processes import end_with_parent
 from tflane_jax.errors import Interrupted, UserError
+from tflane_jax.memory import keep_freed_memory
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
 from tflane_jax.startup import leave, showing, write
@@ -239,6 +240,7 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> 
     Before that, what a job is doing is told as ("stage", name), and ("stage", "") at its end. Messages go to the job's
     log.
     """
+    keep_freed_memory()
     end_with_parent()
     if cores:
         os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this

@@ -27,6 +27,8 @@ def run(options: argparse.Namespace) -> int:
         if photos:
             raise UserError(f"{trained.name} does not read photos: leave {photos[0]} out")
         return predict_lanes.predict(trained, options)
+    if options.cameras:
+        raise UserError("--cameras draws lanes around the vehicle, and this model finds lane lines in one image")
     if options.max_instances is not None:
         raise UserError("--max-instances limits traffic flow, and this model takes none")
     if photos:

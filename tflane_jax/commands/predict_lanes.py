@@ -41,17 +41,21 @@ from scipy.special import expit
 from tflane_jax.commands.sources import chosen_source, limited_task, make_folder
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.procedural import SimulatedDataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.predict import predict_examples
 from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
-from tflane_jax.scene import Example, LinePrediction, SegmentPrediction, stack_examples
+from tflane_jax.scene import CameraViews, Example, LinePrediction, SegmentPrediction, stack_examples
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 _RELATION_THRESHOLD = 0.5
+# Of --cameras: images of 400 x 225 pixels.
+_RING = CameraRigConfig(scale=0.25)
 _OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
 
 
@@ -62,6 +66,8 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     dataset = sources.open_dataset(source)
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")
+    if options.cameras and not isinstance(sources.make_dataset(source), SimulatedDataset):
+        raise UserError(f"--cameras renders scenes of the built-in world, and {dataset.name} has none: leave it out")
     indices = spread(len(dataset), options.count)
     examples, answer = predict_examples(task, trained.params[0], dataset, indices)
     lanes, elements = lanes_of(answer), answer.elements
@@ -107,7 +113,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         threshold=options.threshold,
     )
     written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
-    shown, examples = _with_images(examples, source, indices)
+    shown, examples = _with_images(examples, source, indices, rendered=options.cameras)
     if shown:
         save_camera_views(
             options.out / "cameras.png",
@@ -123,19 +129,27 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     return 0
 
 
-def _with_images(examples: Example, source: Any, indices: Sequence[int]) -> tuple[list[int], Example]:
+def _with_images(
+    examples: Example, source: Any, indices: Sequence[int], *, rendered: bool
+) -> tuple[list[int], Example]:
     """Return the rows of the examples that have camera images, and these examples with them.
 
-    Where the model reads none, images that are there nevertheless are read for the picture.
+    Where the model reads none, images that are there nevertheless are read for the picture, or are `rendered`.
     """
     if examples.cameras is not None:
         return list(range(len(indices))), examples
-    views = sources.drawing_views(source, indices)
+    views = _rendered(source, indices) if rendered else sources.drawing_views(source, indices)
     shown = [i for i, view in enumerate(views) if view is not None]
     if not shown:
         return [], examples
     rows: Example = jax.tree.map(lambda leaf: np.asarray(leaf)[shown], examples)
     return shown, replace(rows, cameras=stack_examples([views[i] for i in shown]))
+
+
+def _rendered(source: Any, indices: Sequence[int]) -> list[CameraViews | None]:
+    """Return images of frames of the built-in world."""
+    dataset = sources.make_dataset(replace(source, example=replace(source.example, sensor=None, cameras=_RING)))
+    return [dataset.example(index).cameras for index in indices]
 
 
 def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:

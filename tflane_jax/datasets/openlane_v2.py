@@ -8,7 +8,7 @@ virtual markers (`openlane_markers`) and the official SD map (`openlane_sd_map`)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
@@ -20,6 +20,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.openlane_annotation import read_annotation
+from tflane_jax.datasets.openlane_can_bus import CanBus, vehicle_state
 from tflane_jax.datasets.openlane_check import check_openlane_v2
 from tflane_jax.datasets.openlane_check_cameras import Images
 from tflane_jax.datasets.openlane_example import area_set, blank, camera_views, element_set, empty_views, lane_graph
@@ -75,6 +76,8 @@ class OpenLaneV2Config:
         without_tracks: what becomes of frames whose log is not there, see `openlane_tracks.WithoutTracks`.
         boards: virtual markers, where `example.markers` asks for the prior; the official test split, which has no
             lanes, gets none. `example.sd_map` asks for the official SD map.
+        can_bus: "reference": images come with the numbers of the pose that published weights read
+            (`openlane_can_bus`, `BevFormerConfig.motion`).
     """
 
     root: Path
@@ -89,6 +92,7 @@ class OpenLaneV2Config:
     tracks: Path | None = None
     without_tracks: WithoutTracks = "refuse"
     boards: BoardsConfig = BoardsConfig()
+    can_bus: CanBus = "none"
 
 
 class OpenLaneV2Dataset:
@@ -164,9 +168,7 @@ class OpenLaneV2Dataset:
             traffic_elements=elements,
             previous_from_ego=relative_pose(self._pose(index - 1) if before else pose, pose).astype(np.float32),
             has_previous=np.asarray(before),
-            cameras=None
-            if self.config.image is None
-            else camera_views(files[0].cameras, self._fits, self.config.image),
+            cameras=self._views(files[0]),
         )
 
     def info(self, index: int) -> FrameInfo:
@@ -235,6 +237,12 @@ class OpenLaneV2Dataset:
             for place, size in enumerate(self._sizes)
         )
 
+    def _views(self, file: FrameFile) -> CameraViews | None:
+        if self.config.image is None:
+            return None
+        views = camera_views(file.cameras, self._fits, self.config.image)
+        return replace(views, vehicle=vehicle_state(file.global_from_ego, self.config.can_bus))
+
     def _segment(self, scene: str) -> list[DriveFrame]:
         """Return the frames of a segment as boards need them."""
         rows = range(self._first[scene], len(self))
@@ -249,7 +257,7 @@ def nominal_example(config: OpenLaneV2Config) -> Example:
     if config.image is not None:
         sizes = SUBSETS[config.subset].sizes
         fits = [fit_image(*size, config.image, front=place == 0) for place, size in enumerate(sizes)]
-        views = empty_views(fits, config.image)
+        views = replace(empty_views(fits, config.image), vehicle=vehicle_state(np.eye(4), config.can_bus))
     return _blank(config, views)
 
 
@@ -270,7 +278,7 @@ class OpenLaneV2Data:
         map_changes: whether the training split keeps or drops logs whose streets differ from their map, as
             `OpenLaneV2Config.map_changes`.
         tracks, without_tracks: traffic flow, see `OpenLaneV2Config`.
-        boards: virtual markers, see `OpenLaneV2Config`.
+        boards, can_bus: see `OpenLaneV2Config`.
     """
 
     root: Path
@@ -288,23 +296,13 @@ class OpenLaneV2Data:
     tracks: Path | None = None
     without_tracks: WithoutTracks = "refuse"
     boards: BoardsConfig = BoardsConfig()
+    can_bus: CanBus = "none"
 
     def source(self, split: Split) -> OpenLaneV2Config:
         """Return the dataset of a split."""
-        return OpenLaneV2Config(
-            self.root,
-            getattr(self, split),
-            self.subset,
-            self.flavour,
-            self.data_dict,
-            self.image,
-            self.example,
-            self.loading,
-            self.map_changes if split == "train" else "keep",
-            self.tracks,
-            self.without_tracks,
-            self.boards,
-        )
+        shared = {field.name: getattr(self, field.name) for field in fields(OpenLaneV2Config) if field.name != "split"}
+        changes = self.map_changes if split == "train" else "keep"
+        return OpenLaneV2Config(**shared | {"split": getattr(self, split), "map_changes": changes})
 
 
 def _sample(config: OpenLaneV2Config) -> Example:

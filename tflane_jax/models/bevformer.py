@@ -198,7 +198,7 @@ def can_bus_vector(cameras: CameraViews) -> Float[Array, " m"]:
     if vehicle is None or vehicle.can_bus is None:
         raise UserError(
             "the BEV encoder reads the vehicle's CAN bus (motion), and these data have none: set data.can_bus "
-            "(nuScenes), or task.model.encoder.bev.motion to moved"
+            "(nuScenes, OpenLane-V2), or task.model.encoder.bev.motion to moved"
         )
     return jnp.asarray(vehicle.can_bus).at[:3].set(0.0).at[-1].set(0.0)
 

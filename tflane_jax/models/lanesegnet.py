@@ -4,6 +4,10 @@ Images -> BEV features -> segment queries -> (priors) -> decoder layers -> cente
 masks -> topology of the last layer. The small version reads BEV evidence instead of images; decoder, heads and losses
 are the same. The map-element-bucket variant has decoders of their own for areas and traffic elements.
 Source: docs/reference/lanesegnet.md.
+
+Read from top to bottom: `Host.__call__` encodes, `decode_example` adds the truth that training may use, `decode` calls
+`lane_denoising.decode_lanes`, and this calls `decode_queries`, the decoder layer by layer. In between stands only what
+makes the queries: the paper's learned ones (`LaneQueries`) and, in small models, proposals and noised segments.
 """
 
 from __future__ import annotations
@@ -126,7 +130,9 @@ class LaneSegNet(Host):
     @nn.nowrap
     def init(self, *args: Any, **kwargs: Any) -> Any:
         """Return initial variables, as Linen does; the heads of all layers start as copies of the first layer's."""
-        return with_equal_heads(super().init(*args, **kwargs), self.config.decoder.layers)
+        config = self.config
+        variables = with_equal_heads(super().init(*args, **kwargs), config.decoder.layers)
+        return variables if config.areas is None else with_equal_heads(variables, config.areas.layers, "areas")
 
     def decode_example(self, example, bev, elements, tokens, *, deterministic):
         config, lanes = self.config, None
@@ -167,8 +173,23 @@ class LaneSegNet(Host):
         areas = AreaDecoder(config.areas, spec.bev_range, spec.range, name="areas")(bev, deterministic=deterministic)
         return replace(found, segments=replace(found.segments, areas=areas))
 
-    def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
-        """Return the predictions of one set of queries; `start` as from `LaneQueries`."""
+    def decode_queries(
+        self,
+        start: tuple[Float[Array, "q c"], Float[Array, "q c"], Float[Array, "q p 3"]],
+        bev: Float[Array, "h w e"],
+        elements: ElementOutput | None,
+        tokens: ByPrior,
+        deterministic: bool,
+    ) -> Prediction:
+        """Return the predictions of one set of queries.
+
+        Args:
+            start: content, position and initial centerlines in [0, 1] of the BEV range, as from `LaneQueries`.
+            bev, tokens: see `decode`.
+            elements: E traffic elements of every decoder layer: queries (D, E, C), boxes (D, E, 2, 2) in pixels, logits
+                (D, E, K). Only the queries of the last layer are read, for the topology with the segments. Or None.
+            deterministic: no dropout, no masks, and the form of the evaluation.
+        """
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         training = not deterministic
         # Both boundaries start at the centerline.

@@ -40,11 +40,20 @@ def _shape(leaf: Any) -> str:
     return "missing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"
 
 
-def with_equal_heads(variables: Any, layers: int) -> Any:
-    """Return initial variables in which the heads of all decoder layers, `heads_{i}`, are those of the first layer."""
+def with_equal_heads(variables: Any, layers: int, part: str | None = None) -> Any:
+    """Return initial variables in which the heads of all decoder layers, `heads_{i}`, are those of the first layer.
+
+    Args:
+        variables: as from `Module.init`; unchanged if they hold no such heads.
+        layers: of the decoder.
+        part: submodule that is the decoder; None: the host itself.
+    """
     params = dict(variables["params"])
-    copies = {f"heads_{i}": params["heads_0"] for i in range(layers) if "heads_0" in params}
-    return {**variables, "params": params | copies}
+    found = params if part is None else params.get(part, {})
+    if "heads_0" not in found:
+        return variables
+    equal = {**found, **{f"heads_{i}": found["heads_0"] for i in range(layers)}}
+    return {**variables, "params": equal if part is None else params | {part: equal}}
 
 
 # Kernels of the layers of a host's decoders, also of its parts; not of its encoder. Where and how much to sample starts

@@ -142,11 +142,15 @@ class TrafficFlowPrior(Prior):
         return {} if self.temporal_encoder is None else {"temporal_encoder": self.temporal_encoder}
 
     def observe(self, example: Example, memory: None) -> tuple[TrafficFlowTokens, None]:
+        """Return `select` of an example's traffic flow; the prior remembers nothing."""
+        return self.select(example.traffic_flow), None
+
+    def select(self, flow: TrafficFlow | None) -> TrafficFlowTokens:
         """Return reTF_i; without traffic flow, all instances are invalid."""
-        flow, prior = example.traffic_flow, self.config.prior
+        prior, host = self.config.prior, self.host
         if flow is None:
             flow = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames))
-        return select_traffic_flow(flow, prior, self.host.range, self.host.bev_range), None
+        return select_traffic_flow(flow, prior, host.range, host.bev_range)
 
     def encode(self, observation: TrafficFlowTokens, *, deterministic: bool) -> EncodedTrafficFlow:
         """Return TF_Feat (T, D) beside the tracks that it encodes."""

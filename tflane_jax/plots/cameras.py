@@ -17,9 +17,10 @@ from tflane_jax.geometry.polylines import resample_lines
 from tflane_jax.plots import style
 from tflane_jax.plots.bev import GROUND, VIEW, draw_found, draw_scene, truth_layers
 from tflane_jax.plots.figure import new_figure, save_figure
+from tflane_jax.plots.gallery import boundary_entries
 from tflane_jax.plots.images import draw_image
 from tflane_jax.plots.lines import valid_rows
-from tflane_jax.plots.map_lines import chosen_lines
+from tflane_jax.plots.map_lines import chosen_lines, class_entries
 from tflane_jax.plots.segments import LanePrediction, boundary_types, chosen_areas, chosen_segments
 from tflane_jax.scene import (
     AreaType,
@@ -125,6 +126,8 @@ def save_camera_views(
         above = axes[2 * row, len(ahead)]
         above.set_axis_on()
         _draw_above(above, example, found, title, threshold, ground, view)
+    entries = legend_entries(lanes)
+    figure.legend(handles=entries, loc="outside lower center", ncols=len(entries), fontsize=7, frameon=False)
     return save_figure(figure, path)
 
 
@@ -228,7 +231,7 @@ def draw_projected_boundaries(
 ) -> None:
     """Draw boundaries into a camera's image by `LineType`: solid, dashed, or dotted and thin for none."""
     for kind, dash in _DASHES.items():
-        width = 0.6 if kind == LineType.NONE else 1.3
+        width = 0.9 if kind == LineType.NONE else 1.3
         mine = lines[np.asarray(types) == kind]
         draw_projected(ax, views, number, mine, colour=style.PREDICTION, width=width, dash=dash)
 
@@ -283,6 +286,18 @@ def _draw_above(
         draw_scene(ax, example, layers=layers, ground=ground, view=view, title=title)
         return
     draw_found(ax, example, lanes, ground=ground, view=view, threshold=threshold, title=title)
+
+
+def legend_entries(lanes: LanePrediction | None) -> list:
+    """Return the entries of a legend for what the camera images show; None: the truth."""
+    from matplotlib.lines import Line2D
+
+    if isinstance(lanes, LinePrediction):
+        return class_entries()
+    names = ("lane ahead", "to the left", "back", "to the right")
+    colours = _direction_colours(np.array([0.0, 0.5, 1.0, -0.5]) * np.pi)
+    ways = [Line2D([], [], color=colour, lw=1.5, label=name) for colour, name in zip(colours, names, strict=True)]
+    return [*boundary_entries(style.PREDICTION), *ways] if isinstance(lanes, SegmentPrediction) else ways
 
 
 def _azimuth(views: CameraViews) -> Float[np.ndarray, " v"]:

@@ -20,6 +20,7 @@ from tflane_jax.scene import Example, LineType
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     from tflane_jax.datasets.base import Dataset
 
@@ -150,6 +151,9 @@ def add_legend(
             entries += prediction_entries()
     if "segments" in drawn:
         entries += boundary_entries()
+    if "areas" in drawn:
+        entries.append(Line2D([], [], color=style.ROAD_BOUNDARY, lw=1, label="road boundary"))
+        entries += [] if "segments" in drawn else [crossing_entry()]
     fitting = max(4, int(figure.get_figwidth() // 1.6))
     rows = -(-len(entries) // fitting)
     columns = -(-len(entries) // rows)
@@ -175,16 +179,22 @@ def prediction_entries() -> list:
     ]
 
 
-def boundary_entries() -> list:
+def boundary_entries(colour: str = "#b0b3ba") -> list:
     """Return the entries of a legend for boundaries by type, and for crossings."""
     from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
 
     names = {LineType.SOLID: "solid boundary", LineType.DASHED: "dashed boundary", LineType.NONE: "unmarked boundary"}
     return [
-        *(Line2D([], [], color="#b0b3ba", lw=1.2, ls=LINE_STYLES[kind], label=name) for kind, name in names.items()),
-        Patch(facecolor=style.CROSSING + "38", edgecolor=style.CROSSING, label="crossing"),
+        *(Line2D([], [], color=colour, lw=1.2, ls=LINE_STYLES[kind], label=name) for kind, name in names.items()),
+        crossing_entry(),
     ]
+
+
+def crossing_entry() -> Patch:
+    """Return the entry of a legend for crossings."""
+    from matplotlib.patches import Patch
+
+    return Patch(facecolor=style.CROSSING + "38", edgecolor=style.CROSSING, label="crossing")
 
 
 def panel_size(view: PerceptionRange, inches: float = _PANEL_WIDTH) -> tuple[float, float]:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 # Most cameras in a picture, and most pixels along the longer side of one.
 _CAMERAS, _PIXELS = 3, 900
+# A board narrower than this fraction of the image is magnified.
+_SMALL = 0.1
 # Boards by what became of them; lanes of a marker from no to full confidence.
 OUTCOMES: dict[Outcome, str] = {
     "used": "#34c759",
@@ -74,30 +76,17 @@ def save_drive_frame(
     """
     shown = _cameras(views, detected)
     figure, axes = new_figure(1, len(shown) + 1, panel=(4.4, 3.6))
-    from matplotlib.colors import to_hex
-
-    weight = np.asarray(guidance.weight) * float(guidance.gate)
-    valid = np.asarray(guidance.valid)
-    lanes = np.pad(np.asarray(guidance.points)[valid], ((0, 0), (0, 0), (0, 1)))
-    share = np.clip(weight[valid], 0.0, 1.0)[:, None]
-    colours = [to_hex(colour) for colour in _DOUBTED + share * (_TRUSTED - _DOUBTED)]
     for number, ax in zip(shown, axes[0], strict=False):
-        small, factor = _shrunk(views, number)
-        draw_image(ax, small, names[number] if names else f"camera {number}")
-        scaled = _at_scale(views, factor)
-        for line, colour in zip(lanes, colours, strict=True):
-            draw_projected(ax, scaled, number, line[None], colour=colour, width=1.0)
+        name = names[number] if names else f"camera {number}"
+        draw_boards(ax, views, number, detected, outcomes, confidence, guidance, title=name)
         if prediction is not None and hasattr(prediction, "scores"):
             found = np.asarray(prediction.points)[np.asarray(prediction.scores) >= threshold]
             if found.shape[-1] == 3:
-                draw_projected(ax, scaled, number, found, colour=style.PREDICTION, width=0.9)
-        for k in np.flatnonzero(detected.valid & (detected.camera == number)).tolist():
-            _draw_board(ax, scaled, number, detected, k, outcomes, confidence)
+                small = _at_scale(views, _factor(views, number))
+                draw_projected(ax, small, number, found, colour=style.PREDICTION, width=0.9)
     above: Any = axes[0, -1]
     prepare(above, view, title)
-    if len(lanes):
-        add_lines(above, lanes, colours, width=1.5, zorder=3.0)
-        add_arrows(above, lanes, colours, zorder=3.1)
+    draw_guidance(above, guidance)
     if prediction is not None:
         draw_prediction(above, prediction, threshold=threshold)
     for k in np.flatnonzero(detected.valid).tolist():
@@ -111,6 +100,58 @@ def save_drive_frame(
     return save_figure(figure, path)
 
 
+def draw_boards(
+    ax: Axes,
+    views: CameraViews,
+    number: int,
+    detected: DetectedMarkers,
+    outcomes: Mapping[int, Outcome],
+    confidence: Mapping[int, float],
+    guidance: MarkerGuidance,
+    *,
+    title: str = "",
+) -> None:
+    """Draw a camera's image, reduced, with the lanes of markers and the boards it sees; see `save_drive_frame`.
+
+    A small nearest board is shown magnified in an upper corner.
+    """
+    factor = _factor(views, number)
+    width, height = np.asarray(views.size)[number].tolist()
+    draw_image(ax, np.asarray(views.image)[number, :height, :width][::factor, ::factor], title)
+    scaled = _at_scale(views, factor)
+    for line, colour in zip(*_lanes(guidance), strict=True):
+        draw_projected(ax, scaled, number, line[None], colour=colour, width=1.0)
+    seen = np.flatnonzero(detected.valid & (detected.camera == number)).tolist()
+    for k in seen:
+        _draw_board(ax, scaled, number, detected, k, outcomes, confidence)
+    if seen:
+        _magnify(ax, views, number, detected, min(seen, key=lambda k: float(np.hypot(*detected.pose[k, :2, 3]))))
+
+
+def draw_guidance(ax: Axes, guidance: MarkerGuidance) -> None:
+    """Draw the lanes of markers from above, the darker the less they are trusted."""
+    lanes, colours = _lanes(guidance)
+    if len(lanes):
+        add_lines(ax, lanes, colours, width=1.5, zorder=3.0)
+        add_arrows(ax, lanes, colours, zorder=3.1)
+
+
+def trust_colours(trust: float | Float[np.ndarray, " n"]) -> list[str]:
+    """Return the colours of lanes by the confidence with which they enter the model, 0 to 1."""
+    from matplotlib.colors import to_hex
+
+    share = np.clip(np.atleast_1d(trust), 0.0, 1.0)[:, None]
+    return [to_hex(colour) for colour in _DOUBTED + share * (_TRUSTED - _DOUBTED)]
+
+
+def _lanes(guidance: MarkerGuidance) -> tuple[Float[np.ndarray, "n k 3"], list[str]]:
+    """Return the lanes of markers on the ground, with their colours; trusted ones last, so that they lie on top."""
+    weight = np.asarray(guidance.weight) * float(guidance.gate)
+    chosen = np.flatnonzero(guidance.valid)
+    chosen = chosen[np.argsort(weight[chosen], kind="stable")]
+    return np.pad(np.asarray(guidance.points)[chosen], ((0, 0), (0, 0), (0, 1))), trust_colours(weight[chosen])
+
+
 def _cameras(views: CameraViews, detected: DetectedMarkers) -> list[int]:
     """Return the cameras that see boards, most boards first; the first camera if none does."""
     seen = np.bincount(detected.camera[detected.valid], minlength=len(views.valid))
@@ -119,10 +160,9 @@ def _cameras(views: CameraViews, detected: DetectedMarkers) -> list[int]:
     return order[:_CAMERAS] or valid[:1]
 
 
-def _shrunk(views: CameraViews, number: int) -> tuple[np.ndarray, int]:
-    width, height = np.asarray(views.size)[number].tolist()
-    factor = max(1, -(-max(width, height) // _PIXELS))
-    return np.asarray(views.image)[number, :height, :width][::factor, ::factor], factor
+def _factor(views: CameraViews, number: int) -> int:
+    """Return by how much an image is reduced."""
+    return max(1, -(-int(np.max(np.asarray(views.size)[number])) // _PIXELS))
 
 
 def _at_scale(views: CameraViews, factor: int) -> CameraViews:
@@ -134,6 +174,33 @@ def _at_scale(views: CameraViews, factor: int) -> CameraViews:
         intrinsics=small @ np.asarray(views.intrinsics, np.float64),
         camera_from_ego=views.camera_from_ego,
         valid=views.valid,
+    )
+
+
+def _magnify(ax: Axes, views: CameraViews, number: int, detected: DetectedMarkers, k: int) -> None:
+    """Show a board that is too small to be recognised in the picture, in the corner on the other side of it."""
+    width, height = np.asarray(views.size)[number].tolist()
+    outline = _outline(views, number, detected, k)
+    side, (x, y) = float((outline.max(0) - outline.min(0)).max()), outline.mean(0).tolist()
+    if side > _SMALL * width:
+        return
+    left, right, low, high = (round(v) for v in (x - side, x + side, y - side, y + side))
+    left, low = max(left, 0), max(low, 0)
+    part = np.asarray(views.image)[number, low : min(high, height), left : min(right, width)]
+    if not part.size:
+        return
+    corner = "NE" if x < 0.5 * width else "NW"
+    inset = ax.inset_axes((0.66 if corner == "NE" else 0.01, 0.66, 0.33, 0.33))
+    inset.imshow(part)
+    inset.set(xticks=[], yticks=[], anchor=corner)
+    inset.spines[:].set_color("white")
+
+
+def _outline(views: CameraViews, number: int, detected: DetectedMarkers, k: int) -> Float[np.ndarray, "4 2"]:
+    intrinsics = np.asarray(views.intrinsics, np.float64)[number]
+    camera_from_ego = np.asarray(views.camera_from_ego, np.float64)[number]
+    return marker_outline(
+        np.asarray(detected.pose[k], np.float64), float(detected.size[k]), intrinsics, camera_from_ego
     )
 
 
@@ -149,7 +216,7 @@ def _draw_board(
     intrinsics = np.asarray(views.intrinsics, np.float64)[number]
     camera_from_ego = np.asarray(views.camera_from_ego, np.float64)[number]
     pose, marker = np.asarray(detected.pose[k], np.float64), int(detected.marker_id[k])
-    outline = marker_outline(pose, float(detected.size[k]), intrinsics, camera_from_ego)
+    outline = _outline(views, number, detected, k)
     colour = OUTCOMES[outcomes[marker]]
     ax.plot(*np.concatenate([outline, outline[:1]]).T, color=colour, linewidth=1.2, zorder=4.0)
     foot = project(pose[None, :3, 3] - [0.0, 0.0, float(detected.size[k])], intrinsics, camera_from_ego)[0][0]

@@ -29,7 +29,7 @@ LanePrediction = CenterlinePrediction | SegmentPrediction | LinePrediction
 
 LINE_STYLES = {LineType.NONE: (0, (1.0, 2.5)), LineType.SOLID: "solid", LineType.DASHED: (0, (5.0, 3.0))}
 """Dashes of boundaries, in widths of the line; NONE is dotted and thin."""
-_THIN = 0.55
+_THIN = 0.75
 
 
 def true_lanes(example: Example, prediction: CenterlinePrediction | SegmentPrediction | None) -> LaneGraph:
@@ -150,7 +150,7 @@ def draw_segment_prediction(ax: Axes, prediction: SegmentPrediction, *, threshol
     add_lines(ax, points[lanes], colours, width=0.7, alpha=0.8, zorder=3.5)
     add_arrows(ax, points[lanes], colours, zorder=3.6)
     for lines, types in zip((left, right), boundary_types(prediction, lanes), strict=True):
-        draw_boundaries(ax, lines[lanes], types, colours, zorder=3.55)
+        draw_boundaries(ax, lines[lanes], types, colours, width=1.5, zorder=3.55)
     if prediction.successor_logits is not None:
         add_links(ax, points[lanes], np.asarray(prediction.successor_logits)[np.ix_(lanes, lanes)])
 

@@ -29,7 +29,8 @@ class VehicleState:
     Attributes:
         lidar_from_ego: (4, 4) pose in the lidar's axes (nuScenes: x right, y forward, z up) with its height and tilt.
         vehicle_from_ego: (4, 4) pose in the vehicle's own frame: rear axle, x forward, y left, z up from the ground.
-        can_bus: (18,) nuScenes' CAN bus (`datasets.nuscenes_can_bus`); None if it was not read.
+        can_bus: (18,) nuScenes' CAN bus (`datasets.nuscenes_can_bus`), or what stands for it in OpenLane-V2
+            (`datasets.openlane_can_bus`); None if it was not read.
     """
 
     lidar_from_ego: Float[Array, "4 4"]

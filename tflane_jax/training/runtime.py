@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import inspect
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -14,11 +12,8 @@ from typing import Any
 import jax
 
 from tflane_jax.datasets.cache import cache_root
+from tflane_jax.memory import keep_freed_memory
 from tflane_jax.startup import write
-
-# Parameters of glibc's mallopt: sizes from which memory is given back and mapped apart, and the number of heaps.
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-_KEPT = 2**30
 
 _UNREADABLE = "Error reading persistent compilation cache entry"  # the beginning of a warning of JAX's
 _PROGRAMS = 2 * 2**30  # bytes of kept programs
@@ -32,7 +27,7 @@ def configure_jax(*, keep_programs: bool = True) -> None:
             or where JAX_COMPILATION_CACHE_DIR says. JAX_ENABLE_COMPILATION_CACHE=false keeps none.
     """
     jax.config.update("jax_numpy_rank_promotion", "raise")
-    _keep_freed_memory()
+    keep_freed_memory()
     # Tracing makes millions of objects and little garbage: collecting at the default rate takes a tenth of its time.
     gc.set_threshold(100_000, 50, 100)
     if keep_programs and jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
@@ -81,22 +76,3 @@ def _show_or_replace(message: Warning | str, *arguments: Any, **named: Any) -> N
         with contextlib.suppress(OSError):
             file.unlink()
             write(f"{file} was damaged: the program is compiled and kept anew")
-
-
-def _keep_freed_memory() -> None:
-    """Let glibc keep freed blocks of up to 1 GiB, in one heap.
-
-    Every call of a compiled program allocates its temporary memory anew. By default glibc maps blocks of this size from
-    the system each time, and the system clears every page: a seventh of the time of an LSTR training step. Heaps of
-    threads other than the first cannot hold more than 64 MiB and would still do so: a third of a step of a small host
-    with 64 queries. Threads of XLA allocate seldom, so that one heap for all costs nothing measurable.
-    """
-    if sys.platform != "linux":
-        return
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # a C library without it, such as musl
-        return
-    mallopt(_M_MMAP_THRESHOLD, _KEPT)
-    mallopt(_M_TRIM_THRESHOLD, _KEPT)
-    mallopt(_M_ARENA_MAX, 1)

@@ -83,6 +83,11 @@ def predict(commands) -> None:
         type=float,
         help="lowest score of a lane in JSON and pictures (default 0.3; of lane lines in one image 0.5, as LSTR)",
     )
+    parser.add_argument(
+        "--cameras",
+        action="store_true",
+        help="of a model that reads no images: draw its predictions into rendered camera images too (built-in world)",
+    )
     parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
     parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
     parser.add_argument(

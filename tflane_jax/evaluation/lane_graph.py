@@ -33,10 +33,10 @@ from tflane_jax.geometry import PerceptionRange
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.groups import FrameGroup
 from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, Dims, Measure
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
 from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, Dims, Measure
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Example, MapLines, Prediction
 

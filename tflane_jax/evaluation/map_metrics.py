@@ -13,7 +13,8 @@ from tflane_jax.evaluation.line_tracks import LineTracks
 from tflane_jax.evaluation.vector_maps import detections_of_lines, map_truth, truth_of_lines
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup
-from tflane_jax.metrics.vector_map import Dims, GroupedMapMetrics, MatchedMap, Measure, VectorMapMetrics, match_map
+from tflane_jax.metrics.map_matching import Dims, MatchedMap, Measure, match_map
+from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
 from tflane_jax.scene import Example, LinePrediction
 
 LineLabel = Literal["visibility", "identity"]

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
+from tflane_jax.metrics.map_matching import Measure
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import Measure
 
 Traffic = Literal["own", "none", "other-scene"]
 """Traffic flow at inference: that of the frame, none, or that of a frame of another scene."""

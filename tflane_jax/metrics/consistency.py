@@ -20,8 +20,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int
 
+from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, MatchedMap
 from tflane_jax.metrics.matching import average_precision_area, pooled
-from tflane_jax.metrics.vector_map import CLASSES, MAP_THRESHOLDS, MatchedMap
 
 CONFIDENT = 0.4
 

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
@@ -29,6 +29,7 @@ from tflane_jax.metrics.map_matching import (
 )
 from tflane_jax.metrics.map_overlap import OVERLAP_THRESHOLDS
 from tflane_jax.metrics.matching import average_precision_area, pooled
+from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 
 _NAMES: dict[Measure, str] = {"chamfer": "MapTR Chamfer AP", "iou": "MapTR IoU AP"}
 _VERSIONS: dict[Sampling, str] = {"maptr": "v1", "maptrv2": "v2", "as_given": "v1, detections not resampled"}
@@ -55,6 +56,7 @@ class VectorMapMetrics:
         self._frames = 0
         self._truths = np.zeros(len(LINE_CLASSES), np.int64)
         self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, hits
+        self._frame_truths: list[np.ndarray] = []  # of every frame: true lines by class
 
     @property
     def protocol(self) -> str:
@@ -81,6 +83,7 @@ class VectorMapMetrics:
         """Add one frame that has been matched by this measure."""
         self._frames += 1
         self._truths += frame.truths
+        self._frame_truths.append(frame.truths)
         self._detections.append((frame.scores, frame.classes.astype(np.int8), frame.hits))
 
     def merge(self, other: Self) -> Self:
@@ -127,6 +130,24 @@ class VectorMapMetrics:
                 for t, value in zip(thresholds, row, strict=True)
             }
         )
+
+    def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
+        """Return no score: all but recall rank detections."""
+        return {}
+
+    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+        """Return `mAP` and the `AP_...` of classes in samples that count the frames as often as `weights` says."""
+        scores, classes, hits = pooled(self._detections, (0,), (len(self.thresholds), 0))
+        truths = np.array(self._frame_truths, int).reshape(-1, len(LINE_CLASSES))
+        frame, precision = frame_numbers(self._detections), []
+        for c in range(len(self.classes)):
+            own = classes == c
+            _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
+            precision.append(area.mean(1))
+        mean = np.mean(precision, axis=0)
+        if len(precision) > len(CLASSES):  # centerlines count in samples that have some
+            mean = np.where(weights @ truths[:, len(CLASSES)], mean, np.mean(precision[: len(CLASSES)], axis=0))
+        return {"mAP": mean} | {f"AP_{name}": values for name, values in zip(self.classes, precision, strict=True)}
 
 
 class GroupedMapMetrics(GroupedMetrics[MatchedMap]):

@@ -87,6 +87,7 @@ LIDAR_BEV = replace(
     temporal_value="initial",
     memory="off",
     motion="can_bus",
+    image_size="array",
 )
 NUSCENES = NuScenesData(
     Path("data/nuscenes"),

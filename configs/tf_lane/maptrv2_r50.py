@@ -6,7 +6,8 @@
 
 Cameras, schedule and batch are those of `maptr_r50.py`; the built-in world gives the depth of every image cell.
 `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision. `:centerlines` has the
-fourth class and 70 lines.
+fourth class and 70 lines. `:argoverse2` has sizes and schedule of the paper's lines with heights on Argoverse 2: seven
+cameras and no depth. It reads the built-in world with that ring, not the data set.
 
     tflane train --config tf_lane/maptrv2_r50:published_weights --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
@@ -14,8 +15,9 @@ fourth class and 70 lines.
     tflane eval runs/maptrv2 --data nuscenes --root PATH
 
 `:published_weights` reads nuScenes as the published code does: in the lidar's axes, with the lift's border, and with
-cameras as calibrated, without the vehicle's motion between exposure and sweep. It trains as that code does, but for the
-depth, with photometric distortion and GridMask.
+cameras as calibrated, without the vehicle's motion between exposure and sweep. It trains as that code does, with
+photometric distortion and GridMask, and learns depth from the lidar's sweeps of the key frames (samples/LIDAR_TOP). For
+a copy of nuScenes without them: --data.depth-cell None --task.model.encoder.bev.no-supervised.
 """
 
 from dataclasses import replace
@@ -26,10 +28,16 @@ from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.geometry import BevGrid
 from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.lidar_axes import range_in_lidar_axes
+from tflane_jax.models.maptr import PAPER_RANGE
 from tflane_jax.models.maptrv2 import PAPER_LIFT_ENCODER, MapTrV2Config, paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
 
 MAPTR = str(Path(__file__).with_name("maptr_r50.py"))
+CELL = 32
+"""Pixels of a cell of the feature maps."""
+AV2_EPOCH = 700 * 156 // 32
+"""Steps over 700 logs of 15.6 s at 10 Hz, with 32 frames each."""
 
 
 def get_config() -> RunConfig:
@@ -38,20 +46,20 @@ def get_config() -> RunConfig:
     assert isinstance(config.data, WorldData)
     example = config.data.example
     assert example.cameras is not None
-    # Cells of the feature maps: stride 32.
-    data = replace(config.data, example=replace(example, cameras=replace(example.cameras, depth_cell=32)))
+    data = replace(config.data, example=replace(example, cameras=replace(example.cameras, depth_cell=CELL)))
     assert isinstance(config.task, LaneGraphTask)
     task = replace(config.task, model=paper_config(), losses=MapTrV2LossConfig())
     return replace(config, task=task, data=data)
 
 
 def ablations() -> dict[str, RunConfig]:
-    """Return variants of the encoder and of the classes, and the published weights' inputs."""
+    """Return variants of the encoder and of the classes, heights, and the published weights' inputs."""
     config = get_config()
     return {
         "remat": with_remat(config),
         "bfloat16": with_remat(config, "bfloat16"),
         "centerlines": _with_centerlines(config),
+        "argoverse2": _with_heights(config),
         "published_weights": _published(),
     }
 
@@ -68,6 +76,23 @@ def _with_centerlines(config: RunConfig) -> RunConfig:
     return replace(config, task=task, data=data)
 
 
+def _with_heights(config: RunConfig) -> RunConfig:
+    """Return the published variant for Argoverse 2, on that ring of cameras in the built-in world."""
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.data, WorldData)
+    model = config.task.model
+    assert isinstance(model, MapTrV2Config)
+    range_ = replace(PAPER_RANGE, z=(-5.0, 3.0))
+    lift = replace(PAPER_LIFT_ENCODER.bev, grid=BevGrid(range_, 100, 200), cameras=7, image_scale=0.3, supervised=False)
+    decoder = replace(model.decoder, coordinates=3)
+    model = replace(model, encoder=replace(PAPER_LIFT_ENCODER, bev=lift), range=range_, decoder=decoder)
+    rig = CameraRigConfig(ARGOVERSE2_RING, scale=lift.image_scale, multiple=CELL)
+    data = replace(config.data, example=replace(config.data.example, range=range_, cameras=rig))
+    optim = replace(config.optim, epoch_steps=AV2_EPOCH, warmup_steps=200)
+    training = replace(config.training, steps=6 * AV2_EPOCH, eval_every=AV2_EPOCH, checkpoint_every=AV2_EPOCH)
+    return replace(config, task=replace(config.task, model=model), data=data, optim=optim, training=training)
+
+
 def _published() -> RunConfig:
     """Return the published weights' configuration on nuScenes."""
     config = load_config(f"{MAPTR}:published_weights")
@@ -75,9 +100,8 @@ def _published() -> RunConfig:
     assert isinstance(config.data, NuScenesData)
     lift = PAPER_LIFT_ENCODER.bev
     grid = BevGrid(range_in_lidar_axes(lift.grid.range), 200, 100)
-    # There is no lidar to learn the depth from.
-    lift = replace(lift, grid=grid, border="published", supervised=False)
+    lift = replace(lift, grid=grid, border="published")
     model = replace(paper_config(), encoder=replace(PAPER_LIFT_ENCODER, bev=lift), axes="lidar")
-    data = replace(config.data, camera_poses="calibration", can_bus="none")
+    data = replace(config.data, camera_poses="calibration", can_bus="none", depth_cell=CELL)
     task = replace(config.task, model=model, losses=MapTrV2LossConfig())
     return replace(config, task=task, data=data)

@@ -198,3 +198,13 @@ def test_smaller_images_lie_in_the_corner_of_their_array():
     halved, same = see_pillars(CONFIG, larger)
     np.testing.assert_array_equal(same, visible)
     np.testing.assert_allclose(2 * halved, reference, rtol=1e-6)
+    # Published code also sees what lies over the padding, at the same places; or takes the image for the whole array.
+    places, more = see_pillars(replace(CONFIG, image_size="array"), larger)
+    np.testing.assert_allclose(places, halved, rtol=1e-6)
+    assert (np.asarray(more) >= same).all()
+    assert more.sum() > same.sum()
+    narrow = larger.replace(size=np.array([[32, 48], [64, 48], [64, 48]], np.int32))
+    stretched, fewer = see_pillars(replace(CONFIG, image_size="first"), narrow)
+    np.testing.assert_allclose(stretched, reference * np.array([2.0, 1.0], np.float32), rtol=1e-6)
+    inside = ((stretched > 0.0) & (stretched < 1.0)).all(-1)
+    np.testing.assert_array_equal(fewer, inside & np.asarray(visible))

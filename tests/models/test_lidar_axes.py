@@ -104,6 +104,21 @@ def test_ranges_and_rasters_turn_as_points_do():
     np.testing.assert_array_equal(raster_in_ego_axes(jnp.asarray(theirs)), ours)
 
 
+def test_the_road_users_ahead_come_first_in_either_axes():
+    """More road users than slots: those in the front sector stay, whichever way the axes point."""
+    lidar = range_in_lidar_axes(RANGE)
+    example = make_example(vehicle=False)  # a quarter turn about the origin
+    example.traffic_flow.position[..., :2] *= 0.4  # so that many lie in range
+    ego, turned = with_cameras(RANGE, range=RANGE), with_cameras(lidar, range=RANGE, axes="lidar")
+    here, there = (host.build_priors()["traffic_flow"].observe(example, None)[0] for host in (ego, turned))
+    assert (example.traffic_flow.valid.sum(1) >= 5).sum() > here.valid.sum() == len(here.valid)
+    np.testing.assert_array_equal(there.index, here.index)
+    np.testing.assert_allclose(there.weight, here.weight, atol=1e-6)
+    # A prior that takes x for forward prefers those to the right.
+    blind = turned.priors.build(replace(turned.spec, forward="x"))["traffic_flow"]
+    assert blind.observe(in_lidar_axes(example), None)[0].index.tolist() != here.index.tolist()
+
+
 def with_cameras(range_, kind=MapTrConfig, **settings):
     """Return a host with cameras on a grid over the range, in the grid's own axes."""
     images = replace(CAMERA.images, stages=(3,), pyramid=replace(CAMERA.images.pyramid, levels=1))

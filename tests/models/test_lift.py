@@ -4,16 +4,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.traverse_util import flatten_dict
 
 from tests.golden import case_id, golden_modules, load_module_case, options
 from tests.golden_compare import compare
 from tests.parameters import random_params
 from tflane_jax.convert.maptr import LIFT
 from tflane_jax.convert.renaming import convert
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.layers.depth_net import DepthNet
+from tflane_jax.limits import check_settings
 from tflane_jax.losses.map_masks import depth_targets
 from tflane_jax.losses.maptrv2 import depth_loss
-from tflane_jax.models.lift import LiftConfig, LiftEncoder, cell_numbers, collect, ray_points
+from tflane_jax.models.auxiliary import LineMaskHead
+from tflane_jax.models.lift import LiftConfig, LiftEncoder, camera_vector, cell_numbers, collect, ray_points
 from tflane_jax.models.traffic_raster import TrafficRasterConfig, TrafficRasterFusion
 from tflane_jax.priors.traffic_raster import CHANNELS, TrafficRaster
 from tflane_jax.scene import CameraViews
@@ -46,6 +51,9 @@ def test_it_matches_the_reference(path):
     pose = np.linalg.inv(inputs["camera2ego"].astype(np.float64)) @ inputs["lidar2ego"].astype(np.float64)[:, None]
     place = jax.vmap(lambda k, p: ray_points(k, p, size, shape, config.depth))
     points = jax.jit(place)(jnp.asarray(intrinsics), jnp.asarray(pose, jnp.float32))
+    # What the depth network knows of the cameras, from their calibration.
+    native, known = inputs["camera_intrinsics"][..., :2, :3], jnp.asarray(affine[..., :2, :])
+    vectors = jax.jit(jax.vmap(camera_vector))(native, known, jnp.asarray(np.linalg.inv(inputs["camera2ego"])))
     one_hot = case.outputs["gt_depth_onehot"].reshape(*points.shape[:2], *shape, config.bins)
     bins, counted = one_hot.argmax(-1), one_hot.any(-1)
 
@@ -57,12 +65,13 @@ def test_it_matches_the_reference(path):
             return model.apply(variables, features, vector, points, train=False, method="encode")
 
         features = jnp.asarray(arrays["images"]).transpose(0, 1, 3, 4, 2)
-        bev, logits = jax.vmap(one)(features, jnp.asarray(case.outputs["mlp_input"]), points)
+        bev, logits = jax.vmap(one)(features, vectors, points)
         loss = depth_loss(logits, bins, counted)
         return {
             "bev": bev.transpose(0, 3, 1, 2),
             "depth": jax.nn.softmax(logits, -1).transpose(0, 1, 4, 2, 3),
             "geom": points,
+            "mlp_input": vectors,
             "depth_loss": found.loss_depth_weight * loss,
         }
 
@@ -70,9 +79,8 @@ def test_it_matches_the_reference(path):
     constant = {name: case.params[name] for name in ("dx", "bx", "nx")}
     learned = {name: x for name, x in case.params.items() if name not in statistics and name not in constant}
     tolerances = {"geom": 1e-4, "bev": 1e-4}
-    ignore = ("mlp_input", "gt_depth_onehot")
     run = lambda params, arrays: outputs(params | statistics | constant, arrays)  # noqa: E731
-    compare(case, run, params=learned, ignore=ignore, tolerances=tolerances)
+    compare(case, run, params=learned, ignore=("gt_depth_onehot",), tolerances=tolerances)
     # Its bins are ours, but that a point nearer than the first bin hides all others in its cell.
     ours, valid = jax.vmap(lambda depth: targets_of(depth, shape, config.depth))(inputs["gt_depth"])
     near = (inputs["gt_depth"] > 0) & (inputs["gt_depth"] < config.depth[0])
@@ -111,6 +119,31 @@ def make_views(seed=0):
     intrinsics = np.tile(np.array([[20, 0, 24], [0, 20, 16], [0, 0, 1]], np.float32), (2, 1, 1))
     image = np.random.default_rng(seed).integers(0, 256, (2, 32, 48, 3), dtype=np.uint8)
     return CameraViews(image, np.tile([48, 32], (2, 1)), intrinsics, np.stack([ahead, back]), np.ones(2, bool))
+
+
+@pytest.mark.parametrize("depth", [(1.0, 35.0, 0.75), (1.0, 1.5, 1.0)])
+def test_depth_bins_are_whole(depth):
+    """45 1/3 bins would give targets of a bin that the network does not have."""
+    with pytest.raises(UserError, match=r"depth is .*whole bins from first to last"):
+        check_settings(LiftConfig(depth=depth), "")
+    check_settings(LiftConfig(depth=(1.0, 35.0, 0.1)), "")
+
+
+def test_kernels_start_as_published():
+    """Xavier-uniform in the whole depth network; PyTorch's default in the heads of the masks."""
+    cells, vector = jnp.zeros((1, 2, 3, 32)), jnp.zeros((1, 22))
+    network, head = DepthNet(32, 12, 24), LineMaskHead()
+    start = lambda: (network.init(jax.random.key(0), cells, vector, train=False), head.init(jax.random.key(1), cells))  # noqa: E731
+    depth, mask = (flatten_dict(one["params"], sep="/") for one in jax.jit(start)())
+    kernels = {name: leaf for name, leaf in depth.items() if name.endswith("kernel")}
+    assert len(kernels) == 2 + 2 * (2 + 2) + 6 + 6 + 1
+    for name, leaf in kernels.items():
+        area = np.prod(leaf.shape[:-2], dtype=int)
+        bound = np.sqrt(6.0 / (area * sum(leaf.shape[-2:])))
+        assert 0.95 * bound < np.abs(leaf).max() <= bound, name
+    for name, inputs in (("hidden/kernel", 9 * 32), ("out/kernel", 32)):
+        assert 0.8 * inputs**-0.5 < np.abs(mask[name]).max() <= inputs**-0.5
+    assert 0.0 < np.abs(mask["out/bias"]).max() <= 32**-0.5
 
 
 def test_the_points_of_a_ray_are_seen_in_their_image_cell_at_their_depth():

@@ -14,7 +14,7 @@ from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
 from tflane_jax.models.lane_denoising import DenoisingConfig
 from tflane_jax.models.maptrv2 import DecoupledLayer, MapTrV2Config
-from tflane_jax.scene import stack_examples
+from tflane_jax.scene import LineClass, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 DECODER = replace(SMALL_LINES.decoder, layers=2)
@@ -96,6 +96,25 @@ def make_depth_example(seed):
     depth = rng.uniform(1.0, 9.0, shape).astype(np.float32)
     cameras = example.cameras.replace(depth=depth, depth_valid=rng.random(shape) < 0.7)
     return example.replace(cameras=cameras, map_lines=make_line_example(seed).map_lines)
+
+
+def test_masks_show_only_the_classes_that_the_model_has():
+    """One divider and centerlines in the data, and a model of three classes."""
+    example = make_depth_example(0)
+    category = np.where(np.arange(len(example.map_lines.valid)) > 0, LineClass.CENTERLINE, LineClass.DIVIDER)
+    kept = example.map_lines.valid & (category != LineClass.CENTERLINE)
+    given = example.replace(map_lines=example.map_lines.replace(category=category))
+    without = example.replace(map_lines=given.map_lines.replace(valid=kept))
+    logits = {"line_mask": jnp.zeros((1, 6, 10)), "view_line_masks": jnp.zeros((1, 2, 4, 6))}
+
+    def losses(example, classes):
+        host = replace(MODEL, decoder=replace(DECODER, classes=classes))
+        batch = stack_examples([example])
+        terms = [TASK.losses.auxiliary_terms(name, one, None, batch, host) for name, one in logits.items()]
+        return [float(value[0]) for term in terms for value in term.values()]
+
+    assert losses(given, 3) == losses(without, 3)
+    assert losses(given, 4)[0] > losses(without, 4)[0]
 
 
 @pytest.mark.slow

@@ -1,11 +1,13 @@
 """Parameters and outputs at the papers' sizes, from shapes alone (counts: docs/reference/training.md)."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
+from tflane_jax.config import load_config
 from tflane_jax.convert.hosts import camera_shapes
 from tflane_jax.models import bevformer_detr, lanesegnet, maptr, maptrv2, toponet
 
@@ -95,6 +97,23 @@ def test_maptrv2_is_as_large_as_the_reference():
     assert count(params) == MAPTRV2_HEAD - MAPTRV2_UNUSED
     assert count(images) == MAPTRV2 - MAPTRV2_HEAD - 2 * 26_560
     assert answer.lines.points.shape[1:] == (50, 20, 2)
+
+
+def test_maptrv2_for_argoverse_2_has_a_third_coordinate():
+    """Of the first points, and of the changes in six layers; the lift is as large as for nuScenes."""
+    path = Path(__file__).parents[2] / "configs" / "tf_lane" / "maptrv2_r50.py"
+    run = load_config(f"{path}:argoverse2")
+    model, data = run.task.model, run.data
+    assert (model.encoder.bev.grid.rows, model.encoder.bev.grid.columns) == (100, 200)
+    assert (model.range.x, model.range.y, model.range.z) == ((-30.0, 30.0), (-15.0, 15.0), (-5.0, 3.0))
+    assert "depth" not in model.auxiliary
+    run.task.check_settings(data)
+    module, example = model.build(), camera_shapes(model.encoder)
+    answer, variables = jax.eval_shape(lambda key, e: module.init_with_output(key, e), jax.random.key(0), example)
+    params = variables["params"]
+    assert count(params) == MAPTRV2 - 2 * 26_560 - MAPTRV2_UNUSED + (1 + 6) * 257
+    assert count(params["encoder"]["bev"]) == LIFT
+    assert answer.lines.points.shape[1:] == (50, 20, 3)
 
 
 @pytest.mark.parametrize(("control_points", "expected"), [(None, POINT_LANES), (5, CURVE_LANES)])

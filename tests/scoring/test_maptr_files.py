@@ -73,6 +73,20 @@ def test_centerlines_are_a_fourth_class(tmp_path):
     assert row["mAP"] == pytest.approx((1 + 2 / 3) / 4)
 
 
+def test_heights_count_in_the_protocol_of_argoverse_2(tmp_path, capsys):
+    """A line 0.7 m above the true one, at thresholds of 0.5, 1 and 1.5 m."""
+    line = np.array([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])
+    truth = MapTruth([line], np.array([0]))
+    found = MapDetections([line + np.array([0.0, 0.0, 0.7])], np.array([0]), np.array([0.9]))
+    write(tmp_path, [(found, truth)])
+    assert run(tmp_path, "maptrv2-3d")[1]["AP_divider"] == pytest.approx(2 / 3)
+    assert run(tmp_path, "maptrv2")[0] == 2
+    assert "pts has shape (2, 3), expected (n, 2): such files are scored by maptrv2-3d" in capsys.readouterr().err
+    write(tmp_path, [(MapDetections([line[:, :2]], np.array([0]), np.array([0.9])), truth)])
+    assert run(tmp_path, "maptrv2-3d")[0] == 2
+    assert "pts has shape (2, 2), expected (n, 3): such files are scored by maptr or maptrv2" in capsys.readouterr().err
+
+
 DAMAGE = {
     "missing": (lambda r: r.pop(1), "frames are missing from the predictions: s1"),
     "twice": (lambda r: r.append(r[0]), "sample s0 is there twice"),

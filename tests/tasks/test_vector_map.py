@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.models.cases import LIFTED_LINES
+from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.loading import load_arrays
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.procedural import STREET_EXAMPLE, ProceduralDataset, WorldData
@@ -21,11 +23,13 @@ from tflane_jax.evaluation.found_lanes import confidences_of, lane_scores
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.losses.common import HostLossConfig
+from tflane_jax.losses.maptrv2 import MapTrV2LossConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.scene import LineClass, LinePrediction, MapLines, Prediction
 from tflane_jax.tasks import Model
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.world.cameras.ring import CameraRigConfig
 
 EXAMPLE = dataclasses.replace(STREET_EXAMPLE, map_lines=MapLinesConfig(lines=24, centerlines="include"))
 DATA = dataclasses.replace(WorldData.street(2, 2, 2), example=EXAMPLE)
@@ -131,6 +135,15 @@ def test_data_without_lines_or_with_other_points_are_refused():
         other = dataclasses.replace(DATA, example=dataclasses.replace(EXAMPLE, map_lines=lines))
         with pytest.raises(UserError, match=message):
             task.check(other, arrays())
+
+
+def test_the_depth_network_is_told_the_scale_of_the_images():
+    task = LaneGraphTask(LIFTED_LINES, MapTrV2LossConfig())
+    example = ExampleConfig(sensor=None, cameras=CameraRigConfig(scale=0.5), map_lines=MapLinesConfig(points=5))
+    task.check_settings(dataclasses.replace(DATA, example=example))
+    smaller = dataclasses.replace(example, cameras=CameraRigConfig(scale=0.3))
+    with pytest.raises(UserError, match=r"have 0\.3 times .* is told 0\.5 \(task\.model\.encoder\.bev\.image_scale\)"):
+        task.check_settings(dataclasses.replace(DATA, example=smaller))
 
 
 def test_pictures_of_training_and_of_a_comparison(tmp_path, monkeypatch):

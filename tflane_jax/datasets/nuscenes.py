@@ -3,6 +3,7 @@
 <root>/v1.0-trainval/*.json          the thirteen tables (or v1.0-mini, ...)
 <root>/maps/expansion/<city>.json    map expansion, version 1.3
 <root>/samples/CAM_*/*.jpg           images of the key frames; read if `NuScenesConfig.image` is given
+<root>/samples/LIDAR_TOP/*.pcd.bin   sweeps of the key frames; read if `NuScenesConfig.depth_cell` is given
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from tflane_jax.datasets.nuscenes_cameras import (
     sample_cameras,
     vehicle_state,
 )
+from tflane_jax.datasets.nuscenes_depth import with_depth
 from tflane_jax.datasets.nuscenes_log import (
     ReferenceFrame,
     SceneFrames,
@@ -49,6 +51,7 @@ from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Count, Rules
 from tflane_jax.scene import CameraViews, Example
 from tflane_jax.scene.logs import Log
 
@@ -74,6 +77,8 @@ class NuScenesConfig:
         can_bus: messages of the vehicle from the folder `can_bus`, by the "plain" rules or those of the "reference"
             (`nuscenes_can_bus.can_bus`), for published weights that read them (`BevFormerConfig.motion`).
         image: scaling and cropping of the camera images; None does not read them.
+        depth_cell: side of the square cells for which images have the depth of the lidar's nearest point, pixels
+            (MapTRv2 learns it in cells of 32); None does not read the sweeps.
         example: what is in an example, and its capacities. `example.cameras` must be None: cameras are real here.
         loading: memory or disk, and workers; no example depends on it.
     """
@@ -87,6 +92,7 @@ class NuScenesConfig:
     camera_poses: CameraPoses = "exposure"
     can_bus: CanBus = "none"
     image: ImageConfig | None = None
+    depth_cell: Count | None = None
     example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
 
@@ -129,7 +135,10 @@ class NuScenesDataset:
         if config.image is None:
             return example
         views = camera_views(self._cameras(index), self._fits, config.image)
-        sample, pose = self.frames(name).samples[number], self._frame_from_ego(name, number)
+        frames = self.frames(name)
+        sample, pose = frames.samples[number], self._frame_from_ego(name, number)
+        if config.depth_cell is not None:
+            views = with_depth(self.tables, sample, frames.global_from_ego[number], views, config.depth_cell)
         state = vehicle_state(self.tables, self.scenes[name], sample, pose, config.can_bus)
         return replace(example, cameras=replace(views, vehicle=state))
 
@@ -211,6 +220,7 @@ class NuScenesData:
         root: folder of the data set.
         train, val, test: which official split serves as each; the official test split has no annotations.
         version, splits, frame, least_visibility, camera_poses, can_bus, image, example, loading: see `NuScenesConfig`.
+        depth_cell: the same, of training images; others need no depth.
         augmentation: of the colours of training images, or None.
     """
 
@@ -225,25 +235,20 @@ class NuScenesData:
     camera_poses: CameraPoses = "exposure"
     can_bus: CanBus = "none"
     image: ImageConfig | None = None
+    depth_cell: Count | None = None
     example: ExampleConfig = NUSCENES_SIZES
     loading: StreamingConfig = StreamingConfig()
     augmentation: PhotometricConfig | None = None
 
+    def limits(self) -> Rules:
+        """Depth belongs to images."""
+        yield "depth_cell", self.depth_cell is None or self.image is not None, "None without images (image)"
+
     def source(self, split: Split) -> NuScenesConfig:
         """Return the dataset of a split."""
-        return NuScenesConfig(
-            root=self.root,
-            split=getattr(self, split),
-            version=self.version,
-            splits=self.splits,
-            frame=self.frame,
-            least_visibility=self.least_visibility,
-            camera_poses=self.camera_poses,
-            can_bus=self.can_bus,
-            image=self.image,
-            example=self.example,
-            loading=self.loading,
-        )
+        own = {"split": getattr(self, split), "depth_cell": self.depth_cell if split == "train" else None}
+        shared = {field.name: getattr(self, field.name) for field in fields(NuScenesConfig) if field.name not in own}
+        return NuScenesConfig(**shared, **own)
 
 
 def check_nuscenes(root: Path) -> FolderCheck:
@@ -303,7 +308,7 @@ def _row(location: str, count: Counter[str], expansion: MapExpansion | None) -> 
 def _choose(choice: Choice) -> NuScenesConfig:
     assert choice.root is not None
     if isinstance(choice.configured, NuScenesConfig):  # its splits stay as configured: the official test has no truth
-        return replace(choice.configured, root=choice.root)
+        return replace(choice.configured, root=choice.root, depth_cell=None)
     example = choice.configured.example
     image = getattr(choice.configured, "image", None)
     if image is None and example.cameras is not None:

@@ -13,7 +13,7 @@ from tflane_jax.layers.batch_norm import BatchNorm
 from tflane_jax.layers.graph import Mlp
 from tflane_jax.layers.resnet import BasicBlock
 
-# MapTRv2 initialises the whole network so.
+# MapTRv2 initialises all kernels of the network so.
 _INIT = nn.initializers.xavier_uniform()
 _DILATIONS = (1, 6, 12, 18)
 
@@ -47,11 +47,11 @@ class DepthNet(nn.Module):
         cameras = BatchNorm(name="camera_norm")(cameras, train=train)
         x = _conv(self.dim, 3, name="reduce", use_bias=True)(features)
         x = nn.relu(BatchNorm(name="reduce_norm")(x, train=train))
-        context = CameraGate(name="context_gate")(x, Mlp((self.dim, self.dim), name="context_mlp")(cameras))
+        context = CameraGate(name="context_gate")(x, Mlp((self.dim, self.dim), _INIT, name="context_mlp")(cameras))
         context = _conv(self.dim, 1, name="context", use_bias=True)(context)
-        depth = CameraGate(name="depth_gate")(x, Mlp((self.dim, self.dim), name="depth_mlp")(cameras))
+        depth = CameraGate(name="depth_gate")(x, Mlp((self.dim, self.dim), _INIT, name="depth_mlp")(cameras))
         for i in range(3):
-            depth = BasicBlock(self.dim, 1, False, name=f"block_{i}")(depth, train=train)
+            depth = BasicBlock(self.dim, 1, False, kernel_init=_INIT, name=f"block_{i}")(depth, train=train)
         depth = DilatedPyramid(self.dim, self.pyramid, self.dropout, name="pyramid")(depth, train=train)
         return _conv(self.bins, 1, name="depth", use_bias=True)(depth), context
 

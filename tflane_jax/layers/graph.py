@@ -143,15 +143,18 @@ class Mlp(nn.Module):
 
     Attributes:
         widths: output channels of each layer.
+        kernel_init: of every layer.
     """
 
     widths: tuple[int, ...]
+    kernel_init: nn.initializers.Initializer = nn.initializers.lecun_normal()
 
     @nn.compact
     def __call__(self, x: Float[Array, "*b c"]) -> Float[Array, "*b d"]:
         """Return the last layer's output, without activation."""
         for i, width in enumerate(self.widths):
-            x = nn.Dense(width, name=f"linear_{i}")(x if i == 0 else jax.nn.relu(x))
+            layer = nn.Dense(width, kernel_init=self.kernel_init, name=f"linear_{i}")
+            x = layer(x if i == 0 else jax.nn.relu(x))
         return x
 
 

@@ -156,13 +156,14 @@ class BasicBlock(nn.Module):
     stride: int
     frozen: bool
     dtype: Any = None
+    kernel_init: nn.initializers.Initializer = _INIT
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"], *, train: bool) -> Float[Array, "v ho wo co"]:
         """Return the block's features."""
-        y = _conv(self.channels, 3, self.stride, "conv1", self.dtype)(x)
+        y = _conv(self.channels, 3, self.stride, "conv1", self.dtype, self.kernel_init)(x)
         y = nn.relu(BatchNorm(self.frozen, name="bn1")(y, train=train))
-        y = _conv(self.channels, 3, 1, "conv2", self.dtype)(y)
+        y = _conv(self.channels, 3, 1, "conv2", self.dtype, self.kernel_init)(y)
         y = BatchNorm(self.frozen, name="bn2")(y, train=train)
         return nn.relu(y + _shortcut(x, self.channels, self.stride, self.frozen, train, self.dtype))
 
@@ -193,7 +194,9 @@ def _shortcut(x: jax.Array, channels: int, stride: int, frozen: bool, train: boo
     return BatchNorm(frozen, name="downsample_bn")(projected, train=train)
 
 
-def _conv(channels: int, size: int, stride: int, name: str, dtype: Any) -> nn.Conv:
+def _conv(
+    channels: int, size: int, stride: int, name: str, dtype: Any, init: nn.initializers.Initializer = _INIT
+) -> nn.Conv:
     pad = size // 2
     return nn.Conv(
         channels,
@@ -201,7 +204,7 @@ def _conv(channels: int, size: int, stride: int, name: str, dtype: Any) -> nn.Co
         (stride, stride),
         [(pad, pad), (pad, pad)],
         use_bias=False,
-        kernel_init=_INIT,
+        kernel_init=init,
         dtype=dtype,
         conv_general_dilated=convolve,
         name=name,

@@ -81,12 +81,13 @@ def depth_targets(
         UserError: the cameras have no depth, or its cells do not fit those of the feature map.
     """
     if views.depth is None or views.depth_valid is None:
-        raise UserError("these cameras have no depth: set data.example.cameras.depth_cell")
+        raise UserError("these cameras have no depth: set data.example.cameras.depth_cell (nuScenes: data.depth_cell)")
     (h, w), (rows, columns) = shape, views.depth.shape[1:]
     if rows % h or columns % w or rows // h != columns // w:
         raise UserError(
             f"depth in {rows} x {columns} cells does not fit features of {h} x {w}: set "
-            "data.example.cameras.depth_cell to the stride of the features in pixels, or to a fraction of it"
+            "data.example.cameras.depth_cell (nuScenes: data.depth_cell) to the stride of the features in pixels, or "
+            "to a fraction of it"
         )
     factor = rows // h
     depth = jnp.where(views.depth_valid & (views.depth >= low), views.depth, jnp.inf)

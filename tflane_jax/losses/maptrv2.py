@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -44,7 +44,7 @@ class MapTrV2LossConfig(MapTrLossConfig):
     def auxiliary_terms(self, name: str, output: Any, targets: LineTargets, batch: Example, host: Any) -> Terms:
         """Return the weighted losses of an auxiliary output, see `MapTrLossConfig.auxiliary_terms`."""
         range_ = host.bev_range
-        lines: Any = batch.map_lines
+        lines: Any = of_classes(batch.map_lines, host.decoder.classes)
         views: Any = batch.cameras
         if name == "one_to_many":
             terms = one_to_many_losses(output, targets, range_, self)
@@ -61,6 +61,11 @@ class MapTrV2LossConfig(MapTrLossConfig):
             bins, valid = jax.vmap(each)(views)
             return {"depth": self.depth_weight * depth_loss(output, bins, valid)[None]}
         return super().auxiliary_terms(name, output, targets, batch, host)
+
+
+def of_classes(lines: Any, classes: int) -> Any:
+    """Return map lines of which those of a class that the model does not have are not valid: no mask shows them."""
+    return replace(lines, valid=lines.valid & (lines.category < classes))
 
 
 def one_to_many_losses(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import flax.linen as nn
+import jax
+import jax.numpy as jnp
 from flax import struct
 from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float
@@ -86,10 +88,18 @@ class LaneCellHead(nn.Module):
 
 
 class LineMaskHead(nn.Module):
-    """Whether any line passes through a cell, from features of the cells."""
+    """Whether any line passes through a cell, from features of the cells; initialised as in PyTorch."""
 
     @nn.compact
     def __call__(self, features: Float[Array, "*v h w c"]) -> Float[Array, "*v h w"]:
         """Return the logit of each cell."""
-        x = nn.relu(nn.Conv(features.shape[-1], (3, 3), use_bias=False, name="hidden")(features))
-        return nn.Conv(1, (1, 1), name="out")(x)[..., 0]
+        channels = features.shape[-1]
+        hidden, out = _uniform(9 * channels), _uniform(channels)
+        x = nn.relu(nn.Conv(channels, (3, 3), use_bias=False, kernel_init=hidden, name="hidden")(features))
+        return nn.Conv(1, (1, 1), kernel_init=out, bias_init=out, name="out")(x)[..., 0]
+
+
+def _uniform(fan_in: int) -> nn.initializers.Initializer:
+    """Return PyTorch's default of kernels and biases: uniform within 1 / sqrt(fan in)."""
+    limit = fan_in**-0.5
+    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -limit, limit)

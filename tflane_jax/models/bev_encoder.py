@@ -8,6 +8,8 @@ from the paper:
 - `align="bevformer"` (BEVFormer, MapTR, OpenLane-V2's baseline, SMERF) does the same with a shift along the axes of
   nuScenes' lidar; on a grid with x forward, such as OpenLane-V2's, this moves the points sideways.
 - `temporal_value="initial"`: in every layer, the value of the present frame is the queries before the first layer.
+- `image_size="array"` (BEVFormer, MapTR): cameras also see points over the padding of their images; "first" (TopoNet,
+  LaneSegNet): pixels of all cameras are divided by the size of the first image, though features cover padded arrays.
 - `value_projections=2` (OpenLane-V2's baseline, SMERF): temporal attention projects its value twice.
 """
 
@@ -63,6 +65,8 @@ class BevFormerConfig:
             "warp"; None: the vehicle. TopoNet's published (50, 100) on 200 x 100 cells is not the vehicle.
         temporal_value: the present frame's value in temporal attention, see the module docstring.
         value_projections: how many times temporal attention projects its value.
+        image_size: by which the pixels of a point are divided; a camera sees what lies within it. "own": that of each
+            image; "array" and "first": as in published code, see the module docstring.
         remat: recompute each layer's activations for the gradient instead of keeping them.
         precision: dtype of the projections; parameters, sampling locations and results are float32.
         initial: values of the queries and of the tables of their positions at the start of training. "mixed": normal of
@@ -93,6 +97,7 @@ class BevFormerConfig:
     memory: Literal["previous", "off"] = "previous"
     motion: Literal["moved", "can_bus"] = "moved"
     initial: Literal["mixed", "xavier", "normal"] = "mixed"
+    image_size: Literal["own", "array", "first"] = "own"
 
     def limits(self) -> Rules:
         """Channels split over heads, sampling points over anchors."""

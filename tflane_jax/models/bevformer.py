@@ -135,17 +135,20 @@ class MotionEmbedding(nn.Module):
 def see_pillars(config: BevFormerConfig, cameras: CameraViews) -> tuple[Float[Array, "v q z 2"], Bool[Array, "v q z"]]:
     """Return where each camera sees the pillar points of all queries, and which of them it sees.
 
-    Positions are fractions of the padded image array, because the features cover that array with its padding.
+    Positions are fractions of the padded image array, because the features cover that array with its padding; but see
+    `BevFormerConfig.image_size`.
     """
     points = config.grid.range.denormalise(pillar_points(config.grid, config.anchors))
+    height, width = cameras.image.shape[1:3]
+    array, own = jnp.array([[width, height]]), jnp.asarray(cameras.size)
+    size = jnp.broadcast_to({"own": own, "array": array, "first": own[:1]}[config.image_size], own.shape)
     # Full float32: accelerators may multiply matrices at lower precision by default.
     with jax.default_matmul_precision("highest"):
-        fraction, inside = project_pillars(
-            jnp.asarray(points), cameras.intrinsics, cameras.camera_from_ego, jnp.asarray(cameras.size)
-        )
-    height, width = cameras.image.shape[1:3]
-    used = jnp.asarray(cameras.size).astype(fraction.dtype) / jnp.array([width, height], fraction.dtype)[None]
-    return fraction * used[:, None, None], inside & cameras.valid[:, None, None]
+        fraction, inside = project_pillars(jnp.asarray(points), cameras.intrinsics, cameras.camera_from_ego, size)
+    if config.image_size != "first":
+        used = size.astype(fraction.dtype) / array.astype(fraction.dtype)
+        fraction = fraction * used[:, None, None]
+    return fraction, inside & cameras.valid[:, None, None]
 
 
 def seen_queries(config: BevFormerConfig, cameras: CameraViews) -> Int[Array, " v"]:

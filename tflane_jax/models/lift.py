@@ -66,13 +66,12 @@ class LiftConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """The depth bins follow each other."""
+        """Whole depth bins follow each other from the first depth to the last."""
         first, last, size = self.depth
-        yield (
-            "depth",
-            first + size <= last,
-            "(first, last, size of a bin), with a bin between first and last",
-        )
+        count = (last - first) / size
+        fits = first + size <= last and abs(count - round(count)) < 1e-6
+        whole = f"(first, last, size of a bin), with whole bins from first to last, not {count:g} of them"
+        yield "depth", fits, whole
 
     @property
     def bins(self) -> int:
@@ -171,7 +170,9 @@ class LiftEncoder(nn.Module):
             with jax.default_matmul_precision("highest"):
                 own = pose @ invert_pose(jnp.asarray(cameras.vehicle.vehicle_from_ego))[None]
             pose = jnp.where(valid, own, eye)
-        vector = camera_vector(intrinsics, pose, self.config.image_scale)
+        scale = self.config.image_scale
+        affine = jnp.broadcast_to(jnp.array([[[scale, 0.0, 0.0], [0.0, scale, 0.0]]]), (len(intrinsics), 2, 3))
+        vector = camera_vector(intrinsics[:, :2] / scale, affine, pose)
         return self.encode(features, vector, points, train=train, fuse=fuse)
 
 
@@ -223,20 +224,24 @@ def ray_points(
 
 
 def camera_vector(
-    intrinsics: Float[Array, "v 3 3"], camera_from_ego: Float[Array, "v 4 4"], scale: float
+    native: Float[Array, "v 2 3"], affine: Float[Array, "v 2 3"], camera_from_ego: Float[Array, "v 4 4"]
 ) -> Float[Array, "v 22"]:
     """Return the parameters that the depth network knows of each camera.
 
-    Focal lengths and centre of the native image, the rows of the affine map from it to the image (2 x 3), and the
-    camera's pose in the ego frame (3 x 4), which is the vehicle's own where that is known.
+    Focal lengths and centre of the native image, the rows of the affine map, and the camera's pose in the ego frame
+    (3 x 4).
+
+    Args:
+        native: the first two rows of the intrinsics of the native images, pixels.
+        affine: maps pixels of the native images to those of the images.
+        camera_from_ego: extrinsics, metres; from the vehicle's own frame where that is known.
     """
-    count, native = len(intrinsics), intrinsics[:, :2] / scale
+    count = len(native)
     lens = jnp.stack([native[:, 0, 0], native[:, 1, 1], native[:, 0, 2], native[:, 1, 2]], -1)
-    affine = jnp.broadcast_to(jnp.array([[scale, 0.0, 0.0, 0.0, scale, 0.0]]), (count, 6))
     rotation = camera_from_ego[:, :3, :3].swapaxes(1, 2)
     place = -jnp.einsum("vij,vj->vi", rotation, camera_from_ego[:, :3, 3])
     pose = jnp.concatenate([rotation, place[..., None]], -1).reshape(count, 12)
-    return jnp.concatenate([lens, affine, pose], -1)
+    return jnp.concatenate([lens, affine.reshape(count, 6), pose], -1)
 
 
 def cell_numbers(

@@ -7,7 +7,6 @@ line. Every decoder layer moves all points; the class of a line comes from the m
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal, NamedTuple
@@ -27,7 +26,6 @@ from tflane_jax.models.lane_decoder import LaneDecoderLayer, clipped
 from tflane_jax.models.lane_denoising import DenoisingConfig, noised_lanes
 from tflane_jax.models.lane_queries import spread_lanes
 from tflane_jax.models.lane_segments import Branch
-from tflane_jax.models.prior import HostQueries
 from tflane_jax.scene import MapLines
 
 
@@ -223,9 +221,10 @@ def decode_line_layers(
     limits: PerceptionRange | None,
     *,
     deterministic: bool,
-    fuse: Callable[[int, HostQueries], Float[Array, "q c"]] | None = None,
 ) -> list[LineOutput]:
-    """Return the outputs of all decoder layers; part of a compact module, with `layer_{i}` and `heads_{i}`.
+    """Return the outputs of all decoder layers of a host's part without priors; part of a compact module.
+
+    The modules are `layer_{i}` and `heads_{i}`; the hosts of map lines have this loop, with priors, in their files.
 
     Args:
         module: the compact module that is being called.
@@ -234,14 +233,11 @@ def decode_line_layers(
         bev: BEV features.
         range_, limits: of the heads, see `LineHeads`.
         deterministic: no dropout.
-        fuse: layer and all I P queries -> the queries with priors; None for none.
     """
     content, position, reference = start
     queries, outputs = content.reshape(-1, config.dim), []
     for i in range(config.layers):
         placed = point_position(config, i, position, reference).reshape(-1, config.dim)
-        if fuse is not None:
-            queries = fuse(i, HostQueries(queries, placed, reference.reshape(queries.shape[0], 1, -1)))
         around = reference[..., :2].reshape(-1, 1, 2)
         layer, inputs = partial(LaneDecoderLayer, config, name=f"layer_{i}"), (queries, placed, around, bev, None)
         queries = run_layer(module, layer, config, *inputs, deterministic=deterministic)

@@ -8,21 +8,25 @@ same. Source: docs/reference/maptr.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.layers.fpn import FeaturePyramidConfig
+from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, check_settings
 from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import Host, HostConfig
 from tflane_jax.models.image_encoder import PAPER_IMAGE_ENCODER
+from tflane_jax.models.lane_decoder import LaneDecoderLayer
 from tflane_jax.models.lane_denoising import DenoisingConfig, decode_groups
 from tflane_jax.models.lidar_axes import (
     InLidarAxes,
@@ -35,14 +39,15 @@ from tflane_jax.models.lidar_axes import (
 from tflane_jax.models.map_lines import (
     PAPER_LINE_DECODER,
     LineDecoderConfig,
+    LineHeads,
     LineOutput,
     LineQueries,
     NoisedLines,
     PointQueries,
-    decode_line_layers,
+    point_position,
 )
 from tflane_jax.models.parameters import with_equal_heads
-from tflane_jax.models.prior import HostSpec, Prior
+from tflane_jax.models.prior import HostQueries, HostSpec, Prior
 from tflane_jax.models.priors import ByPrior, fuse_into_queries
 from tflane_jax.scene import Example, LineClass, LinePrediction, MapLines, Prediction
 
@@ -100,7 +105,7 @@ class MapTrConfig(HostConfig):
     def spec(self) -> HostSpec:
         """The properties of the host that priors depend on, in the host's own axes."""
         spec = super().spec
-        return spec if self.axes == "ego" else replace(spec, range=range_in_lidar_axes(self.range))
+        return spec if self.axes == "ego" else replace(spec, range=range_in_lidar_axes(self.range), forward="y")
 
     def seen(self, example: Example) -> Example:
         """Return an example in the host's own axes."""
@@ -181,7 +186,9 @@ class MapTr(Host):
         """
         return turned(self.decode_one_to_one(bev, tokens, lines, deterministic), level)
 
-    def decode_one_to_one(self, bev, tokens, lines, deterministic) -> Prediction:
+    def decode_one_to_one(
+        self, bev: Float[Array, "h w e"], tokens: ByPrior | None, lines: MapLines | None, deterministic: bool
+    ) -> Prediction:
         """Return the predictions of the learned queries, and sow those of noised ones in training; in `decode`."""
         config, range_ = self.config, self.config.spec.bev_range
         start = LineQueries(config.decoder, range_, name="queries")()
@@ -191,19 +198,31 @@ class MapTr(Host):
         noised = NoisedLines(config.decoder, config.denoising, range_, name="noised")(lines)
         return decode_groups(self, start, noised, *rest)
 
-    def decode_queries(self, start: PointQueries, bev, elements, tokens, deterministic) -> Prediction:
-        """Return the predictions of one set of queries."""
-        spec, priors = self.config.spec, self.priors.by_name
-        outputs = decode_line_layers(
-            self,
-            self.config.decoder,
-            start,
-            bev,
-            spec.bev_range,
-            spec.range,
-            deterministic=deterministic,
-            fuse=lambda layer, queries: fuse_into_queries(priors, tokens, layer, queries),
-        )
+    def decode_queries(
+        self, start: PointQueries, bev: Float[Array, "h w e"], elements: None, tokens: ByPrior, deterministic: bool
+    ) -> Prediction:
+        """Return the predictions of one set of queries.
+
+        Args:
+            start: I lines of P points: content and position (I, P, C), points (I, P, D) in [0, 1].
+            bev: BEV features.
+            elements: None; the place of the traffic elements of other hosts, see `lane_denoising.decode_groups`.
+            tokens: of the priors, by name.
+            deterministic: no dropout.
+        """
+        config, spec, (content, position, reference) = self.config.decoder, self.config.spec, start
+        queries, outputs = content.reshape(-1, config.dim), []
+        for i in range(config.layers):
+            placed = point_position(config, i, position, reference).reshape(-1, config.dim)
+            points = HostQueries(queries, placed, reference.reshape(len(queries), 1, -1))
+            queries = fuse_into_queries(self.priors.by_name, tokens, i, points)
+            # Attention among all I P queries, then to the BEV features around each point.
+            around = reference[..., :2].reshape(-1, 1, 2)
+            layer, inputs = partial(LaneDecoderLayer, config, name=f"layer_{i}"), (queries, placed, around, bev, None)
+            queries = run_layer(self, layer, config, *inputs, deterministic=deterministic)
+            heads = LineHeads(config, spec.bev_range, spec.range, name=f"heads_{i}")
+            outputs.append(heads(queries.reshape(content.shape), reference))
+            reference = lax.stop_gradient(outputs[-1].unit)
         return make_prediction(outputs)
 
 

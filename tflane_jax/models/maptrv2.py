@@ -126,8 +126,16 @@ class MapTrV2(MapTr):
             self.sow(AUXILIARY, "one_to_many", jax.tree.map(lambda leaf: leaf[:, count:], found.lines))
         return jax.tree.map(lambda leaf: leaf[:, :count], found)
 
-    def decode_queries(self, start: PointQueries, bev, elements, tokens, deterministic) -> Prediction:
-        """Return the predictions of one set of queries; those of the one-to-many group exchange nothing with others."""
+    def decode_queries(
+        self, start: PointQueries, bev: Float[Array, "h w e"], elements: None, tokens: ByPrior, deterministic: bool
+    ) -> Prediction:
+        """Return the predictions of one set of queries; those of the one-to-many group exchange nothing with others.
+
+        Args:
+            start: I lines of P points, those of the one-to-many group last: content and position (I, P, C), points
+                (I, P, D) in [0, 1].
+            bev, elements, tokens, deterministic: see `MapTr.decode_queries`.
+        """
         config, spec, (queries, position, reference) = self.config.decoder, self.config.spec, start
         (lines, points, dim), outputs = queries.shape, []
         groups, sizes = None, ()

@@ -34,12 +34,14 @@ class HostSpec:
         bev_range: the box that the BEV features cover and that normalised coordinates span, metres.
         query_type: a query represents a whole lane ("instance": TopoNet, LaneSegNet) or one of its points ("point":
             MapTR), see TF-Lane, Eq. (3).
+        forward: axis of the host's frame that points ahead of the vehicle; "y" in the axes of nuScenes' lidar.
     """
 
     dim: int
     range: PerceptionRange
     bev_range: PerceptionRange
     query_type: Literal["instance", "point"] = "instance"
+    forward: Literal["x", "y"] = "x"
 
 
 BevHook = Callable[[int, Any, Float[Array, "q c"], Float[Array, "q c"]], Float[Array, "q c"]]

@@ -150,7 +150,7 @@ class TrafficFlowPrior(Prior):
         prior, host = self.config.prior, self.host
         if flow is None:
             flow = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames))
-        return select_traffic_flow(flow, prior, host.range, host.bev_range)
+        return select_traffic_flow(flow, prior, host.range, host.bev_range, host.forward)
 
     def encode(self, observation: TrafficFlowTokens, *, deterministic: bool) -> EncodedTrafficFlow:
         """Return TF_Feat (T, D) beside the tracks that it encodes."""

@@ -77,15 +77,20 @@ class TrafficFlowTokens:
 
 
 def select_traffic_flow(
-    flow: TrafficFlow, config: TrafficFlowPriorConfig, region: PerceptionRange, bev_range: PerceptionRange
+    flow: TrafficFlow,
+    config: TrafficFlowPriorConfig,
+    region: PerceptionRange,
+    bev_range: PerceptionRange,
+    forward: Literal["x", "y"] = "x",
 ) -> TrafficFlowTokens:
     """Return the tokens of one frame's traffic flow; padding in `flow` may hold anything.
 
     Args:
-        flow: tracks in the current ego frame.
+        flow: tracks in the current frame of the host.
         config: selection.
         region: R_t, the host's perception range; positions outside it are ignored.
         bev_range: the box of the host's BEV features, which normalised coordinates span.
+        forward: axis of the host's frame that points ahead: y in the axes of nuScenes' lidar.
 
     Raises:
         ValueError: the traffic flow has fewer frames than the configuration.
@@ -111,7 +116,7 @@ def select_traffic_flow(
 
     latest = _latest_valid(frame_valid)
     here = xp.take_along_axis(position[..., :2], latest[:, None, None], axis=1)[:, 0]
-    weight = xp.where(instance_valid, ego_centric_weight(here, config), 0.0)
+    weight = xp.where(instance_valid, ego_centric_weight(here, config, forward), 0.0)
 
     # By descending weight, then by distance (the whole front sector has one weight); both sorts are stable.
     nearest = xp.argsort(xp.where(instance_valid, (here**2).sum(-1), xp.inf), stable=True)
@@ -138,15 +143,18 @@ def select_traffic_flow(
     )
 
 
-def ego_centric_weight(position: Float[Array, "k 2"], config: TrafficFlowPriorConfig) -> Float[Array, " k"]:
-    """Return the weight of instances at these positions (ego frame, metres), in (0, 1].
+def ego_centric_weight(
+    position: Float[Array, "k 2"], config: TrafficFlowPriorConfig, forward: Literal["x", "y"] = "x"
+) -> Float[Array, " k"]:
+    """Return the weight of instances at these positions (metres, vehicle at the origin), in (0, 1].
 
     1 within the front sector; elsewhere it decreases with bearing and distance. The paper (section 3.3) defines the
     sector and states that weights decrease "based on relative positions"; both factors are our choice.
     """
     xp = namespace(position)
     half = math.radians(config.front_sector_deg) / 2
-    bearing = xp.abs(xp.arctan2(position[..., 1], position[..., 0]))
+    ahead, aside = (0, 1) if forward == "x" else (1, 0)
+    bearing = xp.abs(xp.arctan2(position[..., aside], position[..., ahead]))
     distance = xp.sqrt((position**2).sum(-1))
     off_axis = 1.0 - 0.5 * (bearing - half) / (math.pi - half)
     outside = off_axis / (1.0 + distance / config.distance_scale)

@@ -1,8 +1,8 @@
 """MapTR's files: `nuscmap_results.json` and the ground truth that its evaluation writes (`*_map_anns_val.json`).
 
 Both are lists of {"sample_token", "vectors": [{"pts", "cls_name", "confidence_level" (results only)}]}, under "results"
-and under "GTs". Other fields of MapTR (`pts_num`, `type`) repeat these. For groups by occlusion, the truth has one of
-ours, `visibility`, 0 to 1.
+and under "GTs". Other fields of MapTR (`pts_num`, `type`) repeat these. Points are (x, y), or (x, y, z) in MapTRv2's
+variant for Argoverse 2. For groups by occlusion, the truth has a field of ours, `visibility`, 0 to 1.
 """
 
 from __future__ import annotations
@@ -15,26 +15,35 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_file, member, numbers, scores
-from tflane_jax.metrics.map_matching import LINE_CLASSES, MapDetections, MapTruth
+from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
 _FARTHEST = 1e5
 
 
-def read_predictions(path: Path) -> dict[str, MapDetections]:
-    """Return the detections by sample token; raises UserError that names file, sample and field."""
+def read_predictions(path: Path, dims: Dims = 2) -> dict[str, MapDetections]:
+    """Return the detections by sample token, see `read_truth`."""
     frames = {}
     for token, vectors, where in _samples(path, "results"):
-        lines = _lines(vectors, where, least=1)
+        lines = _lines(vectors, where, 1, dims)
         levels = [member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)]
         frames[token] = MapDetections(*lines, scores(levels, f"{where}: confidence_level"))
     return frames
 
 
-def read_truth(path: Path) -> dict[str, MapTruth]:
-    """Return the annotations by sample token; raises UserError that names file, sample and field."""
+def read_truth(path: Path, dims: Dims = 2) -> dict[str, MapTruth]:
+    """Return the annotations by sample token.
+
+    Args:
+        path: of the file.
+        dims: coordinates of a point, which are those that the metric compares.
+
+    Raises:
+        UserError: it names file, sample and field; also for points with other coordinates, whose numbers would be those
+            of another protocol.
+    """
     return {
-        token: MapTruth(*_lines(vectors, where, least=2), visibility=_visibility(vectors, where))
+        token: MapTruth(*_lines(vectors, where, 2, dims), visibility=_visibility(vectors, where))
         for token, vectors, where in _samples(path, "GTs")
     }
 
@@ -54,14 +63,17 @@ def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
     return samples
 
 
-def _lines(vectors: Any, where: str, least: int) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return points and classes; `least` is the number of points that a line must have."""
+def _lines(vectors: Any, where: str, least: int, dims: Dims) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return points and classes; `least` is the number of points that a line must have, `dims` that of coordinates."""
     points, classes = [], []
     for i, vector in enumerate(vectors):
         at = f"{where}: vectors[{i}]"
         line = numbers(member(vector, "pts", at), (None, None), f"{at}.pts", largest=_FARTHEST)
         if line.shape[1] not in (2, 3) or len(line) < least:
-            raise UserError(f"{at}.pts has shape {line.shape}, expected (n, 2) with n of at least {least}")
+            raise UserError(f"{at}.pts has shape {line.shape}, expected (n, {dims}) with n of at least {least}")
+        if line.shape[1] != dims:
+            other = "maptr or maptrv2" if dims == 3 else "maptrv2-3d"
+            raise UserError(f"{at}.pts has shape {line.shape}, expected (n, {dims}): such files are scored by {other}")
         if "pts_num" in vector and vector["pts_num"] != len(line):
             told = reprlib.repr(vector["pts_num"])
             raise UserError(f"{at}.pts_num is {told}, but pts has {len(line)} points: is the line cut off?")
@@ -69,7 +81,7 @@ def _lines(vectors: Any, where: str, least: int) -> tuple[list[np.ndarray], np.n
         if not isinstance(name, str) or name not in LINE_CLASSES:
             shown = reprlib.repr(name)
             raise UserError(f"{at}.cls_name is {shown:.40}, expected one of {', '.join(LINE_CLASSES)}")
-        points.append(line[:, :2])
+        points.append(line)
         classes.append(LINE_CLASSES.index(name))
     return points, np.array(classes, np.int64)
 

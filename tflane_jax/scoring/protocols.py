@@ -14,7 +14,7 @@ from tflane_jax.files import tusimple
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.groups import ByDistance
 from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, LaneSegmentMetrics
-from tflane_jax.metrics.map_matching import LINE_CLASSES, Measure, Sampling
+from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, Measure, Sampling
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
@@ -99,20 +99,18 @@ def _lane_segment(flavour: Flavour, columns: tuple[str, ...]) -> ScoringProtocol
     )
 
 
-def _maptr(sampling: Sampling, measure: Measure = "chamfer") -> ScoringProtocol:
+def _maptr(sampling: Sampling, measure: Measure = "chamfer", dims: Dims = 2) -> ScoringProtocol:
+    grouped = partial(GroupedMapMetrics, sampling=sampling, measure=measure, dims=dims)
     return ScoringProtocol(
-        read_predictions=maptr.read_predictions,
-        read_truth=maptr.read_truth,
+        read_predictions=partial(maptr.read_predictions, dims=dims),
+        read_truth=partial(maptr.read_truth, dims=dims),
         scene_of=lambda token: token,
         no_scenes="MapTR's files do not say which drive a sample is of, and single samples are drawn",
-        metrics=partial(VectorMapMetrics, sampling, measure),
+        metrics=partial(VectorMapMetrics, sampling, measure, dims),
         columns=("mAP", *(f"AP_{name}" for name in LINE_CLASSES)),
         formats=("MapTR",),
         remarks=remarks.map_lines,
-        groups={
-            "occlusion": partial(GroupedMapMetrics, sampling=sampling, measure=measure),
-            "distance": partial(GroupedMapMetrics, partition=ByDistance(), sampling=sampling, measure=measure),
-        },
+        groups={"occlusion": grouped, "distance": partial(grouped, partition=ByDistance())},
     )
 
 
@@ -143,6 +141,7 @@ PROTOCOLS: dict[str, ScoringProtocol] = {
     ),
     "maptr": _maptr("maptr"),
     "maptrv2": _maptr("maptrv2"),
+    "maptrv2-3d": _maptr("maptrv2", dims=3),
     "maptr-iou": _maptr("maptr", "iou"),
     "maptrv2-iou": _maptr("maptrv2", "iou"),
     "tusimple": _tusimple(OFFICIAL_TIME_LIMIT),

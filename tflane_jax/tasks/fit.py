@@ -13,21 +13,23 @@ from tflane_jax.models.bevformer import check_capacity
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.host import HostConfig
+from tflane_jax.models.lift import LiftConfig
 from tflane_jax.scene import Example
 
 
-def check_settings_fit(model: HostConfig, config: ExampleConfig, *, images: bool) -> None:
+def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale: float | None) -> None:
     """Raise UserError where data and model cannot fit together whatever the examples are.
 
-    Ranges, points or forms of the truth differ, or the data lack the camera images, the evidence, the past frames or
-    the prior that the model reads, or the lines of a map that it learns.
+    Ranges, points or forms of the truth differ, or the scale of the images, or the data lack the camera images, the
+    evidence, the past frames or the prior that the model reads, or the lines of a map that it learns.
 
     Args:
         model: the host.
         config: of the examples.
-        images: whether examples have camera images.
+        image_scale: of the camera images in examples, relative to the camera's own; None: there are no images.
     """
-    _check_inputs(model, config, images=images)
+    _check_inputs(model, config, images=image_scale is not None)
+    _check_scale(model, image_scale)
     _check_ranges(model, config)
     _check_lines(model, config)
     _check_points(model, config)
@@ -111,6 +113,20 @@ def _check_inputs(model: HostConfig, config: ExampleConfig, *, images: bool) -> 
                 f"this model reads a prior (task.model.priors.{name}), and data.example.{name} is None: set that one "
                 "as well, or leave the prior out"
             )
+
+
+def _check_scale(model: HostConfig, image_scale: float | None) -> None:
+    """The lift's depth network is told by which factor images are smaller than the camera's own."""
+    encoder = model.encoder
+    if image_scale is None or not isinstance(encoder, CameraEncoderConfig) or not isinstance(encoder.bev, LiftConfig):
+        return
+    known = encoder.bev.image_scale
+    if abs(known - image_scale) > 1e-6:
+        raise UserError(
+            f"images have {image_scale:g} times the camera's own size (data.image.scale, or data.example.cameras.scale "
+            f"of the built-in world), and the model is told {known:g} (task.model.encoder.bev.image_scale): set the "
+            "latter to the former"
+        )
 
 
 _NO_LINES = (

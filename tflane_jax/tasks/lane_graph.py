@@ -206,8 +206,8 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     def check_settings(self, data: SplitData) -> None:
         """Raise UserError where settings of data and model do not fit together, see `tasks.fit`."""
         source, world = data.source("train"), getattr(data, "world", None)
-        images = source.example.cameras is not None or getattr(source, "image", None) is not None
-        check_settings_fit(self.model, source.example, images=images)
+        images = source.example.cameras or getattr(source, "image", None)
+        check_settings_fit(self.model, source.example, image_scale=None if images is None else images.scale)
         if self.time == "scan" and not self.loops:
             clips = "'unrolled', without clips (task.clip above 1) of a host that carries BEV features between frames"
             raise SettingError("task.time", self.time, clips)

@@ -17,7 +17,7 @@ _FILES = """Protocols and their files:
       mAP of the LaneSegNet and TF-Lane papers.
   openlane-v2-f-score
       The files of the centerline protocols; the devkit's F-score of 3-D lanes.
-  maptr, maptrv2, maptr-iou, maptrv2-iou
+  maptr, maptrv2, maptrv2-3d, maptr-iou, maptrv2-iou
       MapTR's nuscmap_results.json and the *_map_anns_val.json that its evaluation writes; -iou matches lines by the
       overlap of their buffers.
   tusimple, tusimple-lstr

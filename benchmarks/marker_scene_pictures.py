@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.geometry import relative_pose
@@ -20,6 +19,7 @@ from tflane_jax.plots.style import LANE_CLEAR, LANE_HIDDEN, ROAD
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.scene import CameraViews, Example, Prediction
 from tflane_jax.scene.logs import KeyFrame
+from tflane_jax.tasks.lane_pictures import lanes_of
 from tflane_jax.tasks.marker_drive import DriveStep
 
 # Gaps in the picture, each of a scene of its own.
@@ -81,7 +81,9 @@ def sighting(views: CameraViews, moment: KeyFrame, step: DriveStep) -> Sighting 
     board = min(rows, key=lambda k: float(np.hypot(*detected.pose[k, :2, 3])))
     camera = int(detected.camera[board])
     names = ("image", "size", "intrinsics", "camera_from_ego", "valid")
-    alone = CameraViews(**{name: np.array(getattr(views, name)[camera : camera + 1]) for name in names})
+    # Copies: the other images are not kept.
+    image, size, intrinsics, extrinsics, valid = (np.array(getattr(views, name)[camera : camera + 1]) for name in names)
+    alone = CameraViews(image, size, intrinsics, extrinsics, valid)
     return Sighting(moment, step, alone, camera, board)
 
 
@@ -96,7 +98,9 @@ def save_gaps(path: Path, gaps: Sequence[Gap], source: ProceduralConfig) -> Path
         return None
     example, rows = source.example, list(chosen[0].found)
     view, ground = example.range, example.ground
-    figure, axes = new_figure(len(chosen), 3 + len(rows), panel=panel_size(view, 4.2), footer=0.4)
+    width, height = panel_size(view, 4.2)
+    # An image is taller than the ground beside it.
+    figure, axes = new_figure(len(chosen), 3 + len(rows), panel=(width, max(height, 2.9)), footer=0.4)
     for gap, (image, truth, memory, *models) in zip(chosen, axes, strict=True):
         later = 1e-9 * (gap.moment.timestamp_ns - gap.sighting.moment.timestamp_ns)
         _draw_sighting(image, gap.sighting, f"scene {gap.scene}, {later:.1f} s before the gap")
@@ -108,9 +112,9 @@ def save_gaps(path: Path, gaps: Sequence[Gap], source: ProceduralConfig) -> Path
         _draw_place(memory, gap)
         draw_ego(memory)
         for ax, name in zip(models, rows, strict=True):
-            draw_found(ax, gap.truth, gap.found[name].centerlines, ground=ground, view=view, title=f"model: {name}")
+            draw_found(ax, gap.truth, lanes_of(gap.found[name]), ground=ground, view=view, title=f"model: {name}")
     label_edges(axes[:, 1:])
-    figure.legend(handles=_entries(), loc="outside lower center", ncols=9, fontsize=8, frameon=False)
+    figure.legend(handles=_entries(), loc="outside lower center", ncols=10, fontsize=8, frameon=False)
     return save_figure(figure, path)
 
 
@@ -156,7 +160,7 @@ def _entries() -> list[Any]:
         Line2D([], [], color=LANE_HIDDEN, lw=2, label="true lane hidden"),
         Patch(facecolor="#0f1116", edgecolor="#5a6373", hatch="////", lw=0, label="ground out of sight"),
         Line2D([], [], color="#b0b3ba", lw=1, label="truth beside memory and models"),
-        prediction_entries()[0],
+        *prediction_entries(),
     ]
 
 
@@ -200,10 +204,11 @@ def _draw_cell(ax: Any, column: int, row: int, cell: Cell) -> None:
         ax.text(column, row, f"{cell.gate:.2f}", ha="center", va="center", fontsize=7, color="white" if dark else ROAD)
 
 
-def _shade(cell: Cell) -> Float[np.ndarray, "3"]:
+def _shade(cell: Cell) -> tuple[float, float, float]:
     """Return white for no board so far; green for boards in sight, orange for gaps, the darker the more trusted."""
     if cell.group == "before":
-        return np.array([0.86, 0.86, 0.86])
+        return 0.86, 0.86, 0.86
     full = np.array([0.10, 0.55, 0.24]) if cell.group == "seen" else np.array([0.85, 0.45, 0.05])
     light = np.array([0.97, 0.97, 0.97])
-    return light + min(max(cell.gate, 0.0), 1.0) * (full - light)
+    red, green, blue = (light + min(max(cell.gate, 0.0), 1.0) * (full - light)).tolist()
+    return red, green, blue

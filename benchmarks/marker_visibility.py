@@ -41,7 +41,7 @@ SIMULATIONS = {
 CONFIGS = ("markers/toponet_markers", "markers/camera_clips")
 _LANES = 64
 _AT_ONCE = (
-    *("boards", "frames", "with 0", "of these after one (gap)", "with 1", "with 2", "with 3 or more"),
+    *("boards", "frames", "with 0", "in a gap", "with 1", "with 2", "with 3 or more"),
     *("lanes of a frame's boards, median", "frames with more than the prior takes"),
 )
 _BANDS = ((0.0, 8.0), (8.0, 25.0), (25.0, 60.0))

@@ -7,31 +7,35 @@
 FOLDER holds logs of Argoverse 2, scene files of nuScenes, segments of OpenLane-V2, or lanes as GeoJSON, in any depth.
 A log in `test_logs` or `val_logs` is no training map. The third command tests on recorded traffic; `tflane carry-over`
 does all of it, with each log left out once. No result yet; docs/real_roads.md tells what a run costs.
+
+Generated roads are those of the preset `real-like`, which was fitted to mean statistics of nine recorded logs.
 """
 
-import dataclasses
+from dataclasses import replace
 
 from tflane_jax.config import RealMapData, RunConfig, load_config
+from tflane_jax.world.presets import CITY, REAL_LIKE
+
+MAPS = RealMapData(generated_world=REAL_LIKE)
 
 
 def get_config() -> RunConfig:
     """Return training on recorded maps alone, for as long as on the preset `city`."""
-    return _on(RealMapData(), "tf_lane/toponet_tfm")
+    return _on(MAPS, "tf_lane/toponet_tfm")
 
 
 def ablations() -> dict[str, RunConfig]:
     """Return `mixed`, every second scene on generated roads; `generated`, all of them; and the three without traffic.
 
-    `generated` has seen no recorded map: a control with the same capacities, steps and test data.
+    `generated` has seen no recorded map: a control with the same capacities, steps and test data. `generated_city` is
+    the same on the preset `city`.
     """
-    sources = {
-        "mixed": RealMapData(generated=0.5),
-        "generated": RealMapData(generated=1.0),
-    }
+    sources = {"mixed": replace(MAPS, generated=0.5), "generated": replace(MAPS, generated=1.0)}
+    without = {name: _on(data, "tf_lane/toponet") for name, data in {"maps": MAPS, **sources}.items()}
+    sources["generated_city"] = replace(MAPS, generated=1.0, generated_world=CITY)
     with_traffic = {name: _on(data, "tf_lane/toponet_tfm") for name, data in sources.items()}
-    without = {name: _on(data, "tf_lane/toponet") for name, data in {"maps": RealMapData(), **sources}.items()}
     return with_traffic | {f"{name}_no_traffic": config for name, config in without.items()}
 
 
 def _on(data: RealMapData, host: str) -> RunConfig:
-    return dataclasses.replace(load_config(host), data=data)
+    return replace(load_config(host), data=data)

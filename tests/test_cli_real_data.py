@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.datasets.nuscenes_small import write_nuscenes
+from tests.datasets.small_argoverse2 import write_images as write_ring_images
 from tests.datasets.small_argoverse2 import write_log
 from tests.datasets.test_nuscenes import write_images
 from tests.test_cli import CONFIG, FEW_PICTURES, use_fakes
@@ -11,6 +12,7 @@ from tflane_jax import plots
 from tflane_jax.cli import main
 from tflane_jax.commands import predict_lanes
 from tflane_jax.datasets import sources
+from tflane_jax.datasets.argoverse2_cameras import RING
 
 pytest.importorskip("shapely")
 pytest.importorskip("pyarrow")
@@ -63,7 +65,19 @@ def test_nuscenes_is_drawn_from_above_and_in_the_images_that_are_there(run, draw
     assert len(np.load(tmp_path / "out" / "predictions.npz")["points"]) == 2
 
 
-def test_a_log_of_argoverse_2_has_no_images_to_draw_into(run, drawn, tmp_path):
+def test_argoverse_2_is_drawn_in_the_images_of_the_logs_that_have_some(run, drawn, tmp_path):
+    """The model reads no images; one of two logs has some, at its first key frame."""
+    ring = "ring_front_center", "ring_side_left"
+    write_ring_images(write_log(tmp_path / "logs" / "log-a"), [(ring[0], 990), (ring[1], 1010)], (16.5, 2.0, 1.0))
+    write_log(tmp_path / "logs" / "log-b")
+    assert "cameras.png" in predict(run, tmp_path / "out", "argoverse2", tmp_path / "logs", "--count", "4")
+    ((examples, lanes),) = drawn
+    assert examples.cameras.valid.tolist() == [[name in ring for name in RING]]
+    assert len(lanes.points) == 1
+    assert len(np.load(tmp_path / "out" / "predictions.npz")["points"]) == 4
+
+
+def test_a_log_of_argoverse_2_without_images_is_drawn_from_above_only(run, drawn, tmp_path):
     write_log(tmp_path / "logs" / "log-a")
     files = predict(run, tmp_path / "out", "argoverse2", tmp_path / "logs", "--count", "2")
     assert files == {"predictions.npz", "predictions.json", "truth.npz", "pictures.png"}

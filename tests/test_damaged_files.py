@@ -278,8 +278,10 @@ def test_damaged_scores_are_measured_again(tmp_path, content):
     path = tmp_path / "scores.json"
     ways = {"": {"all/recall": 0.5}}
     entry = {"code": "", "step": 1, "protocol": "", "ways": ways, "ratios": {"": {"all/recall": [[1], [2]]}}}
-    write_json(path, {"mark": entry})
-    assert dict(_read(path)) == {"mark": entry}
+    sampled, wrong = ({**entry, "samples": {"": {"all/DET_l": each}}} for each in ([[2], [0.5]], [0.5]))
+    entries = {"earlier": entry, "mark": sampled}
+    write_json(path, entries | {"wrong": wrong})
+    assert dict(_read(path)) == entries
     damage(path, CONTENTS[content])
     assert dict(_read(path)) == {}
 

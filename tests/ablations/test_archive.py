@@ -21,7 +21,8 @@ from tflane_jax.ablations.table_plan import plan_table
 from tflane_jax.ablations.table_run import run_table
 from tflane_jax.cli import main
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.results import Evaluation, SceneRatio
+from tflane_jax.evaluation.by_scene import SAMPLES
+from tflane_jax.evaluation.results import Evaluation, SceneRatio, SceneSamples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 # Files of a table without provenance.
@@ -44,7 +45,7 @@ def tiny(tmp_path_factory):
 
 def small(tiny, **changes):
     rows = (TableRow("base", f"{tiny}:baseline"), TableRow("tfm", str(tiny)), TableRow("again", f"{tiny}:again"))
-    return test_tables.small(tiny, **{"rows": rows, **changes})
+    return test_tables.small(tiny, **{"rows": rows, "secondary": "all/DET_l", **changes})
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -56,7 +57,10 @@ def scored(cheap):
         size += len(config.traffic)
         hits = tuple(int(5 + 5 * np.sin(size * scene)) for scene in range(1, 7))
         found = {"DET_l": 1 / (1 + size), "recall": sum(hits) / 60, "TOP_ll": np.exp(-size) + len(config.topology)}
-        return Evaluation("a protocol", {"all": found}, ratios={"all/recall": SceneRatio(hits, (10,) * 6)})
+        drawn = tuple(np.random.default_rng(round(1e6 * found["DET_l"])).random(SAMPLES).round(5).tolist())
+        ratios = {"all/recall": SceneRatio(hits, (10,) * 6)}
+        samples = {name: SceneSamples((10,) * 6, drawn) for name in ("all/DET_l", "all/AP_l")}
+        return Evaluation("a protocol", {"all": found}, ratios=ratios, samples=lambda: samples)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(LaneGraphTask, "evaluate", evaluate)
@@ -107,7 +111,12 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     assert "not used" not in told
     for name in SAME:
         assert (tmp_path / "paper.9" / name).read_bytes() == (made / "paper.9" / name).read_bytes(), name
-    assert "95 %" in (tmp_path / "paper.9" / "effects.md").read_text()
+    effects = (tmp_path / "paper.9" / "effects.md").read_text()
+    assert effects.count("95 % interval") == 1
+    assert effects.count("points (95 %") == 4  # both claims, by a ratio and by a score that ranks detections
+    for run in find_archive(results, "paper.9").runs.values():
+        kept = {name: set(found.samples.get("", ())) for name, found in run.measured.items() if found is not None}
+        assert kept == {name: set() if "geometric" in name else {"all/DET_l"} for name in kept}
     assert "all/TOP_ll, geometric" in (tmp_path / "paper.9" / "comparison.json").read_text()
     assert not (tmp_path / "paper.9" / "comparison.png").exists()
     (content, commits), (expected, own) = summary(tmp_path), summary(made)

@@ -13,11 +13,14 @@ from tflane_jax.ablations import archive as module
 from tflane_jax.ablations.archive import Archive, merged, read_archive, write_archive
 from tflane_jax.ablations.recorded import Facts, Measured, RecordedRun, evaluation_name
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
+from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio, SceneSamples
 
 WAYS = {"": {"all/recall": 0.1 + 0.2, "all/DET_l": 0}, "no traffic": {"all/recall": 1e-300, "all/DET_l": 0.5}}
 RATIOS = {"": {"all/recall": SceneRatio((1, 0), (3, 4))}, "no traffic": {"all/recall": SceneRatio((2, 2), (3, 4))}}
-LAST = Measured(4, "a protocol, 2 m", WAYS, RATIOS, "c" * 64)
+SAMPLES = {
+    way: {"all/DET_l": SceneSamples((3, 4), (0.12345, value))} for way, value in (("", 1.0), ("no traffic", 0.3))
+}
+LAST = Measured(4, "a protocol, 2 m", WAYS, RATIOS, "c" * 64, SAMPLES)
 FACTS = Facts(("9ea6749b4",), ("cpu: cpu x 1",), 61.5, ({"step": 2, "split": "val", "all/recall": 0.25},))
 RUN = RecordedRun(
     key="0123456789abcdef",
@@ -54,6 +57,21 @@ def test_a_record_is_read_as_it_was_written_and_equal_parts_are_written_once(fil
     assert write_archive(tmp_path / "again.gz", read).read_bytes() == file.read_bytes()
     content = content_of(file)
     assert [len(content[name]) for name in ("scores", "scenes", "entries", "configs", "runs")] == [1, 1, 2, 1, 2]
+
+
+def test_a_record_without_samples_keeps_its_form(tmp_path):
+    """Records of an earlier version have none: they are read, and written again as they were."""
+    run = replace(RUN, measured={"last": replace(LAST, samples={}), "best": replace(LAST, samples={"": {}})})
+    path = write_archive(tmp_path / "a.gz", Archive("a", None, {RUN.key: run}))
+    assert b"samples" not in gzip.decompress(path.read_bytes())
+    assert read_archive(path).runs[RUN.key].measured["best"].samples == {}
+
+
+def test_sums_that_are_no_counts_are_kept(tmp_path):
+    ratios = {way: {"all/TOP_ll": SceneRatio((0.123456, -1), (3, 4))} for way in WAYS}
+    run = replace(RUN, measured={"last": replace(LAST, ratios=ratios)})
+    read = read_archive(write_archive(tmp_path / "a.gz", Archive("a", None, {RUN.key: run}))).runs[RUN.key]
+    assert read == run
 
 
 def test_numbers_that_are_none_and_missing_checkpoints_are_kept(tmp_path):
@@ -167,6 +185,9 @@ def _with_wrong_values(content):
         (lambda c: c["entries"][0]["ways"][""]["values"].append("1"), "expected a number"),
         (lambda c: c["entries"][0]["ways"][""]["ratios"]["all/recall"][1].pop(), "expected a list of 2"),
         (lambda c: c["scenes"][0].append(-1), "scenes 0 is -1, expected a count"),
+        (lambda c: c["entries"][0]["ways"][""]["samples"]["all/DET_l"][1].append(0.5), "is 0.5, expected a count"),
+        (lambda c: c["entries"][0]["ways"][""]["samples"]["all/DET_l"].pop(), "expected a list of 2"),
+        (lambda c: c["entries"][0]["ways"][""].update(samples=[]), "samples is [], expected a mapping"),
     ],
 )
 def test_wrong_entries_are_named(file, change, words):

@@ -1,6 +1,7 @@
 """Leaving each log out once: what is trained and tested, the tables, resuming, and mistakes; on fake examples."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from tflane_jax.ablations.declaration import Declaration, check
 from tflane_jax.cli import main
 from tflane_jax.config import RealMapData, load_config
 from tflane_jax.errors import UserError
+from tflane_jax.world.presets import CITY, REAL_LIKE
 
 pytestmark = pytest.mark.usefixtures("cheap")
 
 ON_MAPS = """
 
 from tflane_jax.config import RealMapData
+from tflane_jax.world.presets import REAL_LIKE
 
 _tiny, _others = get_config, ablations
 
@@ -31,7 +34,9 @@ def get_config():
 def ablations():
     plain = replace(_others()["baseline"], data=RealMapData(generated=0.5))
     mixed = replace(_tiny(), data=RealMapData(generated=0.5))
-    return {"generated": replace(_tiny(), data=RealMapData(generated=1.0)), "mixed": mixed, "plain": plain}
+    generated = RealMapData(generated=1.0)
+    closer = replace(_tiny(), data=replace(generated, generated_world=REAL_LIKE))
+    return {"generated": replace(_tiny(), data=generated), "mixed": mixed, "plain": plain, "closer": closer}
 """
 
 
@@ -133,6 +138,27 @@ def test_mistakes_are_named_before_anything_is_trained(folder, change, message):
         carry_over(Settings(folder / "maps", **{"steps": 4, **change}), folder / "out")
 
 
+def test_other_generated_roads_are_no_part_of_an_earlier_comparison(folder, monkeypatch):
+    """Neither are runs of the earlier rows found again, nor does the folder take the new ones."""
+    wanted, out = settings(folder), folder / "out"
+
+    def planned():
+        plan = subject._planned(subject._logs(wanted), wanted, subject._configs(wanted), out, {"cores": 1})
+        return {job.folder for job in plan.flat()}
+
+    before = planned()
+    monkeypatch.setattr(subject, "ROWS", {**subject.ROWS, "generated": f"{folder / 'tiny.py'}:closer"})
+    assert len(before & planned()) == len(before) - 1  # all others are the same runs
+    with pytest.raises(UserError, match=r"holds another declaration \(generated: data\.generated_world\."):
+        carry_over(wanted, out)
+
+
+def test_every_page_tells_what_the_worlds_know_of_the_tested_logs(folder):
+    for name in ("carry_over", "logs", "effects"):
+        assert subject.FITTED in (folder / "out" / f"{name}.md").read_text()
+        assert json.loads((folder / "out" / f"{name}.json").read_text())["meta"]["fitted"] == subject.FITTED
+
+
 def test_fewer_logs_are_an_interim_look(folder, capsys):
     out = folder / "out"
     names = ("carry_over.md", "logs.md", "effects.md")
@@ -182,3 +208,8 @@ def test_the_shipped_models_are_measured_by_the_scores_of_the_tables():
         assert set(COLUMNS) <= config.task.score_names(config.data, config.evaluation)
     assert configs["generated"].data.generated == 1.0
     assert configs["maps"].data.generated == 0.0
+    for row in ("generated", "mixed", "generated without traffic", "mixed without traffic"):
+        assert configs[row].data.generated_world == REAL_LIKE
+    # The control differs in the preset alone.
+    city = replace(configs["generated"].data, generated_world=CITY)
+    assert configs["generated on city"] == replace(configs["generated"], data=city)

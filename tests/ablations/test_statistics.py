@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio, scene_weights
+from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio
+from tflane_jax.evaluation.by_scene import scene_weights
 
 
 def test_against_the_formula():

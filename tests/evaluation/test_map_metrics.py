@@ -16,7 +16,7 @@ from tflane_jax.evaluation.lane_groups import LANE_GROUPS, line_groups
 from tflane_jax.evaluation.map_metrics import MapLineMetrics
 from tflane_jax.evaluation.vector_maps import detections_of_lines
 from tflane_jax.geometry import BevGrid, PerceptionRange
-from tflane_jax.metrics.vector_map import LINE_CLASSES
+from tflane_jax.metrics.map_matching import LINE_CLASSES
 from tflane_jax.scene import BevChannel, LineClass, LinePrediction, MapLines
 
 LABELS = ("visibility", "identity")

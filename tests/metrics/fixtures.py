@@ -11,8 +11,8 @@ import numpy as np
 
 from tests.shared import shared_root
 from tflane_jax.metrics import ElementDetections, ElementTruth, LaneDetections, LaneTruth
+from tflane_jax.metrics.map_matching import CLASSES, MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import AreaDetections, AreaTruth, SegmentDetections, SegmentTruth
-from tflane_jax.metrics.vector_map import CLASSES, MapDetections, MapTruth
 
 Task = Literal["centerline", "lanesegment", "maptr"]
 Arrays = dict[str, np.ndarray]

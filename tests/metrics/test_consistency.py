@@ -5,7 +5,7 @@ import pytest
 
 from tflane_jax.metrics import MapDetections, MapTruth
 from tflane_jax.metrics.consistency import MapConsistency
-from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, match_map
+from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, match_map
 
 
 def line(x):

@@ -136,6 +136,11 @@ def test_merged_accumulators_equal_one_pass():
         whole.update(*frame)
         (a if i < 2 else b).update(*frame)
     assert a.merge(b).compute() == pytest.approx(whole.compute(), abs=1e-12)
+    parts = a.merge(b).means()
+    assert {name: part.sum(0)[0] / part.sum(0)[1] for name, part in parts.items()} == pytest.approx(
+        {name: value for name, value in whole.compute().items() if name != "frames"}, abs=1e-12
+    )
+    assert all(len(part) == whole.compute()["frames"] for part in parts.values())
     assert a.compute()["frames"] == 2
     assert TuSimpleMetrics().compute() == {"frames": 0, "Accuracy": 0.0, "FP": 0.0, "FN": 0.0}
 

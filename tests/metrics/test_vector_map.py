@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.errors import UserError
 from tflane_jax.metrics import MapDetections, MapTruth, VectorMapMetrics
-from tflane_jax.metrics.vector_map import CLASSES, MAP_THRESHOLDS, Sampling, match_map
+from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, Sampling, match_map
 
 # What the official program calls the three ways of sampling detections.
 KEYS: dict[Sampling, str] = {

@@ -9,7 +9,7 @@ import pytest
 from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.cli import main
 from tflane_jax.metrics import MapDetections, MapTruth
-from tflane_jax.metrics.vector_map import CLASSES, LINE_CLASSES
+from tflane_jax.metrics.map_matching import CLASSES, LINE_CLASSES
 
 
 def vectors(lines, scores=None):

@@ -6,7 +6,7 @@ Gzipped JSON. What many runs have in common is written once and given by its pla
     table        name
     declaration  content of declaration.json, or null
     scores       lists of names of scores
-    scenes       lists of denominators, one number for each scene
+    scenes       lists of denominators, or of true lanes, one number for each scene
     entries      what was measured of a checkpoint (`Measured`)
     configs      configurations
     runs         by key, see `RecordedRun`
@@ -26,7 +26,8 @@ from typing import Any, TypeVar
 
 from tflane_jax.ablations.recorded import Facts, Measured, RecordedRun
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.results import SceneRatio
+from tflane_jax.evaluation.by_scene import DIGITS
+from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_bytes
 from tflane_jax.files.fields import items, member, parse_json, shown, whole_number
 
@@ -35,6 +36,8 @@ LARGEST_FILE, LARGEST_TEXT = 2**23, 2**26
 """Bytes of the file, and of the JSON in it."""
 _LARGEST_NUMBER = 2**53
 _LONGEST_TEXT = 300
+_STEPS = 10**DIGITS
+"""In a file, scores in samples are multiples of one by this."""
 
 T = TypeVar("T")
 
@@ -114,6 +117,11 @@ def write_archive(path: Path, archive: Archive) -> Path:
                 for name, ratio in measured.ratios[way].items()
             }
             ways[way] = {"scores": scores.place(list(values)), "values": list(values.values()), "ratios": ratios}
+            if samples := measured.samples.get(way):  # earlier records have none
+                ways[way]["samples"] = {
+                    name: [scenes.place(list(each.lanes)), [round(_STEPS * value) for value in each.values]]
+                    for name, each in samples.items()
+                }
         about = {"step": measured.step, "protocol": measured.protocol, "code": measured.code}
         return entries.place(about | {"ways": ways})
 
@@ -204,7 +212,7 @@ def _archive(content: Any, path: Path) -> Archive:
 
 
 def _entry(entry: Any, names: Sequence[Sequence[str]], scenes: Sequence[Sequence[int]], where: str) -> Measured:
-    ways, ratios = {}, {}
+    ways, ratios, samples = {}, {}, {}
     for way, content in _mapping(member(entry, "ways", where), f"{where}: ways").items():
         place = f"{where}: {_text(way, where)!r}"
         own = _chosen(names, member(content, "scores", place), f"{place}: scores")
@@ -216,17 +224,28 @@ def _entry(entry: Any, names: Sequence[Sequence[str]], scenes: Sequence[Sequence
             _text(score, place): _ratio(pair, scenes, f"{place}: {score[:_LONGEST_TEXT]}")
             for score, pair in _mapping(member(content, "ratios", place), f"{place}: ratios").items()
         }
+        if "samples" in content:
+            samples[way] = {
+                _text(score, place): _sampled(pair, scenes, f"{place}: {score[:_LONGEST_TEXT]}")
+                for score, pair in _mapping(content["samples"], f"{place}: samples").items()
+            }
     if "" not in ways:
         raise UserError(f"{where} lacks the scores of the run as trained")
     step = whole_number(member(entry, "step", where), 0, _LARGEST_NUMBER, f"{where}: step")
     protocol, code = (_text(member(entry, name, where), f"{where}: {name}") for name in ("protocol", "code"))
-    return Measured(step, protocol, ways, ratios, code)
+    return Measured(step, protocol, ways, ratios, code, samples)
 
 
 def _ratio(pair: Any, scenes: Sequence[Sequence[int]], where: str) -> SceneRatio:
     place, hits = _each(pair, where, lambda value, _: value, length=2)
     denominator = _chosen(scenes, place, where)
-    return SceneRatio(_each(hits, where, _count, length=len(denominator)), tuple(denominator))
+    return SceneRatio(_each(hits, where, _number, length=len(denominator)), tuple(denominator))
+
+
+def _sampled(pair: Any, scenes: Sequence[Sequence[int]], where: str) -> SceneSamples:
+    place, steps = _each(pair, where, lambda value, _: value, length=2)
+    values = tuple(count / _STEPS for count in _each(steps, where, _count))
+    return SceneSamples(tuple(_chosen(scenes, place, where)), values)
 
 
 def _run(key: str, run: Any, configs: Sequence[Any], entries: Sequence[Measured], where: str) -> RecordedRun:

@@ -6,8 +6,9 @@ measure and checkpoint) and between test scenes (bootstrap interval over scenes,
 *shown* if the corrected p is below the declared level and the interval excludes 0, *contradicted* if the same holds in
 the wrong direction, else *not shown*.
 
-The interval is exact for ratios of counts, such as recall. Scores that rank detections over all scenes (DET_l, AP_l,
-TOP_ll) have none: their findings stand on p alone, and say so.
+Ratios of sums over scenes, such as recall and TOP_ll, are resampled here. Scores that rank detections over all scenes,
+such as DET_l and mAP, were measured in samples that all runs share (`evaluation.by_scene`). Scores of earlier programs
+have neither: their findings stand on p alone, and say so.
 """
 
 from __future__ import annotations
@@ -27,8 +28,11 @@ from tflane_jax.ablations.recorded import Which
 from tflane_jax.ablations.report import listed
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.scores import CHECKPOINTS
-from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio, scene_weights
+from tflane_jax.ablations.statistics import holm, interval, paired_difference, resampled_ratio
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.by_scene import SAMPLES as SHARED_SAMPLES
+from tflane_jax.evaluation.by_scene import scene_weights
+from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.plots.tables import format_table, save_table
 
 SAMPLES = 10_000
@@ -175,26 +179,49 @@ def _values(by_seed: Mapping[int, Mapping[str, float]], measure: Measure, seeds:
 def _samples(
     results: Results, test: str, which: Which, measure: Measure, rows: Sequence[str], seeds: Sequence[int]
 ) -> dict[str, Float[np.ndarray, " b"]]:
-    """Return bootstrap samples of the measure for each row, all of the same draws; empty if it is no ratio of counts.
+    """Return bootstrap samples of the measure for each row, all of the same draws; empty where a score has none.
 
     Raises UserError if rows count different lanes, so that they were not measured on the same scenes.
     """
-    ratios = {row: [results.ratios[test, which][row][seed] for seed in seeds] for row in rows}
-    if not all(score in of_seed for each in ratios.values() for of_seed in each for score in measure.scores):
-        return {}
-    samples = dict.fromkeys(rows, np.zeros(SAMPLES))
+    parts: dict[str, dict[str, list[Any]]] = {}
+    for score in measure.scores:
+        for kind in (results.ratios, results.samples):
+            found = {row: [kind[test, which][row][seed].get(score) for seed in seeds] for row in rows}
+            if not any(part is None for each in found.values() for part in each):
+                parts[score] = found
+                break
+        else:
+            return {}
+    ranked = [len(part.values) for found in parts.values() for part in found[rows[0]] if isinstance(part, SceneSamples)]
+    samples = dict.fromkeys(rows, np.zeros(min(ranked, default=SAMPLES)))
     for score, weight in measure.scores.items():
-        denominator = ratios[rows[0]][0][score].denominator
-        weights = scene_weights(len(denominator), SAMPLES)
-        for row, each in ratios.items():
-            if any(of_seed[score].denominator != denominator for of_seed in each):
-                raise UserError(
-                    f"{row} and {rows[0]} were not measured on the same lanes ({score}): a recorded run, or one that "
-                    "an earlier state of the code measured, saw other test data; train and measure it again"
-                )
-            numerators = np.array([of_seed[score].numerator for of_seed in each])
-            samples[row] = samples[row] + weight * resampled_ratio(numerators, np.array(denominator), weights)
+        for row, drawn in _of_score(parts[score], score, len(samples[rows[0]])).items():
+            samples[row] = samples[row] + weight * drawn
     return samples
+
+
+def _of_score(found: Mapping[str, Sequence[Any]], score: str, count: int) -> dict[str, Float[np.ndarray, " b"]]:
+    """Return as many bootstrap samples of a score for each row, the seeds averaged, from its parts for each seed."""
+    (first, (one, *_)), *_ = found.items()
+    lanes = one.lanes if isinstance(one, SceneSamples) else one.denominator
+    for row, each in found.items():
+        if any(_drawn_from(part) != _drawn_from(one) for part in each):
+            raise UserError(
+                f"{row} and {first} were not measured on the same lanes ({score}): a recorded run, or one that "
+                "an earlier state of the code measured, saw other test data; train and measure it again"
+            )
+    if isinstance(one, SceneSamples):
+        return {row: np.mean([part.values for part in each], axis=0) for row, each in found.items()}
+    weights = scene_weights(len(lanes), count)
+    return {
+        row: resampled_ratio(np.array([part.numerator for part in each]), np.array(lanes), weights)
+        for row, each in found.items()
+    }
+
+
+def _drawn_from(part: SceneRatio | SceneSamples) -> tuple[tuple[int, ...], int]:
+    """Return what the samples of a run are drawn from, the lanes of each scene, and how many are stored."""
+    return (part.lanes, len(part.values)) if isinstance(part, SceneSamples) else (part.denominator, 0)
 
 
 def _finding(effect: Effect, p: float, alpha: float, sign: float) -> Finding:
@@ -221,8 +248,8 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     lines += ["", *(f"- {text}." for text in findings(every)), ""]
     lines += [
         "Difference: the claim's model minus the row. From, to: 95 % interval over scenes (seeds averaged,",
-        f"{SAMPLES:,} bootstrap samples; only for ratios of counts). p: two-sided paired t-test over seeds; Holm:",
-        "corrected for all differences of one measure and checkpoint.",
+        f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections). p: two-sided paired t-test",
+        "over seeds; Holm: corrected for all differences of one measure and checkpoint.",
     ]
     rows, title = _rows(results, declaration, test, every), "\n".join(lines)
     print("\n" + format_table(rows, title=title, digits=4))

@@ -49,8 +49,8 @@ def page(folder: Path) -> str:
         "Every table of the papers that was run here, in the built-in world. `tflane tables` writes this page from",
         "`docs/results/`; do not edit it. The papers' own numbers are of other data and stand there for orientation.",
         "A claim is *shown* or *contradicted* if the corrected p over seeds and the interval over scenes say so, else",
-        "*not shown* ([how](comparisons.md)). Scores that rank detections over all scenes, such as DET_l, have no",
-        "interval: there p alone decides.",
+        "*not shown* ([how](comparisons.md)). Scores other than recall have no interval where an earlier version",
+        "measured them: there p alone decides.",
     ]
     for name in (*TABLES, *sorted(found.keys() - TABLES.keys())):
         if name in found:

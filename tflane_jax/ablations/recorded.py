@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from tflane_jax.ablations.comparison import Scores
 from tflane_jax.config_io import to_json
-from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
+from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio, SceneSamples
 from tflane_jax.training.records import Record
 
 Which = Literal["last", "best"]
@@ -22,8 +22,9 @@ class Measured:
         step: of the checkpoint.
         protocol: of the metrics, with its version.
         ways: scores of each way to use the run: "" as trained, others as `Task.interventions` names them.
-        ratios: parts of the scores that are ratios of counts, by way and score.
+        ratios: parts of the scores that are ratios of sums over scenes, by way and score.
         code: hash of the program that measured, see `scores.code_digest`.
+        samples: other scores in samples of the scenes, by way and score; earlier programs measured none.
     """
 
     step: int
@@ -31,6 +32,7 @@ class Measured:
     ways: dict[str, Scores]
     ratios: dict[str, dict[str, SceneRatio]]
     code: str = ""
+    samples: Mapping[str, Mapping[str, SceneSamples]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

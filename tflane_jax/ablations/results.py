@@ -10,9 +10,10 @@ from tflane_jax.ablations.comparison import Scores
 from tflane_jax.ablations.jobs import Tests
 from tflane_jax.ablations.recorded import Measured, Which
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.results import SceneRatio
+from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 
 Ratios = Mapping[str, SceneRatio]
+Samples = Mapping[str, SceneSamples]
 
 
 @dataclass
@@ -25,7 +26,8 @@ class Results:
         tests: further test sets, see `compare`.
         protocol: of the metrics, with its version.
         scores: by (test set, checkpoint), by row of the table, by seed. Rows are models, or "model, intervention".
-        ratios: parts of the scores that are ratios of counts over scenes, in the same order.
+        ratios: parts of the scores that are ratios of sums over scenes, in the same order.
+        samples: other scores in samples of the scenes, in the same order.
         owners: model of each row.
         protocols: of each test set and model.
     """
@@ -36,6 +38,7 @@ class Results:
     protocol: str = ""
     scores: dict[tuple[str, Which], dict[str, dict[int, Scores]]] = field(default_factory=dict)
     ratios: dict[tuple[str, Which], dict[str, dict[int, Ratios]]] = field(default_factory=dict)
+    samples: dict[tuple[str, Which], dict[str, dict[int, Samples]]] = field(default_factory=dict)
     owners: dict[str, str] = field(default_factory=dict)
     protocols: dict[tuple[str, str], str] = field(default_factory=dict)
 
@@ -49,6 +52,7 @@ class Results:
             self.owners[row] = model
             self.scores.setdefault((test, which), {}).setdefault(row, {})[seed] = dict(scores)
             self.ratios.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.ratios[way]
+            self.samples.setdefault((test, which), {}).setdefault(row, {})[seed] = measured.samples.get(way, {})
 
     def has(self, model: str) -> bool:
         """Return whether any run of a model was measured."""

@@ -178,8 +178,8 @@ def _recorded(key: str, row: str, job: Job, scores: Collection[str], curves: Col
 
 def _of_scores(measured: Measured, scores: Collection[str]) -> Measured:
     """Return what was measured with the parts by scene of some scores alone."""
-    kept = {
-        way: {name: ratio for name, ratio in ratios.items() if name in scores}
-        for way, ratios in measured.ratios.items()
-    }
-    return replace(measured, ratios=kept)
+    ratios, samples = (
+        {way: {name: part for name, part in of_way.items() if name in scores} for way, of_way in parts.items()}
+        for parts in (measured.ratios, measured.samples)
+    )
+    return replace(measured, ratios=ratios, samples=samples)

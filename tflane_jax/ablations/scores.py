@@ -22,7 +22,7 @@ from tflane_jax.ablations.recorded import Measured, Which, evaluation_name
 from tflane_jax.config import RunConfig, apply_overrides
 from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError
-from tflane_jax.evaluation.results import SceneRatio
+from tflane_jax.evaluation.results import SceneRatio, SceneSamples
 from tflane_jax.files.atomic import write_json
 from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.training.checkpoint import Checkpoints
@@ -108,14 +108,20 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
             "ways": {way: evaluation.scores() for way, evaluation in found.items()},
             "ratios": {way: _counts(evaluation.ratios) for way, evaluation in found.items()},
         }
+        if config.evaluation == job.config.evaluation:  # nothing is tested by another one
+            entry["samples"] = {way: _samples(evaluation.samples()) for way, evaluation in found.items()}
         if job.scored_by == "this code":
             kept = {name: other for name, other in kept.items() if other["code"] == code_digest()}
-        write_json(path, kept | {_mark(parts, code_digest()): entry})
+        write_json(path, kept | {_mark(parts, code_digest()): entry}, indent=None)
     ratios = {
         way: {name: SceneRatio(*map(tuple, counts)) for name, counts in of_way.items()}
         for way, of_way in entry["ratios"].items()
     }
-    return Measured(entry["step"], entry["protocol"], entry["ways"], ratios, entry["code"])
+    samples = {
+        way: {name: SceneSamples(*map(tuple, values)) for name, values in of_way.items()}
+        for way, of_way in entry.get("samples", {}).items()
+    }
+    return Measured(entry["step"], entry["protocol"], entry["ways"], ratios, entry["code"], samples)
 
 
 def _file(job: Job) -> Path:
@@ -145,8 +151,12 @@ def _valid(entries: dict[str, dict[str, Any]], parts: Mapping[str, Any], job: Jo
     return next((entry for entry, code in found if entry is not None and entry["code"] == code), None)
 
 
-def _counts(ratios: Mapping[str, SceneRatio]) -> dict[str, list[list[int]]]:
+def _counts(ratios: Mapping[str, SceneRatio]) -> dict[str, list[Sequence[float]]]:
     return {name: [list(ratio.numerator), list(ratio.denominator)] for name, ratio in ratios.items()}
+
+
+def _samples(samples: Mapping[str, SceneSamples]) -> dict[str, list[Sequence[float]]]:
+    return {name: [list(each.lanes), list(each.values)] for name, each in samples.items()}
 
 
 def _mark(parts: Mapping[str, Any], code: str) -> str:
@@ -169,7 +179,8 @@ def _is_entry(entry: Any) -> bool:
     if not isinstance(entry, dict) or not all(isinstance(entry.get(name), kind) for name, kind in kinds.items()):
         return False
     numbers = [value for scores in entry["ways"].values() for value in _values(scores)]
-    counts = [pair for of_way in entry["ratios"].values() for pair in _values(of_way)]
+    by_way = [*entry["ratios"].values(), *_values(entry.get("samples", {}))]  # earlier programs measured no samples
+    counts = [pair for of_way in by_way for pair in _values(of_way)]
     paired = [isinstance(pair, list) and [type(half) for half in pair] == [list, list] for pair in counts]
     return "" in entry["ways"] and all(type(value) in (int, float) for value in numbers) and all(paired)
 

@@ -1,4 +1,4 @@
-"""Paired tests over seeds, the correction of p-values for several tests, and bootstrap samples of scenes."""
+"""Paired tests over seeds, the correction of p-values for several tests, and bootstrap intervals."""
 
 from __future__ import annotations
 
@@ -69,23 +69,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected.tolist()
 
 
-def scene_weights(scenes: int, samples: int, *, seed: int = 0) -> Int[np.ndarray, "b c"]:
-    """Return bootstrap samples of scenes: how often each scene is drawn when as many are drawn with replacement.
-
-    Scenes, not frames: frames of one drive are alike, so intervals over frames would be far too narrow.
-    """
-    return np.random.default_rng(seed).multinomial(scenes, np.full(scenes, 1.0 / scenes), samples)
-
-
 def resampled_ratio(
-    numerators: Int[np.ndarray, "s c"], denominator: Int[np.ndarray, " c"], weights: Int[np.ndarray, "b c"]
+    numerators: Float[np.ndarray, "s c"], denominator: Int[np.ndarray, " c"], weights: Int[np.ndarray, "b c"]
 ) -> Float[np.ndarray, " b"]:
     """Return a ratio of sums over scenes, such as recall, in each bootstrap sample; the mean over seeds.
 
     Args:
         numerators: of each seed and scene.
         denominator: of each scene; the same for all seeds.
-        weights: see `scene_weights`.
+        weights: how often each scene is drawn, see `evaluation.by_scene`.
 
     Returns:
         Ratios; 0 where a sample has nothing to count.

@@ -1,20 +1,32 @@
-"""Argoverse 2 sensor logs as a dataset of lane graphs."""
+"""Argoverse 2 sensor logs as a dataset of lane graphs, with the images of the ring cameras where they are there."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from tflane_jax.datasets.argoverse2_cameras import RING, LogImages, has_images, ring_fits
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, Keyframes, check_log, find_logs, load_log
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
+from tflane_jax.datasets.openlane_example import camera_views
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.overlap import frame_drives
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import StreamingConfig
+from tflane_jax.datasets.view_images import ImageConfig, ImageFit
 from tflane_jax.errors import UserError
-from tflane_jax.scene import Example
-from tflane_jax.scene.logs import Log
+from tflane_jax.scene import CameraViews, Example
+from tflane_jax.scene.logs import KeyFrame, Log
+from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
+
+_PICTURES = ImageConfig(scale=0.5)
+"""Of images that no model reads: whole, at half the size."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +36,10 @@ class Argoverse2Config:
     Attributes:
         root: a dataset root (sensor/<split>/<log id>/), a split, a folder of logs, or one log; all logs below it.
         keyframes, openlane: see `load_log`.
-        example: what is in an example, and its capacities.
+        example: what is in an example, and its capacities. `example.cameras` draws images of map and boxes.
         loading: memory or disk, and workers.
+        image: scaling and cropping of the recorded images of the ring cameras, which then take the place of drawn ones;
+            None does not read them.
     """
 
     root: Path
@@ -33,40 +47,73 @@ class Argoverse2Config:
     openlane: Path | None = None
     example: ExampleConfig = field(default_factory=ExampleConfig)
     loading: StreamingConfig = StreamingConfig()
+    image: ImageConfig | None = None
 
 
 class Argoverse2Dataset:
     """Examples of every log below a folder, sorted by log id, then time.
 
-    Raises UserError where there is no log or one cannot be read.
+    Raises UserError where there is no log or one cannot be read, with `image` also where a log has no images.
     """
 
     name = "argoverse2"
 
     def __init__(self, config: Argoverse2Config):
         self.config = config
+        if config.image is not None and config.example.cameras is not None:
+            raise UserError("image reads recorded images, example.cameras draws others: set one of them to None")
+        self._folders = find_logs(config.root)
         self.logs = tuple(
-            load_log(folder, keyframes=config.keyframes, openlane=config.openlane) for folder in find_logs(config.root)
+            load_log(folder, keyframes=config.keyframes, openlane=config.openlane) for folder in self._folders
         )
-        self._frames = [(log, i) for log in self.logs for i in range(len(log.keyframes))]
+        self._frames = [(row, i) for row, log in enumerate(self.logs) for i in range(len(log.keyframes))]
+        wanted = config.image is not None
+        self._images = [LogImages(folder) if wanted else None for folder in self._folders]
+        self._fits = ring_fits(filter(None, self._images), config.image) if config.image is not None else ()
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def example(self, index: int) -> Example:
-        """Return one example."""
-        log, keyframe = self._frames[index]
-        return make_example(log, keyframe, self.config.example)
+        """Return one example; a camera without an image at that time is not valid."""
+        config, (row, number) = self.config, self._frames[index]
+        example, images = make_example(self.logs[row], number, config.example), self._images[row]
+        if images is None or config.image is None:
+            return example
+        cameras = images.at(self.logs[row].keyframes[number])
+        return replace(example, cameras=camera_views(cameras, self._fits, config.image))
+
+    def views(self, indices: Sequence[int]) -> list[CameraViews | None]:
+        """Return the images of some examples for pictures; None for an example whose images are not there.
+
+        Raises UserError for an image or a calibration that cannot be read.
+        """
+        places = [self._frames[index] for index in indices]
+        there = {row: LogImages(self._folders[row]) for row, _ in places if has_images(self._folders[row])}
+        image = self.config.image or _PICTURES
+        fits = ring_fits(there.values(), image)
+        return [
+            _views(there[row], self.logs[row].keyframes[number], fits, image) if row in there else None
+            for row, number in places
+        ]
 
     def info(self, index: int) -> FrameInfo:
         """Return log id, time and pose of one example."""
-        log, number = self._frames[index]
+        row, number = self._frames[index]
+        log = self.logs[row]
         keyframe = log.keyframes[number]
         return FrameInfo(log.source, log.name, keyframe.timestamp_ns, keyframe.global_from_ego, log.area)
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
         yield from self.logs
+
+
+def _views(
+    images: LogImages, moment: KeyFrame, fits: Sequence[ImageFit | None], config: ImageConfig
+) -> CameraViews | None:
+    cameras = images.at(moment)
+    return camera_views(cameras, fits, config) if any(camera is not None for camera in cameras) else None
 
 
 @dataclass(frozen=True)
@@ -79,6 +126,8 @@ class LogData:
         openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps.
         example: what is in an example, and its capacities.
         loading: memory or disk, and workers.
+        image: scaling and cropping of the ring cameras' images, see `Argoverse2Config`; None does not read them.
+        augmentation: of the colours of training images, or None.
     """
 
     train: Path
@@ -88,10 +137,13 @@ class LogData:
     openlane: Path | None = None
     example: ExampleConfig = ExampleConfig()
     loading: StreamingConfig = StreamingConfig()
+    image: ImageConfig | None = None
+    augmentation: PhotometricConfig | None = None
 
     def source(self, split: Split) -> Argoverse2Config:
         """Return the dataset of a split."""
-        return Argoverse2Config(getattr(self, split), self.keyframes, self.openlane, self.example, self.loading)
+        root: Path = getattr(self, split)
+        return Argoverse2Config(root, self.keyframes, self.openlane, self.example, self.loading, self.image)
 
 
 def split_folder(root: Path, split: Split, *, required: bool) -> Path:
@@ -122,8 +174,37 @@ def split_folder(root: Path, split: Split, *, required: bool) -> Path:
 
 def _choose(choice: Choice) -> Argoverse2Config:
     assert choice.root is not None
-    root = split_folder(choice.root, choice.split, required=choice.split_given)
-    return Argoverse2Config(root, openlane=choice.openlane, example=choice.configured.example)
+    root, example = split_folder(choice.root, choice.split, required=choice.split_given), choice.configured.example
+    image = _recorded(choice.configured, root)
+    if image is not None:  # recorded images take the place of drawn ones
+        example = replace(example, cameras=None)
+    return Argoverse2Config(root, openlane=choice.openlane, example=example, image=image)
+
+
+def _recorded(configured: Any, root: Path) -> ImageConfig | None:
+    """Return how a model that was trained on the data `configured` reads the images of the logs; None for not at all.
+
+    It reads them where its own images are of this ring: recorded ones as in training, drawn ones of other data as
+    recorded ones of the same focal length if every log has images.
+    """
+    drawn = configured.example.cameras
+    if isinstance(configured, Argoverse2Config) or (
+        isinstance(configured, OpenLaneV2Config) and configured.subset == "A"
+    ):
+        return configured.image
+    if drawn is None or not _is_ring(drawn) or not all(map(has_images, find_logs(root))):
+        return None
+    return _like_drawn(drawn)
+
+
+def _is_ring(drawn: CameraRigConfig) -> bool:
+    return tuple(mount.name for mount in drawn.cameras) == RING
+
+
+def _like_drawn(drawn: CameraRigConfig) -> ImageConfig:
+    """Return the scaling with which recorded images have the focal lengths of drawn ones, pixels."""
+    ratio = np.median([mount.focal for mount in drawn.cameras]) / np.median([mount.focal for mount in ARGOVERSE2_RING])
+    return ImageConfig(scale=float(drawn.scale * ratio), divisor=drawn.multiple)
 
 
 def _title(config: Argoverse2Config) -> str:
@@ -136,14 +217,33 @@ def check_argoverse2(root: Path) -> FolderCheck:
     rows, faults = [], []
     for folder in find_logs(root):
         found = check_log(folder)
-        faults += found
         row = {"log": folder.name, "key frames": 0, "annotated frames": 0, "road users": 0, "lane segments": 0}
+        row |= {"cameras": 0, "missing images": 0}
         if not found:
             log = load_log(folder)
             row |= {"key frames": len(log.keyframes), "annotated frames": log.tracks.frames}
             row |= {"road users": len(log.tracks.uuid), "lane segments": len(log.map.segments)}
+            if has_images(folder):
+                row |= _checked_images(folder, log, found)
+        faults += found
         rows.append(row | {"faults": len(found)})
     return FolderCheck("Argoverse 2", rows, faults)
+
+
+def _checked_images(folder: Path, log: Log, faults: list[str]) -> dict[str, int]:
+    """Return how many ring cameras have images, and how many of their images at key frames are missing."""
+    try:
+        images = LogImages(folder)
+        at = [images.at(moment) for moment in log.keyframes]
+    except UserError as error:
+        faults.append(str(error))
+        return {}
+    there = [row for row, camera in enumerate(images.cameras) if camera is not None]
+    return {"cameras": len(there), "missing images": sum(frame[row] is None for frame in at for row in there)}
+
+
+def _pictures(config: Argoverse2Config, numbers: Sequence[int]) -> list[CameraViews | None]:
+    return Argoverse2Dataset(config).views(numbers)
 
 
 SOURCE = DataSource(
@@ -157,4 +257,7 @@ SOURCE = DataSource(
     drives=lambda config: frame_drives(Argoverse2Dataset(config)),
     root="a log or a folder of logs",
     check=check_argoverse2,
+    streams=lambda config: config.image is not None,
+    views=_pictures,
+    cameras=lambda config: None if config.image is None else RING,
 )

@@ -1,8 +1,8 @@
 """One Argoverse 2 sensor log: annotations, ego poses and the vector map -> `Log`.
 
-Images and lidar are not read. Two traps of the format: a box is given in the ego frame of its own timestamp, and the
-map's predecessor lists are incomplete, so only successors are read. Format: https://argoverse.github.io/user-guide
-(sensor dataset; annotations.feather, city_SE3_egovehicle.feather, map/).
+`argoverse2_cameras` reads its images; lidar is not read. Two traps of the format: a box is given in the ego frame of
+its own timestamp, and the map's predecessor lists are incomplete, so only successors are read. Format:
+https://argoverse.github.io/user-guide (sensor dataset; annotations.feather, city_SE3_egovehicle.feather, map/).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
@@ -25,12 +26,12 @@ from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 
 ANNOTATIONS, POSES = "annotations.feather", "city_SE3_egovehicle.feather"
 _QUATERNION, _SIZE = ("qw", "qx", "qy", "qz"), ("length_m", "width_m", "height_m")
-_POSE_COLUMNS: Mapping[str, Kind] = {
+POSE_COLUMNS: Mapping[str, Kind] = {
     "timestamp_ns": "integer",
     **dict.fromkeys((*_QUATERNION, "tx_m", "ty_m", "tz_m"), "number"),
 }
 _BOX_COLUMNS: Mapping[str, Kind] = {
-    **_POSE_COLUMNS,
+    **POSE_COLUMNS,
     "track_uuid": "text",
     "category": "text",
     **dict.fromkeys(_SIZE, "number"),
@@ -148,16 +149,17 @@ def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises UserError for a damaged file, two poses of one time, or a vehicle that jumps.
     """
     path = folder / POSES
-    table = read_columns(path, _POSE_COLUMNS)
+    table = read_columns(path, POSE_COLUMNS)
     order = np.argsort(table["timestamp_ns"], kind="stable")
-    times, poses = table["timestamp_ns"][order], _pose_of(path, table)[order]
+    times, poses = table["timestamp_ns"][order], poses_of(path, table)[order]
     if (same := np.diff(times) == 0).any():
         raise UserError(f"{path} has two poses at {times[same.argmax()]}: download it again")
     check_motion(poses[:, :2, 3], times, [f"{path}: time {time}" for time in times.tolist()])
     return times, poses
 
 
-def _pose_of(path: Path, table: dict[str, np.ndarray]) -> np.ndarray:
+def poses_of(path: Path, table: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 4 4"]:
+    """Return the poses in the columns of a file; raise UserError for a quaternion that is not of unit length."""
     quaternion = np.stack([table[c] for c in _QUATERNION], -1)
     if (odd := np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) > _UNIT).any():
         row = int(odd.argmax())
@@ -213,7 +215,7 @@ def _tracks(
     boxes = {name: column[traffic] for name, column in boxes.items()}
     uuid, first, k = np.unique(boxes["track_uuid"], return_index=True, return_inverse=True)
     f = np.searchsorted(times, boxes["timestamp_ns"])
-    pose, shape = _pose_of(folder / ANNOTATIONS, boxes), (len(times), len(uuid))
+    pose, shape = poses_of(folder / ANNOTATIONS, boxes), (len(times), len(uuid))
     tracks = Tracks(
         position=np.zeros((*shape, 3)),
         yaw=np.zeros(shape),

@@ -17,8 +17,8 @@ from scipy.special import expit
 
 from tflane_jax.evaluation.vector_maps import detections_of_lines, measured_lines, truth_of_lines
 from tflane_jax.metrics.centerline_matching import nearest_lanes
+from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, match_map
 from tflane_jax.metrics.segment_matching import nearest_segments
-from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, match_map
 from tflane_jax.scene import CenterlinePrediction, LaneGraph, LinePrediction, MapLines, SegmentPrediction
 
 WITHIN = 2.0  # metres

@@ -12,14 +12,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.batches import ordered_batches
 from tflane_jax.datasets.streaming import Streamed
+from tflane_jax.evaluation.by_scene import counted_ratio, scene_numbers, shared_samples, summed_ratio
 from tflane_jax.evaluation.centerlines import detections_from_prediction, truth_from_example
 from tflane_jax.evaluation.geometric_topology import with_geometric_topology
 from tflane_jax.evaluation.interventions import with_traffic
@@ -27,18 +28,21 @@ from tflane_jax.evaluation.lane_groups import LANE_GROUPS, lane_groups, line_gro
 from tflane_jax.evaluation.lane_segments import detections_of_segments, segment_truth
 from tflane_jax.evaluation.map_metrics import LineLabel, MapLineMetrics
 from tflane_jax.evaluation.predict import Predictor, predicted_batches
-from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio
+from tflane_jax.evaluation.results import EvaluationConfig, SceneRatio, SceneSamples
 from tflane_jax.evaluation.vector_maps import measured_lines
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.groups import FrameGroup
 from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.map_matching import MAP_THRESHOLDS, Dims, Measure
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
+from tflane_jax.metrics.resampling import Weights
 from tflane_jax.metrics.segment_matching import match_segments
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import MAP_THRESHOLDS, Dims, Measure
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import Example, MapLines, Prediction
+
+T = TypeVar("T")
 
 # Both kinds of protocols, for lanes and for lines, have three thresholds.
 _THRESHOLDS = len(LANE_THRESHOLDS)
@@ -140,20 +144,35 @@ class LaneGraphMetrics:
         return groups
 
     def ratios(self) -> dict[str, SceneRatio]:
-        """Return the recall of every group of lanes or lines as hits and lanes of each scene."""
+        """Return recall and topology scores of every group of lanes, and recall of lines, as sums over each scene."""
         if not self._continues:
             return {}
         recalled = self._centerlines.recalled() if "centerlines" in self._measured else {}
+        means = self._centerlines.means() if "centerlines" in self._measured else {}
         if "segments" in self._measured:
             recalled |= {self._prefix + group: counts for group, counts in self._segments.recalled().items()}
+            means |= {self._prefix + group: parts for group, parts in self._segments.means().items()}
         if "lines" in self._measured:
             recalled |= self._lines.recalled()
-        scene = np.cumsum(~np.array([True, *self._continues[1:]]))
-        ratios = {}
+        scene, ratios = scene_numbers(self._continues), {}
         for group, counts in recalled.items():
-            lanes, hits = (np.bincount(scene, column).astype(int).tolist() for column in counts.T)
-            ratios[f"{group}/recall"] = SceneRatio(tuple(hits), tuple(_THRESHOLDS * n for n in lanes))
+            ratios[f"{group}/recall"] = counted_ratio(counts[:, ::-1] * [1, _THRESHOLDS], scene)
+            for name, parts in means.get(group, {}).items():
+                ratios[f"{group}/{name}"] = summed_ratio(parts, scene)
         return ratios
+
+    def samples(self) -> dict[str, SceneSamples]:
+        """Return the scores that rank detections, of every group, in bootstrap samples of the scenes."""
+        return shared_samples(self._resampled, scene_numbers(self._continues), self.ratios())
+
+    def _resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+        groups = self._centerlines.resampled(weights) if "centerlines" in self._measured else {}
+        if "segments" in self._measured:
+            segments = self._segments.resampled(weights)
+            if "TOP_lt" in self._devkit.means():  # elements were measured: its own scores
+                segments["all"] |= _of_devkit(self._devkit.resampled(weights))
+            groups |= {self._prefix + group: values for group, values in segments.items()}
+        return groups | (self._lines.resampled(weights) if "lines" in self._measured else {})
 
     @property
     def _prefix(self) -> str:
@@ -167,7 +186,7 @@ class LaneGraphMetrics:
         return applied + ([self._lines] if "lines" in self._measured else [])
 
 
-def _of_devkit(values: Mapping[str, float]) -> dict[str, float]:
+def _of_devkit(values: Mapping[str, T]) -> dict[str, T]:
     """Return the devkit's numbers that LaneSegNet's do not contain; TOP_lt is TOP_lste of its papers."""
     names = {"DET_a": "DET_a", "DET_t": "DET_t", "TOP_lt": "TOP_lste", "OLUS": "OLUS"}
     names |= {name: name for name in values if name.startswith("DET_t@")}

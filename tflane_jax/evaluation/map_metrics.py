@@ -7,13 +7,15 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.evaluation.line_tracks import LineTracks
 from tflane_jax.evaluation.vector_maps import detections_of_lines, map_truth, truth_of_lines
 from tflane_jax.metrics.consistency import CONFIDENT, MapConsistency
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup
-from tflane_jax.metrics.vector_map import Dims, GroupedMapMetrics, MatchedMap, Measure, VectorMapMetrics, match_map
+from tflane_jax.metrics.map_matching import Dims, MatchedMap, Measure, match_map
+from tflane_jax.metrics.resampling import Weights
+from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
 from tflane_jax.scene import Example, LinePrediction
 
 LineLabel = Literal["visibility", "identity"]
@@ -111,6 +113,13 @@ class MapLineMetrics:
             groups["lines"] |= self._consistency.compute()
         if self._overlap is not None:
             groups["lines IoU"] = self._overlap.compute()
+        return groups
+
+    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+        """Return by group the Chamfer AP, and `C-mAP`, in samples of the frames, see `metrics.resampling`."""
+        groups = {_name(group): values for group, values in self._chamfer.resampled(weights).items()}
+        if self._consistency is not None:
+            groups["lines"] |= self._consistency.resampled(weights)
         return groups
 
     def recalled(self) -> dict[str, Int[np.ndarray, "f 2"]]:

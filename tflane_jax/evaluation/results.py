@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero
+from tflane_jax.metrics.map_matching import Measure
 from tflane_jax.metrics.topology import Version
-from tflane_jax.metrics.vector_map import Measure
 
 Traffic = Literal["own", "none", "other-scene"]
 """Traffic flow at inference: that of the frame, none, or that of a frame of another scene."""
@@ -49,8 +49,21 @@ class SceneRatio:
         numerator, denominator: of each scene; the score is the ratio of their sums.
     """
 
-    numerator: tuple[int, ...]
+    numerator: tuple[float, ...]
     denominator: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class SceneSamples:
+    """A score that ranks detections over all scenes, in bootstrap samples that all runs share (`evaluation.by_scene`).
+
+    Attributes:
+        lanes: true lanes of each scene, times the number of thresholds; runs with the same lanes have the same samples.
+        values: the score in each sample.
+    """
+
+    lanes: tuple[int, ...]
+    values: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -61,13 +74,15 @@ class Evaluation:
         protocol: name and version of the metrics.
         groups: metrics by name, for each measured group ("all", "occluded", ...).
         counts: names of the entries that are counts, not scores.
-        ratios: parts of the scores that are ratios of counts, by "group/name".
+        ratios: parts of the scores that are ratios of sums over scenes, by "group/name".
+        samples: returns the other scores in samples of the scenes, by "group/name"; takes a second.
     """
 
     protocol: str
     groups: Mapping[str, Mapping[str, float]]
     counts: tuple[str, ...] = ("frames", "lanes", "lines")
     ratios: Mapping[str, SceneRatio] = field(default_factory=dict)
+    samples: Callable[[], Mapping[str, SceneSamples]] = field(default=dict, compare=False)
 
     def scores(self) -> dict[str, float]:
         """Return the scores by "group/name", without counts. Runs record them and rate checkpoints by them."""

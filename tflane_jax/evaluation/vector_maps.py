@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import expit
 
 from tflane_jax.datasets.identities import line_distances
-from tflane_jax.metrics.vector_map import CLASSES, Dims, MapDetections, MapTruth
+from tflane_jax.metrics.map_matching import CLASSES, Dims, MapDetections, MapTruth
 from tflane_jax.scene import Areas, AreaType, LaneGraph, LinePrediction, LineType, MapLines
 
 _DIVIDER, _CROSSING, _BOUNDARY = (CLASSES.index(name) for name in ("divider", "ped_crossing", "boundary"))
@@ -58,7 +58,7 @@ def map_lines(
 
     Args:
         points: metres; closed lines repeat their first vertex.
-        classes: index into `metrics.vector_map.LINE_CLASSES`.
+        classes: index into `metrics.map_matching.LINE_CLASSES`.
         valid: padding is False.
     """
     kept = np.asarray(valid)
@@ -77,7 +77,7 @@ def map_detections(
 
     Args:
         points: metres.
-        classes: index into `metrics.vector_map.LINE_CLASSES`.
+        classes: index into `metrics.map_matching.LINE_CLASSES`.
         scores: confidence, 0 to 1.
         valid: detections to keep; None keeps all.
         dims: coordinates of the points to keep.

@@ -10,6 +10,7 @@ from tflane_jax.metrics.frames import (
     LaneTruth,
 )
 from tflane_jax.metrics.lane_segment import GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.segment_matching import (
     AreaDetections,
@@ -18,7 +19,7 @@ from tflane_jax.metrics.segment_matching import (
     SegmentTruth,
 )
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
-from tflane_jax.metrics.vector_map import GroupedMapMetrics, MapDetections, MapTruth, VectorMapMetrics
+from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
 
 __all__ = [
     "AreaDetections",

@@ -18,10 +18,11 @@ Where identities of detections come from is the caller's, see `evaluation.line_t
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
+from tflane_jax.metrics.map_matching import CLASSES, MAP_THRESHOLDS, MatchedMap
 from tflane_jax.metrics.matching import average_precision_area, pooled
-from tflane_jax.metrics.vector_map import CLASSES, MAP_THRESHOLDS, MatchedMap
+from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 
 CONFIDENT = 0.4
 
@@ -32,6 +33,7 @@ class MapConsistency:
     def __init__(self) -> None:
         self._truths = np.zeros(len(CLASSES), np.int64)
         self._detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, classes, consistent hits
+        self._frame_truths: list[np.ndarray] = []  # of every frame: true lines by class
         # Of every threshold, by number of a true line: identities in the first frame that matches it.
         self._first: list[dict[int, set[int]]] = [{} for _ in MAP_THRESHOLDS]
 
@@ -64,6 +66,7 @@ class MapConsistency:
                 row[p] = line not in first or identity in first[line]
             first |= new
         self._truths += frame.truths[: len(CLASSES)]
+        self._frame_truths.append(frame.truths[: len(CLASSES)])
         self._detections.append((frame.scores, frame.classes, consistent))
 
     def compute(self) -> dict[str, float]:
@@ -80,3 +83,14 @@ class MapConsistency:
         }
         means = {"C-mAP": np.mean(list(precision.values()))} | precision
         return {name: float(value) for name, value in means.items()}
+
+    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+        """Return the numbers of `compute` in samples that count the frames of a scene equally often, see `weights`."""
+        scores, classes, hits = pooled(self._detections, (0,), (len(MAP_THRESHOLDS), 0))
+        frame, truths = frame_numbers(self._detections), np.array(self._frame_truths, int).reshape(-1, len(CLASSES))
+        precision = {}
+        for c, name in enumerate(CLASSES):
+            own = classes == c
+            _, area = resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, c], weights)
+            precision[f"C-AP_{name}"] = area.mean(1)
+        return {"C-mAP": np.mean(list(precision.values()), axis=0)} | precision

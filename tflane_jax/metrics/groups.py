@@ -20,10 +20,11 @@ from dataclasses import dataclass
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.frames import Lines
+from tflane_jax.metrics.resampling import Weights
 
 
 class TrueLanes(Protocol):
@@ -76,6 +77,14 @@ class LaneMetrics(Protocol):
 
     def compute(self) -> dict[str, float]:
         """Return the numbers."""
+        ...
+
+    def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
+        """Return the scores, recall aside, that are ratios of two sums over frames: the terms of both sums."""
+        ...
+
+    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+        """Return the scores that rank detections, in samples that count the frames as often as `weights` says."""
         ...
 
 
@@ -185,6 +194,8 @@ class GroupedMetrics(Generic[FrameT]):
         self._protocol = make().protocol
         # Of every frame: true lanes and hits, summed over the thresholds.
         self._recalled: dict[str, list[tuple[int, int]]] = {group: [] for group in self._metrics}
+        # Of every frame: whether the group measures it.
+        self._measures: dict[str, list[bool]] = {group: [] for group in self._metrics}
 
     @property
     def protocol(self) -> str:
@@ -209,7 +220,8 @@ class GroupedMetrics(Generic[FrameT]):
         own = (frame_group,) if isinstance(frame_group, str) else frame_group or ()
         for group, metrics in self._metrics.items():
             lanes = hits = 0
-            if group not in self._frame_groups or group in own:
+            self._measures[group].append(group not in self._frame_groups or group in own)
+            if self._measures[group][-1]:
                 part = frame
                 if group in self._lane_groups:
                     part = frame.select((members or {})[group])
@@ -233,8 +245,33 @@ class GroupedMetrics(Generic[FrameT]):
         merged = copy.copy(self)
         merged._metrics = {group: metrics.merge(other._metrics[group]) for group, metrics in self._metrics.items()}
         merged._recalled = {group: counts + other._recalled[group] for group, counts in self._recalled.items()}
+        merged._measures = {group: frames + other._measures[group] for group, frames in self._measures.items()}
         return merged
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return the numbers of each group."""
         return {group: metrics.compute() for group, metrics in self._metrics.items()}
+
+    def means(self) -> dict[str, dict[str, Float[np.ndarray, "f 2"]]]:
+        """Return by group the scores that are ratios of two sums over frames: the terms of both sums, by frame."""
+        return {
+            group: {name: _spread(parts, self._measures[group]) for name, parts in metrics.means().items()}
+            for group, metrics in self._metrics.items()
+        }
+
+    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+        """Return by group the scores that rank detections, in samples that count the frames as often as `weights` says.
+
+        The samples are exact, see `metrics.resampling`.
+        """
+        return {
+            group: metrics.resampled(weights[:, np.array(self._measures[group], bool)])
+            for group, metrics in self._metrics.items()
+        }
+
+
+def _spread(parts: Float[np.ndarray, "m 2"], measured: Sequence[bool]) -> Float[np.ndarray, "f 2"]:
+    """Return the terms of all frames; frames that are not measured have none."""
+    spread = np.zeros((len(measured), 2))
+    spread[np.array(measured, bool)] = parts
+    return spread

@@ -11,16 +11,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal, Self
+from typing import Literal, Self, TypeVar
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
 from tflane_jax.metrics.matching import average_precision_11, pooled
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
+from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 from tflane_jax.metrics.segment_matching import (
     AREA_THRESHOLDS,
     BOUNDARY,
@@ -32,6 +33,7 @@ from tflane_jax.metrics.segment_matching import (
 )
 
 Flavour = Literal["OpenLane-V2", "LaneSegNet"]
+T = TypeVar("T")
 
 
 class LaneSegmentMetrics:
@@ -47,6 +49,7 @@ class LaneSegmentMetrics:
         self._lanes = CenterlineMetrics(("v2.1",))
         self._true_areas = np.zeros(BOUNDARY + 1, np.int64)  # by category
         self._area_detections: list[tuple[np.ndarray, ...]] = []  # of every frame: scores, categories, hits
+        self._frame_areas: list[np.ndarray] = []  # of every frame: true areas by category
         # By threshold, over matched pairs: pairs, sum of distances; pairs with types, sum of wrong fractions.
         self._errors = np.zeros((4, len(LANE_THRESHOLDS)))
 
@@ -67,6 +70,7 @@ class LaneSegmentMetrics:
         self._lanes.add(replace(segments, elements=None) if self.flavour == "LaneSegNet" else segments)
         self._area_detections.append((areas.scores, areas.categories, areas.hits))
         self._true_areas += areas.truths
+        self._frame_areas.append(areas.truths)
         self._errors[:2] += segments.hits.sum(1), segments.hits @ frame.distance
         if frame.wrong is not None:
             self._errors[2:] += segments.hits.sum(1), segments.hits @ frame.wrong
@@ -79,6 +83,7 @@ class LaneSegmentMetrics:
         merged._lanes = self._lanes.merge(other._lanes)
         merged._true_areas = self._true_areas + other._true_areas
         merged._area_detections = self._area_detections + other._area_detections
+        merged._frame_areas = self._frame_areas + other._frame_areas
         merged._errors = self._errors + other._errors
         return merged
 
@@ -120,6 +125,31 @@ class LaneSegmentMetrics:
             detection = [lanes["DET_l"], lanes["DET_a"], lanes["DET_t"]]
             lanes["OLUS"] = float(np.mean([*detection, lanes["TOP_ll"] ** 0.5, lanes["TOP_lt"] ** 0.5]))
         return lanes | areas | self._matched_errors()
+
+    def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
+        """Return the scores that are means over vertices, see `CenterlineMetrics.means`."""
+        lanes = self._lanes.means()
+        return {"TOP_lsls": lanes["TOP_ll"]} if self.flavour == "LaneSegNet" else lanes
+
+    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+        """Return AP, mAP, DET, TOP and OLUS of samples that count the frames as often as `weights` says."""
+        lanes = self._lanes.resampled(weights)
+        scores, categories, hits = pooled(self._area_detections, (0,), (len(AREA_THRESHOLDS), 0))
+        frame, truths = frame_numbers(self._area_detections), np.array(self._frame_areas, int).reshape(-1, BOUNDARY + 1)
+        crossing, boundary = (
+            resampled_precisions(scores[own], hits[:, own], frame[own], truths[:, category], weights)[0].mean(1)
+            for category in (CROSSING, BOUNDARY)
+            for own in [categories == category]
+        )
+        if self.flavour == "LaneSegNet":
+            areas = {"AP_ped": crossing, "AP_boundary": boundary, "mAP": (lanes["DET_l"] + crossing) / 2}
+            return {"AP_ls": lanes["DET_l"], "AP_l": lanes["AP_l"], "TOP_lsls": lanes["TOP_ll"]} | areas
+        lanes.pop("OLS", None)
+        lanes["DET_a"] = (crossing + boundary) / 2
+        if "DET_t" in lanes:
+            roots = lanes["TOP_ll"] ** 0.5, lanes["TOP_lt"] ** 0.5
+            lanes["OLUS"] = np.mean([lanes["DET_l"], lanes["DET_a"], lanes["DET_t"], *roots], axis=0)
+        return lanes
 
     def _matched_errors(self) -> dict[str, float]:
         errors = {}
@@ -169,10 +199,14 @@ class GroupedSegmentMetrics(GroupedMetrics[MatchedSegments]):
 
     def compute(self) -> dict[str, dict[str, float]]:
         """Return the numbers of each group."""
-        return {
-            group: values if group in self._whole else {k: v for k, v in values.items() if not _of_areas(k)}
-            for group, values in super().compute().items()
-        }
+        return {group: self._reported(group, values) for group, values in super().compute().items()}
+
+    def resampled(self, weights: Weights) -> dict[str, dict[str, Float[np.ndarray, " b"]]]:
+        """Return the numbers of each group in samples of the frames."""
+        return {group: self._reported(group, values) for group, values in super().resampled(weights).items()}
+
+    def _reported(self, group: str, values: Mapping[str, T]) -> dict[str, T]:
+        return {name: value for name, value in values.items() if group in self._whole or not _of_areas(name)}
 
 
 def _of_areas(name: str) -> bool:

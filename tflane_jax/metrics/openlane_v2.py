@@ -21,6 +21,7 @@ from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
 from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled
+from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_mean, resampled_precisions
 from tflane_jax.metrics.topology import Version, check_versions
 
 
@@ -45,6 +46,10 @@ class CenterlineMetrics:
         # Detections of every frame: (scores, hits) of lanes, (scores, hits, attributes) of traffic elements.
         self._lane_detections: list[tuple[np.ndarray, ...]] = []
         self._element_detections: list[tuple[np.ndarray, ...]] = []
+        # Of every frame: true lanes and elements by attribute; sums over the vertices of lanes and of elements for each
+        # version, and in the last column the number of vertices.
+        self._frame_truths: list[np.ndarray] = []
+        self._frame_topology: list[np.ndarray] = []
 
     @property
     def protocol(self) -> str:
@@ -62,8 +67,14 @@ class CenterlineMetrics:
         self._lane_vertices += 2 * frame.lanes
         self._lane_topology += np.stack([frame.topology[version].sum(-1) for version in self.versions])
         self._lane_detections.append((frame.scores, frame.hits))
+        self._frame_truths.append(np.append(frame.lanes, np.zeros(ATTRIBUTES, int)))
+        sums = [frame.topology[version].sum() / len(LANE_THRESHOLDS) for version in self.versions]
+        self._frame_topology.append(np.array([[*sums, 2 * frame.lanes], np.zeros(len(sums) + 1)]))
         if frame.elements is not None:
             elements = frame.elements
+            self._frame_truths[-1][1:] = elements.truths
+            sums = [elements.topology[version].mean() for version in self.versions]
+            self._frame_topology[-1][1] = [*sums, elements.vertices]
             self._frames_with_elements += 1
             self._true_elements += elements.truths
             self._element_vertices += elements.vertices
@@ -122,6 +133,39 @@ class CenterlineMetrics:
             lanes, elements = (result.get(name + suffix) for name in ("TOP_ll", "TOP_lt"))
             if lanes is not None and elements is not None:
                 result["OLS" + suffix] = float(np.mean([result["DET_l"], result["DET_t"], lanes**0.5, elements**0.5]))
+        return result
+
+    def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
+        """Return the scores that are means over vertices, TOP_ll and TOP_lt: sum and number of vertices by frame."""
+        parts = np.array(self._frame_topology).reshape(-1, 2, len(self.versions) + 1)
+        found = {}
+        for row, name in enumerate(("TOP_ll", "TOP_lt") if self._frames_with_elements else ("TOP_ll",)):
+            for column, suffix in enumerate(self._suffixes()):
+                if parts[:, row, -1].any() or self.versions[column] == "v2.1":
+                    found[name + suffix] = parts[:, row, [column, -1]]
+        return found
+
+    def resampled(self, weights: Weights) -> dict[str, Float[np.ndarray, " b"]]:
+        """Return DET, AP_l, TOP and OLS of samples that count the frames as often as `weights` says."""
+        truths = np.array(self._frame_truths, int).reshape(-1, 1 + ATTRIBUTES)
+        scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
+        frame = frame_numbers(self._lane_detections)
+        eleven, area = resampled_precisions(scores, hits, frame, truths[:, 0], weights)
+        result = {"DET_l": eleven.mean(1), "AP_l": area.mean(1)}
+        result |= {name: resampled_mean(parts, weights) for name, parts in self.means().items()}
+        if self._frames_with_elements == 0:
+            return result
+        scores, hits, attributes = pooled(self._element_detections, (0,), (0,))
+        frame, precisions = frame_numbers(self._element_detections), []
+        for i in range(ATTRIBUTES):
+            own = attributes == i
+            eleven, _ = resampled_precisions(scores[own], hits[None, own], frame[own], truths[:, 1 + i], weights)
+            precisions.append(eleven[:, 0])
+        result["DET_t"] = np.mean(precisions, axis=0)
+        for suffix in self._suffixes():
+            tops = [result[name + suffix] for name in ("TOP_ll", "TOP_lt") if name + suffix in result]
+            if len(tops) == 2:
+                result["OLS" + suffix] = np.mean([result["DET_l"], result["DET_t"], *np.sqrt(tops)], axis=0)
         return result
 
     def _suffixes(self) -> list[str]:

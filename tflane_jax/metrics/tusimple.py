@@ -23,7 +23,7 @@ _LANES = 4  # the lines of the ego lane and of its neighbours
 
 
 class TuSimpleMetrics:
-    """Accumulator of the TuSimple metrics over images; it keeps three sums.
+    """Accumulator of the TuSimple metrics over images; it keeps three numbers of each image.
 
     Args:
         time_limit: milliseconds; an image that took longer counts as missed. 200 officially, 20,000 in LSTR's copy.
@@ -33,6 +33,7 @@ class TuSimpleMetrics:
         self.time_limit = time_limit
         self._frames = 0
         self._sums = np.zeros(3)
+        self._images: list[tuple[float, float, float]] = []
 
     @property
     def protocol(self) -> str:
@@ -41,7 +42,8 @@ class TuSimpleMetrics:
 
     def update(self, detections: RowLanes, truth: RowLanes) -> None:
         """Add one image; raise UserError for arrays that do not fit together."""
-        self._sums += score_image(detections, truth, self.time_limit)
+        self._images.append(score_image(detections, truth, self.time_limit))
+        self._sums += self._images[-1]
         self._frames += 1
 
     def merge(self, other: Self) -> Self:
@@ -51,12 +53,21 @@ class TuSimpleMetrics:
         merged = type(self)(self.time_limit)
         merged._frames = self._frames + other._frames
         merged._sums = self._sums + other._sums
+        merged._images = self._images + other._images
         return merged
 
     def compute(self) -> dict[str, float]:
         """Return `frames`, and the means over images of `Accuracy`, `FP` and `FN` (0 without images)."""
         accuracy, positives, negatives = (self._sums / max(self._frames, 1)).tolist()
         return {"frames": self._frames, "Accuracy": accuracy, "FP": positives, "FN": negatives}
+
+    def means(self) -> dict[str, Float[np.ndarray, "f 2"]]:
+        """Return the scores, which are means over images: the score of each image, and 1."""
+        images = np.array(self._images).reshape(-1, 3)
+        return {
+            name: np.column_stack([column, np.ones(len(images))])
+            for name, column in zip(("Accuracy", "FP", "FN"), images.T, strict=True)
+        }
 
 
 def score_image(

@@ -15,7 +15,7 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_file, member, numbers, scores
-from tflane_jax.metrics.vector_map import LINE_CLASSES, Dims, MapDetections, MapTruth
+from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
 _FARTHEST = 1e5

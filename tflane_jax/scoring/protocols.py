@@ -14,10 +14,11 @@ from tflane_jax.files import tusimple
 from tflane_jax.metrics.f_score import CenterlineFScore
 from tflane_jax.metrics.groups import ByDistance
 from tflane_jax.metrics.lane_segment import Flavour, GroupedSegmentMetrics, LaneSegmentMetrics
+from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, Measure, Sampling
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics, GroupedCenterlineMetrics
 from tflane_jax.metrics.topology import Version
 from tflane_jax.metrics.tusimple import LSTR_TIME_LIMIT, OFFICIAL_TIME_LIMIT, TuSimpleMetrics
-from tflane_jax.metrics.vector_map import LINE_CLASSES, Dims, GroupedMapMetrics, Measure, Sampling, VectorMapMetrics
+from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
 from tflane_jax.scoring import maptr, openlane_v2, plain, remarks
 from tflane_jax.scoring.recognise import Format, Side, hint
 from tflane_jax.scoring.score import Accumulator

@@ -10,8 +10,8 @@ import numpy as np
 from tflane_jax.datasets.lane_rows import ROWS
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
+from tflane_jax.metrics.map_matching import MapDetections, MapTruth
 from tflane_jax.metrics.segment_matching import SegmentDetections, SegmentTruth
-from tflane_jax.metrics.vector_map import MapDetections, MapTruth
 from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
 
 Remarks = Callable[[Mapping[Any, Any], Mapping[Any, Any]], list[str]]

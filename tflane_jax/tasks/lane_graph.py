@@ -227,7 +227,7 @@ class LaneGraphTask(Task[Example, Example | Streamed, LaneGraphSource, HostMemor
     ) -> Evaluation:
         """Return the metrics of all parts that the host predicts and the examples label."""
         metrics = evaluate_lanes(self, params, data, config, ground=self._ground, frame_groups=frame_groups)
-        return Evaluation(metrics.protocol, metrics.compute(), ratios=metrics.ratios())
+        return Evaluation(metrics.protocol, metrics.compute(), ratios=metrics.ratios(), samples=metrics.samples)
 
     @property
     def _ground(self) -> PerceptionRange | None:

@@ -25,6 +25,7 @@ from tflane_jax.datasets.photos import WIDTH as INPUT_WIDTH
 from tflane_jax.datasets.streaming import Prepare, Streamed
 from tflane_jax.datasets.tusimple import TuSimpleConfig
 from tflane_jax.evaluation import lane_shapes
+from tflane_jax.evaluation.by_scene import summed_ratio
 from tflane_jax.evaluation.predict import Predictor, predict_batch, predicted_batches, predictions
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
@@ -143,7 +144,10 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
             for row, index in enumerate(indices):
                 truth, found = data.truth[index], jax.tree.map(lambda leaf, i=row: leaf[i], answer.curves)
                 metrics.update(found_lanes(found, truth), truth)
-        return Evaluation(metrics.protocol, {"all": metrics.compute() | {"loss": float(np.mean(losses))}})
+        # An image is a scene: in the built-in world each shows another road, of TuSimple's clips one image is labelled.
+        ratios = {f"all/{name}": summed_ratio(parts, np.arange(len(parts))) for name, parts in metrics.means().items()}
+        groups = {"all": metrics.compute() | {"loss": float(np.mean(losses))}}
+        return Evaluation(metrics.protocol, groups, ratios=ratios)
 
     def score_names(self, data: SplitData, config: EvaluationConfig) -> set[str]:
         """Return TuSimple's metrics and the loss."""

@@ -8,7 +8,7 @@ from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.map_metrics import LineLabel
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.openlane import ATTRIBUTES
-from tflane_jax.metrics.vector_map import LINE_CLASSES
+from tflane_jax.metrics.map_matching import LINE_CLASSES
 from tflane_jax.models.host import HostConfig
 
 COLUMNS = (

@@ -142,14 +142,15 @@ def carry_over(commands) -> None:
         module="carry_over",
         function="run",
     )
-    parser.add_argument("maps", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scene files of nuScenes")
+    parser.add_argument("maps", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scenes of nuScenes")
     parser.add_argument("--logs", metavar="LOG", nargs="+", default=[], help="logs to leave out (default: all)")
     parser.add_argument(
         "--models",
         metavar="NAME",
         nargs="+",
         default=[],
-        help="of: generated, maps, mixed, 'generated without traffic', 'mixed without traffic' (default: all)",
+        help="of: generated, 'generated on city', maps, mixed, 'generated without traffic', 'mixed without traffic' "
+        "(default: all)",
     )
     parser.add_argument("--seeds", metavar="N", type=int, default=1, help="number of seeds (default 1)")
     parser.add_argument("--steps", metavar="N", type=int, help="updates of each run (default: the configuration's)")

@@ -99,7 +99,7 @@ def data(commands) -> None:
         module="data_maps",
         function="run",
     )
-    maps.add_argument("root", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scene files of nuScenes")
+    maps.add_argument("root", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scenes of nuScenes")
     maps.add_argument("--logs", metavar="LOG", nargs="+", default=[], help="names of logs (default: all)")
     maps.add_argument("--scene", metavar="N", type=int, default=0, help="number of the simulated scene (default 0)")
     maps.add_argument("--moment", type=_moment, default=0.7, help="of the recorded log, 0 to below 1 (default 0.7)")

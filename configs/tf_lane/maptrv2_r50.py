@@ -36,6 +36,8 @@ from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
 MAPTR = str(Path(__file__).with_name("maptr_r50.py"))
 CELL = 32
 """Pixels of a cell of the feature maps."""
+AV2_SCALE = 0.3
+"""Of images, relative to the cameras' own."""
 AV2_EPOCH = 700 * 156 // 32
 """Steps over 700 logs of 15.6 s at 10 Hz, with 32 frames each."""
 
@@ -83,10 +85,12 @@ def _with_heights(config: RunConfig) -> RunConfig:
     model = config.task.model
     assert isinstance(model, MapTrV2Config)
     range_ = replace(PAPER_RANGE, z=(-5.0, 3.0))
-    lift = replace(PAPER_LIFT_ENCODER.bev, grid=BevGrid(range_, 100, 200), cameras=7, image_scale=0.3, supervised=False)
+    lift = replace(
+        PAPER_LIFT_ENCODER.bev, grid=BevGrid(range_, 100, 200), cameras=7, image_scale=AV2_SCALE, supervised=False
+    )
     decoder = replace(model.decoder, coordinates=3)
     model = replace(model, encoder=replace(PAPER_LIFT_ENCODER, bev=lift), range=range_, decoder=decoder)
-    rig = CameraRigConfig(ARGOVERSE2_RING, scale=lift.image_scale, multiple=CELL)
+    rig = CameraRigConfig(ARGOVERSE2_RING, scale=AV2_SCALE, multiple=CELL)
     data = replace(config.data, example=replace(config.data.example, range=range_, cameras=rig))
     optim = replace(config.optim, epoch_steps=AV2_EPOCH, warmup_steps=200)
     training = replace(config.training, steps=6 * AV2_EPOCH, eval_every=AV2_EPOCH, checkpoint_every=AV2_EPOCH)

@@ -16,7 +16,7 @@ from tflane_jax.scene import VehicleState
 CanBus = Literal["none", "reference"]
 """No vector, or that of the published code."""
 # OpenLane-V2 does not tell the lidar's pose: x right and y forward, as hosts in its axes take it where it is unknown.
-_LIDAR_FROM_EGO = np.float32([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_LIDAR_FROM_EGO = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float32)
 
 
 def pose_can_bus(global_from_ego: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "18"]:

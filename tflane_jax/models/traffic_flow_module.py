@@ -148,9 +148,8 @@ class TrafficFlowPrior(Prior):
     def select(self, flow: TrafficFlow | None) -> TrafficFlowTokens:
         """Return reTF_i; without traffic flow, all instances are invalid."""
         prior, host = self.config.prior, self.host
-        if flow is None:
-            flow = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames))
-        return select_traffic_flow(flow, prior, host.range, host.bev_range, host.forward)
+        tracks = jax.tree.map(jnp.asarray, TrafficFlow.empty(1, prior.frames)) if flow is None else flow
+        return select_traffic_flow(tracks, prior, host.range, host.bev_range, host.forward)
 
     def encode(self, observation: TrafficFlowTokens, *, deterministic: bool) -> EncodedTrafficFlow:
         """Return TF_Feat (T, D) beside the tracks that it encodes."""

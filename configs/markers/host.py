@@ -35,7 +35,7 @@ SEEN = MarkerSimulationConfig(cameras=ARGOVERSE2_RING, occlusion="bodies")
 # GNSS receiver: 2 m and 1 degree (standard deviations), on top of the map's own error of 1.5 m.
 EXAMPLE = ExampleConfig(markers=MarkerConfig(simulation=SEEN), sd_map=SdMapConfig(translation=2.0, yaw_deg=1.0))
 DATA = WorldData(train=2000, val=15, test=100, world=WORLD, example=EXAMPLE)
-STEPS = 6000
+STEPS = 4000
 
 
 def get_config() -> RunConfig:

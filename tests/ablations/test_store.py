@@ -65,7 +65,7 @@ def test_remaining_time_is_measured_where_it_can_be(tmp_path, monkeypatch, recor
         folder = plan["row"][i].folder
         folder.mkdir()
         (folder / "metrics.jsonl").write_text(json.dumps({"step": step, "split": "train", "seconds": seconds}) + "\n")
-    assert remaining_seconds(plan, 2.0) == expected
+    assert remaining_seconds(plan, {"row": 2.0}) == expected
 
 
 def test_a_new_setting_with_its_default_finds_earlier_runs():

@@ -150,7 +150,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     check_rows(by_row)
     declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=plan.content)
     complete = sum(job.is_complete() for job in plan.flat())
-    seconds, guesses = remaining_seconds(by_row, _MINUTES)
+    seconds, guesses = remaining_seconds(by_row, dict.fromkeys(by_row, _MINUTES))
     basis = "a guess" if guesses else "by the runs so far"
     print(
         f"{len(plan.flat())} runs, {complete} complete; the others take about {seconds / 3600 / settings.jobs:.1f} h "

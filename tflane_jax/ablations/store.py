@@ -130,14 +130,14 @@ def _settings(store: Path) -> list[dict[str, Any]]:
     )
 
 
-def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: float) -> tuple[float, int]:
+def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: Mapping[str, float]) -> tuple[float, int]:
     """Return the time that all incomplete trainings need on one core each, and how many of them are guesses.
 
-    A run's rate is that of complete runs of the same row, or its own so far. Where there is none, a run takes
-    `minutes`.
+    A run's rate is that of complete runs of the same row, or its own so far. Where there is none, a run takes the
+    `minutes` of its row.
     """
     seconds, guesses, seen = 0.0, 0, set()
-    for jobs in plan.values():
+    for name, jobs in plan.items():
         rates = [rate for job in jobs if (rate := _seconds_per_step(job)) is not None]
         for job in jobs:
             if job.folder in seen or job.is_complete():
@@ -147,7 +147,7 @@ def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: float) -> tupl
             if rates:
                 seconds += left * sum(rates) / len(rates)
             else:
-                seconds, guesses = seconds + 60.0 * minutes * left / job.config.training.steps, guesses + 1
+                seconds, guesses = seconds + 60.0 * minutes[name] * left / job.config.training.steps, guesses + 1
     return seconds, guesses
 
 

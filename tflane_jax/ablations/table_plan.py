@@ -40,6 +40,11 @@ class TablePlan:
         """Return all trainings; the names of hosts begin with "host"."""
         return {f"host {name}": jobs for name, jobs in self.host_jobs.items()} | dict(self.jobs)
 
+    def minutes(self) -> dict[str, float]:
+        """Return how long a training of each of `named` takes, by the table's own figures."""
+        hosts = dict.fromkeys((f"host {name}" for name in self.host_jobs), self.table.host_minutes)
+        return hosts | dict.fromkeys(self.jobs, self.table.minutes)
+
     def every(self) -> list[Job]:
         """Return every run once, those of the hosts first."""
         return list({job.folder: job for jobs in (self.host_jobs, self.jobs) for job in seed_by_seed(jobs)}.values())
@@ -127,7 +132,7 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int) -> 
     if recorded := sum(job.recorded is not None for job in every):
         text += f" ({recorded} of them recorded)"
     if complete < len(every):
-        seconds, guesses = remaining_seconds(plan.named(), table.minutes)
+        seconds, guesses = remaining_seconds(plan.named(), plan.minutes())
         basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
         text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
     print(text, flush=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from tflane_jax.ablations.paper.cost import core_minutes
+from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.published import record
 from tflane_jax.ablations.tables import TABLES, find_table
 from tflane_jax.errors import UserError
@@ -30,6 +32,7 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"--cores {options.cores}: at least one")
     if not chosen:
         print(format_table([_listed(name) for name in TABLES], digits=0))
+        print(f"\n{_totals()}")
         return 0
     configure_jax()
     if options.search:
@@ -57,13 +60,24 @@ def run(options: argparse.Namespace) -> int:
 
 def _listed(name: str) -> dict[str, str | int | float]:
     table = TABLES[name]
-    runs = table.seeds * (len(table.rows) + len(table.hosts))
-    hours = f"{runs * table.minutes / 60:.0f} h"
     return {
         "table": name,
         "shows": table.title,
         "rows": len(table.rows),
         "seeds": table.seeds,
         "decided by": table.primary,
-        "one core": hours,
+        "one core": f"{core_minutes([table]) / 60:.0f} h",
     }
+
+
+def _totals() -> str:
+    """Return what the tables of each paper cost together, in words."""
+    systems: dict[str, list[PaperTable]] = {}
+    for table in TABLES.values():
+        systems.setdefault(table.name.split(".")[0], []).append(table)
+    hours = {name: f"{core_minutes(tables) / 60:.0f} h" for name, tables in systems.items()}
+    listed = ", ".join(f"{name} {cost}" for name, cost in hours.items())
+    return (
+        f"In one --out, runs that tables share are trained once. Together on one core: {listed}; all "
+        f"{core_minutes(TABLES.values()) / 60:.0f} h."
+    )

@@ -76,6 +76,7 @@ class PaperTable:
         steps: updates of every run; None for those of the configurations.
         hosts: models that rows start from. They are trained first and are no rows.
         minutes: that a run takes on one core, for estimates; the mean over rows in docs/results where it is recorded.
+        host_minutes: the same for one of `hosts`.
         note: a sentence of the table's text, such as why a column of the paper is missing.
         steps_factor: how many times as long every run is, see `lengthened`.
         search: by which the learning rates of the rows were chosen; None where they were not searched for.
@@ -95,6 +96,7 @@ class PaperTable:
     steps: int | None = None
     hosts: tuple[TableRow, ...] = ()
     minutes: float = 6.0
+    host_minutes: float = 6.0
     note: str = ""
     steps_factor: int = 1
     search: RateSearch | None = None
@@ -108,6 +110,7 @@ class PaperTable:
             name=f"{self.name}.steps_x{factor}",
             title=f"{self.title}, {factor} times the steps",
             minutes=self.minutes * factor,
+            host_minutes=self.host_minutes * factor,
             steps_factor=factor,
         )
 

@@ -12,8 +12,8 @@ Written are the table, the CPU time by part, and two pictures: the confidence of
 image that shows the board, the truth, the lanes in memory and those of each model.
 
 `--tiny` takes random weights and one decoder layer and shows that everything runs; its scores mean nothing. A model
-whose scores mean something is a run of `markers/camera_clips:pixels` (400 updates from a host of 3,000:
-docs/markers.md).
+whose scores mean something is a run of `markers/camera_clips:pixels` from a host of `markers/camera_host`
+(docs/markers.md).
 
 `--tiny` takes 12 CPU seconds to start, 20 for the first frame and 1.7 for each other one, 1.3 of them to draw six
 native images. So twenty scenes of 8 frames take some 6 CPU minutes with a whole model (an estimate), if boards are

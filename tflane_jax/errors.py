@@ -8,6 +8,16 @@ class UserError(Exception):
     """
 
 
+def missing_extra(what: str, extra: str) -> UserError:
+    """Return the error that a package of an extra is not installed; `what` says which, and what for."""
+    return UserError(f"{what}: {install(extra)}")
+
+
+def install(extra: str) -> str:
+    """Return how to install an extra of this package."""
+    return f"run `pip install -e '.[{extra}]'` in the checkout of tflane_jax"
+
+
 class Interrupted(KeyboardInterrupt):
     """A signal ended a command. The command line exits with code 128 + `number`."""
 

@@ -26,7 +26,7 @@ from tflane_jax.datasets.data_source import loading_of
 from tflane_jax.datasets.overlap import Nearness, nearness
 from tflane_jax.datasets.sources import source_of
 from tflane_jax.devices import training_mesh
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, install
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import check_settings
 from tflane_jax.migrations import migrate
@@ -332,7 +332,7 @@ def evaluate_run(
 def _drawing(config: RunConfig) -> Draw | None:
     """Return the function that draws curves and a few validation examples, or None without matplotlib."""
     if importlib.util.find_spec("matplotlib") is None:
-        print("no pictures: matplotlib is missing (pip install 'tflane_jax[plot]')", file=sys.stderr)
+        print(f"no pictures, which need matplotlib: {install('plot')}", file=sys.stderr)
         return None
     from tflane_jax.plots import save_curves
 

@@ -8,8 +8,8 @@
 Sizes, schedule and capacity are those of TopoNet (`camera/toponet_r50`): the reference trains 24 epochs on eight GPUs,
 one frame each. `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 `:published_weights` evaluates as the published code does, which its weights need to reach their published numbers: each
-frame alone, with the numbers of its pose that the weights read (`datasets.openlane_can_bus`), and with the last layer's
-change of the centerline applied twice.
+frame alone, with the numbers of its pose that the weights read (`datasets.openlane_can_bus`), pixels of all cameras
+divided by the size of the front camera's crop, and the last layer's change of the centerline applied twice.
 """
 
 from dataclasses import replace

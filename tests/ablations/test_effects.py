@@ -123,6 +123,20 @@ def test_an_effect_of_few_scenes_is_not_shown():
     assert effect.finding == "not shown"
 
 
+def test_one_seed_tests_nothing():
+    found = Results(("baseline", "+TFM"), range(1), {})
+    for model, hits in (("baseline", (5, 5, 5)), ("+TFM", (7, 8, 9))):
+        measured = Measured(
+            1, "a protocol", {"": {PRIMARY: sum(hits) / 30}}, {"": {PRIMARY: SceneRatio(hits, (10, 10, 10))}}
+        )
+        found.add("", "last", model, 0, measured)
+    (effect,) = effects(found, Declaration(PRIMARY, (Claim("+TFM", text="it helps"),)), "", "last")
+    assert effect.low > 0
+    assert effect.finding == "not tested"
+    text = f"**not tested** (one seed): +TFM minus *baseline* in {PRIMARY}, +30.00 points (95 % +20.00 to +40.00)."
+    assert f"{sentence([effect])}." == f"{text} Claim: it helps."
+
+
 def ranked(values, *, ways=("",), lanes=(9, 9, 9)):
     """Return a measurement of a score in four samples, and of a ratio over the same scenes."""
     sample, ratio = SceneSamples(lanes, tuple(values)), SceneRatio((3, 0, 6), lanes)

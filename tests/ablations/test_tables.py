@@ -112,6 +112,27 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert written == page(tmp_path / "results")
 
 
+def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
+    rows = [
+        {"model": model, "checkpoint": which, "seeds": 1, "score": score}
+        for which, scores in (("last", ("1.0", "2.0")), ("best", ("1.0", "2.5")))
+        for model, score in zip("ab", scores, strict=True)
+    ]
+    rows[0]["score, geometric"] = "1.5"
+    summary = dict.fromkeys(("table", "title", "protocol", "declared"), "x") | {
+        "seeds": [0],
+        "steps": [1],
+        "rows": rows,
+    }
+    summary |= {"cores of a run": [1], "commits": [], "devices": [], "core minutes of a run": {"a": 1.0}}
+    (tmp_path / "x.json").write_text(json.dumps(summary | {"findings": [], "quoted": {"rows": []}}))
+    written = page(tmp_path)
+    lines = [line.split() for line in written.splitlines() if line.startswith(("| a", "| b"))]
+    assert [(line[1], line[3]) for line in lines] == [("a", "last"), ("b", "last"), ("b", "best")]
+    assert "Best checkpoints that score as the last are left out.\n" in written
+    assert "1 seed, 1 updates a run" in written
+
+
 def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
     wrong = TableRow("tfm", str(tiny), ("--training.best_metric", "all/NONE"))
     tables = {"paper.9": small(tiny), "paper.10": small(tiny, name="paper.10", rows=(*small(tiny).rows[:1], wrong))}

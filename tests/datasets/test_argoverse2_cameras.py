@@ -8,6 +8,7 @@ import pytest
 
 from tests.datasets.small_argoverse2 import MS, pixel, write, write_images, write_log
 from tests.shared import shared_path
+from tflane_jax.cli import main
 from tflane_jax.datasets.argoverse2 import SOURCE, Argoverse2Config, Argoverse2Dataset, LogData, check_argoverse2
 from tflane_jax.datasets.argoverse2_cameras import RING, LogImages, has_images
 from tflane_jax.datasets.argoverse2_log import POSES, load_log
@@ -88,6 +89,12 @@ def test_pictures_show_what_is_there(root):
         Argoverse2Dataset(Argoverse2Config(root, image=HALVED))
     rows = check_argoverse2(root).rows
     assert [(row["cameras"], row["missing images"], row["faults"]) for row in rows] == [(2, 2, 0), (0, 0, 0)]
+
+
+def test_samples_are_drawn_into_the_images_of_their_log(written, tmp_path):
+    shown = ["data", "show", "--data", "argoverse2", "--root", str(written), "--count", "2"]
+    assert main([*shown, "--out", str(tmp_path / "out" / "logs.png")]) == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"logs.png", "logs-cameras.png"}
 
 
 def rows_of(path):

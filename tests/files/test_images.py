@@ -99,7 +99,7 @@ def test_absent_opencv_names_the_extra(monkeypatch):
         return original(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(UserError, match=r"pip install 'tflane_jax\[images\]'"):
+    with pytest.raises(UserError, match=r"images need OpenCV: run `pip install -e '\.\[images\]'` in the checkout"):
         resize(RED, 3, 4)
 
 

@@ -139,3 +139,29 @@ def faults(start, folder):
 def test_memory_of_one_step_is_used_by_the_next_in_any_thread(tmp_path, start):
     # Without the settings, 25,600 pages of 4 KiB or 50 of 2 MiB are mapped anew each time.
     assert faults(start, tmp_path) < faults("backend", tmp_path) / 4
+
+
+KEPT = """
+from tflane_jax.memory import give_back_freed_memory, keep_freed_memory
+
+def resident():
+    return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmRSS"))
+
+keep_freed_memory()
+blocks = [bytearray(2**24) for _ in range(12)]
+last = bytearray(2**20)
+full = resident()
+del blocks
+kept = resident()
+give_back_freed_memory()
+print(full - kept, full - resident())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
+def test_memory_of_a_training_is_given_back():
+    """192 MiB below a block that is still used: kept until they are given back."""
+    said = subprocess.run([sys.executable, "-c", KEPT], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    kept, given = map(int, said.split())
+    assert kept < 2**14
+    assert given > 180 * 2**10

@@ -4,7 +4,7 @@ A claim without a control compares its treatment with the other models and the i
 Every difference has two uncertainties: between seeds (paired t-test, corrected by Holm for all differences of one
 measure and checkpoint) and between test scenes (bootstrap interval over scenes, the seeds averaged). An effect is
 *shown* if the corrected p is below the declared level and the interval excludes 0, *contradicted* if the same holds in
-the wrong direction, else *not shown*.
+the wrong direction, else *not shown*; with one seed it is *not tested*.
 
 Ratios of sums over scenes, such as recall and TOP_ll, are resampled here. Scores that rank detections over all scenes,
 such as DET_l and mAP, were measured in samples that all runs share (`evaluation.by_scene`). Scores of earlier programs
@@ -38,7 +38,7 @@ from tflane_jax.plots.tables import format_table, save_table
 SAMPLES = 10_000
 HAS_INTERVAL = "95 %"
 NO_INTERVAL = "no interval over scenes: decided by seeds alone"
-Finding = Literal["shown", "not shown", "contradicted"]
+Finding = Literal["shown", "not shown", "contradicted", "not tested"]
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _of_claim(results: Results, claim: Claim, measure: Measure, test: str, which
                 p_holm=math.nan,
                 better=paired.better,
                 seeds=shared,
-                finding="not shown",
+                finding="not tested",
             )
         )
     return found
@@ -225,6 +225,8 @@ def _drawn_from(part: SceneRatio | SceneSamples) -> tuple[tuple[int, ...], int]:
 
 
 def _finding(effect: Effect, p: float, alpha: float, sign: float) -> Finding:
+    if len(effect.seeds) < 2:
+        return "not tested"
     if not p < alpha:  # NaN too
         return "not shown"
     low, high = sorted((sign * effect.low, sign * effect.high))
@@ -270,17 +272,21 @@ def sentence(of_row: Sequence[Effect]) -> str:
     """Return the effects against one row as a sentence: primary measure, then the others, see `measures`."""
     primary, *others = of_row
     claim = primary.claim
-    text = (
-        f"**{primary.finding}**: {claim.treatment} is better than *{primary.row}* in {primary.measure}, "
-        f"{_numbers(primary)}"
-    )
-    text = "; ".join([text, *(f"{effect.finding} in the {effect.measure}, {_numbers(effect)}" for effect in others)])
+    if primary.finding == "not tested":
+        text = f"**not tested** (one seed): {claim.treatment} minus *{primary.row}* in {primary.measure}, "
+        text = "; ".join([text + _numbers(primary), *(f"in the {each.measure}, {_numbers(each)}" for each in others)])
+    else:
+        text = f"**{primary.finding}**: {claim.treatment} is better than *{primary.row}* in {primary.measure}, "
+        each = (f"{effect.finding} in the {effect.measure}, {_numbers(effect)}" for effect in others)
+        text = "; ".join([text + _numbers(primary), *each])
     return f"{text}. Claim: {claim.text}" if claim.text else text
 
 
 def _numbers(effect: Effect) -> str:
-    """Return a difference in points of percent, with its uncertainties."""
+    """Return a difference in points of percent, with its uncertainties; those between seeds only if there are some."""
     parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    if effect.finding == "not tested":
+        return " ".join([f"{100 * effect.difference:+.2f} points", *(f"({part})" for part in parts)])
     parts += [] if math.isnan(effect.p) else [_p_value(effect.p_holm)]
     parts.append(f"better in {effect.better} of {len(effect.seeds)} seeds")
     parts += [NO_INTERVAL] if math.isnan(effect.low) else []

@@ -73,8 +73,9 @@ def _between(numbers: Collection[float]) -> str:
 def _section(summary: Mapping[str, Any]) -> list[str]:
     minutes = summary["core minutes of a run"]
     cores = _listed(summary["cores of a run"])
+    rows = _without_repeated(summary["rows"])
     facts = (
-        f"{len(summary['seeds'])} seeds, {_listed(summary['steps'])} updates a run, each on {cores} "
+        f"{_counted(len(summary['seeds']), 'seed')}, {_listed(summary['steps'])} updates a run, each on {cores} "
         f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}) in "
         f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
@@ -89,9 +90,11 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         "",
         *_wrapped(facts),
         "",
-        format_table(summary["rows"]),
+        format_table(rows),
         "",
     ]
+    if len(rows) < len(summary["rows"]):
+        lines += ["Best checkpoints that score as the last are left out.", ""]
     if note := summary.get("note"):  # earlier summaries have none
         lines += [*_wrapped(note), ""]
     for finding in summary["findings"]:
@@ -104,6 +107,22 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         lines += ["", *_wrapped(f"The paper's own numbers: {quoted['source']}."), ""]
         lines.append(format_table(quoted["rows"], digits=2))
     return lines
+
+
+def _without_repeated(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the rows without those of a best checkpoint that show what the last checkpoint's row shows."""
+    last = {row["model"]: row for row in rows if row["checkpoint"] == "last"}
+
+    def repeats(row: Mapping[str, Any]) -> bool:
+        return row["checkpoint"] != "last" and row | {"checkpoint": "last"} == {
+            column: last.get(row["model"], {}).get(column) for column in row
+        }
+
+    return [row for row in rows if not repeats(row)]
+
+
+def _counted(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _listed(values: Sequence[Any]) -> str:

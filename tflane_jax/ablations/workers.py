@@ -24,7 +24,7 @@ from tflane_jax.ablations.scores import is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.child_processes import end_with_parent
 from tflane_jax.errors import Interrupted, UserError
-from tflane_jax.memory import keep_freed_memory
+from tflane_jax.memory import give_back_freed_memory, keep_freed_memory
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
 from tflane_jax.startup import leave, showing, write
@@ -264,6 +264,7 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> 
                     if not job.is_complete():
                         _train(job)
                     measure_all(job)
+            give_back_freed_memory()
             tell("done", failures[0].reason if failures else None)
     except KeyboardInterrupt as error:  # the comparison tells of it
         code = 128 + getattr(error, "number", signal.SIGINT)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.commands.sources import chosen_source
+from tflane_jax.commands.views import with_images
 from tflane_jax.config import FrontViewData, RunConfig, apply_overrides, load_config
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import SPLITS
@@ -19,6 +20,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.scene import RoadImage, stack_examples
 from tflane_jax.tasks import spread
+from tflane_jax.tasks.lane_pictures import titles
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
 _PRINTED_FAULTS = 50
@@ -37,9 +39,11 @@ def show(options: argparse.Namespace) -> int:
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
     written = [picture]
-    if examples.cameras is not None:
-        path = options.out.with_stem(f"{options.out.stem}-cameras")
-        written.append(save_camera_views(path, examples, ground=source.example.ground, view=source.example.range))
+    shown, seen = with_images(examples, source, indices)
+    if shown:
+        path, names = options.out.with_stem(f"{options.out.stem}-cameras"), titles(dataset, indices)
+        shape = {"ground": source.example.ground, "view": source.example.range}
+        written.append(save_camera_views(path, seen, titles=[names[i] for i in shown], **shape))
     print(
         format_table(
             dataset_summary(examples), title=f"{sources.source_name(source)}: the {len(indices)} examples drawn"

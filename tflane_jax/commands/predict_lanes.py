@@ -28,8 +28,6 @@ predictions.json, lanes with a score of at least `threshold`, best first:
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +37,7 @@ from jaxtyping import Float, Int
 from scipy.special import expit
 
 from tflane_jax.commands.sources import chosen_source, limited_task, make_folder
+from tflane_jax.commands.views import with_images
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.datasets.procedural import SimulatedDataset
@@ -48,14 +47,11 @@ from tflane_jax.files.atomic import replacing, write_json
 from tflane_jax.plots import save_camera_views, save_examples
 from tflane_jax.plots.segments import true_lanes
 from tflane_jax.runs import Run
-from tflane_jax.scene import CameraViews, Example, LinePrediction, SegmentPrediction, stack_examples
+from tflane_jax.scene import Example, LinePrediction, SegmentPrediction
 from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
-from tflane_jax.world.cameras.ring import CameraRigConfig
 
 _RELATION_THRESHOLD = 0.5
-# Of --cameras: images of 400 x 225 pixels.
-_RING = CameraRigConfig(scale=0.25)
 _OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
 
 
@@ -113,7 +109,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         threshold=options.threshold,
     )
     written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
-    shown, examples = _with_images(examples, source, indices, rendered=options.cameras)
+    shown, examples = with_images(examples, source, indices, rendered=options.cameras)
     if shown:
         save_camera_views(
             options.out / "cameras.png",
@@ -127,29 +123,6 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         written.append("cameras.png")
     print(f"{len(indices)} frames written to {options.out}: {', '.join(written)}")
     return 0
-
-
-def _with_images(
-    examples: Example, source: Any, indices: Sequence[int], *, rendered: bool
-) -> tuple[list[int], Example]:
-    """Return the rows of the examples that have camera images, and these examples with them.
-
-    Where the model reads none, images that are there nevertheless are read for the picture, or are `rendered`.
-    """
-    if examples.cameras is not None:
-        return list(range(len(indices))), examples
-    views = _rendered(source, indices) if rendered else sources.drawing_views(source, indices)
-    shown = [i for i, view in enumerate(views) if view is not None]
-    if not shown:
-        return [], examples
-    rows: Example = jax.tree.map(lambda leaf: np.asarray(leaf)[shown], examples)
-    return shown, replace(rows, cameras=stack_examples([views[i] for i in shown]))
-
-
-def _rendered(source: Any, indices: Sequence[int]) -> list[CameraViews | None]:
-    """Return images of frames of the built-in world."""
-    dataset = sources.make_dataset(replace(source, example=replace(source.example, sensor=None, cameras=_RING)))
-    return [dataset.example(index).cameras for index in indices]
 
 
 def _truth(examples: Example, lanes: Found, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray] | None:

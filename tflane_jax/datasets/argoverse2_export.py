@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES
 from tflane_jax.datasets.base import Split
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.atomic import replacing
 from tflane_jax.scene import RoadUser
 from tflane_jax.scene.logs import Log, Tracks
@@ -49,7 +49,7 @@ def export_tracks(
         import pyarrow
         from pyarrow import feather
     except ImportError as error:
-        raise UserError("writing Argoverse 2 needs pyarrow: pip install 'tflane_jax[data]'") from error
+        raise missing_extra("writing Argoverse 2 needs pyarrow", "data") from error
     if out.is_dir() and any(out.iterdir()):
         raise UserError(f"{out} is not empty: choose another folder")
     with replacing(out) as writing:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tflane_jax.datasets.plausible import first_twice, left_of
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.scene import LineType
@@ -127,7 +127,7 @@ def _boundaries(areas: list[np.ndarray]) -> tuple[np.ndarray, ...]:
         import shapely
         from scipy.spatial import KDTree
     except ImportError as error:
-        raise UserError("reading Argoverse 2 needs shapely: pip install 'tflane_jax[data]'") from error
+        raise missing_extra("reading Argoverse 2 needs shapely", "data") from error
     if not areas:
         return ()
     # A zero buffer repairs rings that touch themselves.

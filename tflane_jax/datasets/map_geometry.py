@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.datasets.packed_lines import PackedLines
-from tflane_jax.errors import UserError
+from tflane_jax.errors import missing_extra
 from tflane_jax.geometry import PerceptionRange
 from tflane_jax.geometry.polylines import clip_to_range
 from tflane_jax.geometry.rings import from_first_corner, oriented
@@ -221,7 +221,7 @@ def _shapely() -> Any:
     try:
         import shapely
     except ImportError as error:
-        raise UserError("cutting the areas of a vector map needs shapely: pip install 'tflane_jax[data]'") from error
+        raise missing_extra("cutting the areas of a vector map needs shapely", "data") from error
     return shapely
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.nuscenes_arclines import lane_points
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.fields import items, load_json, member, numbers
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
@@ -297,7 +297,7 @@ def _shape(polygon: Polygon) -> Any:
     try:
         import shapely
     except ImportError as error:
-        raise UserError("reading nuScenes maps needs shapely: pip install 'tflane_jax[data]'") from error
+        raise missing_extra("reading nuScenes maps needs shapely", "data") from error
     return shapely.Polygon(polygon[0], polygon[1:])
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tflane_jax.datasets.base import IndexedExamples
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.limits import Count, CountOrZero
 
 # Draws in place of an example that is not wanted.
@@ -183,5 +183,5 @@ def _grain() -> ModuleType:
     try:
         import grain
     except ImportError as error:
-        raise UserError("reading datasets while training needs grain: pip install 'tflane_jax[images]'") from error
+        raise missing_extra("reading datasets while training needs grain", "images") from error
     return grain

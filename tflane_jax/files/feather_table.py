@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, missing_extra
 
 Kind = Literal["integer", "number", "text"]
 """What a column holds: whole numbers (int64), finite numbers (float64), or text (str)."""
@@ -25,7 +25,7 @@ def read_columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarra
         import pyarrow
         from pyarrow import feather
     except ImportError as error:
-        raise UserError("reading Argoverse 2 needs pyarrow: pip install 'tflane_jax[data]'") from error
+        raise missing_extra("reading Argoverse 2 needs pyarrow", "data") from error
     if not path.is_file():
         raise UserError(f"{path} is missing: download it with the Argoverse 2 sensor dataset")
     try:

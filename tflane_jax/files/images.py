@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from tflane_jax.errors import UserError
+from tflane_jax.errors import UserError, missing_extra
 
 PHOTO_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
@@ -23,7 +23,7 @@ def opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise UserError("images need OpenCV: pip install 'tflane_jax[images]'") from error
+        raise missing_extra("images need OpenCV", "images") from error
     return cv2
 
 

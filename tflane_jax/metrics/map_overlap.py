@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.errors import UserError
+from tflane_jax.errors import missing_extra
 from tflane_jax.metrics.chamfer import PaddedLines
 
 OVERLAP_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
@@ -25,7 +25,7 @@ def map_overlap(true: PaddedLines, found: PaddedLines, same: Bool[np.ndarray, "g
     try:
         import shapely
     except ImportError as error:
-        raise UserError("the IoU of lines needs shapely: pip install 'tflane_jax[data]'") from error
+        raise missing_extra("the IoU of lines needs shapely", "data") from error
     i, j = np.nonzero(same)
     overlap = np.zeros(same.shape)
     if len(i):

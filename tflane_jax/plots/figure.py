@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tflane_jax.errors import UserError
+from tflane_jax.errors import missing_extra
 from tflane_jax.files.atomic import replacing
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def new_figure(
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise UserError("pictures need matplotlib: install the extra with `pip install 'tflane_jax[plot]'`") from error
+        raise missing_extra("pictures need matplotlib", "plot") from error
 
     class NotebookFigure(Figure):
         """A figure that a notebook shows when it is the last value of a cell, in 256 colours: half the bytes."""

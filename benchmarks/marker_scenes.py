@@ -15,9 +15,9 @@ image that shows the board, the truth, the lanes in memory and those of each mod
 whose scores mean something is a run of `markers/camera_clips:pixels` from a host of `markers/camera_host`
 (docs/markers.md).
 
-`--tiny` takes 12 CPU seconds to start, 20 for the first frame and 1.7 for each other one, 1.3 of them to draw six
-native images. So twenty scenes of 8 frames take some 6 CPU minutes with a whole model (an estimate), if boards are
-searched by their outlines, as that configuration does.
+`--tiny` takes 12 CPU seconds to start, 20 for the first frame and 1.6 for each other one, 1.2 of them to draw six
+native images: some 5 CPU minutes for twenty scenes of 8 frames, with boards searched by their outlines, as that
+configuration does.
 """
 
 from __future__ import annotations

@@ -16,15 +16,17 @@ COLUMNS = {
     "DET_l": "all/DET_l",
     "TOP_ll": "all/TOP_ll",
     "recall": "all/recall",
+    **{name: f"all/{name}" for name in ("mAP", "AP_ls", "AP_ped", "TOP_lsls")},
     "hidden, driven along": "hidden+traffic/recall",
     "recall, hidden lanes that vehicles drove along": "hidden+traffic/recall",
     "hidden, no vehicle near": "hidden-traffic/recall",
 }
-ROWS = {
-    "+ TFM (the paper)": "TopoNet + TFM",
-    "+ TFM, in the queries as in the paper": "TopoNet + TFM",
-    "+ TFM + BEV (ours)": "TopoNet + TFM + BEV",
-    "+ TFM, and traffic in the BEV features (ours)": "TopoNet + TFM + BEV",
+# What rows add to the host, which stands in the first row.
+ON_HOST = {
+    "+ TFM (the paper)": " + TFM",
+    "+ TFM, in the queries as in the paper": " + TFM",
+    "+ TFM + BEV (ours)": " + TFM + BEV",
+    "+ TFM, and traffic in the BEV features (ours)": " + TFM + BEV",
 }
 # Rows about the model of the row above that has a name of its own.
 ADDED = {
@@ -69,13 +71,16 @@ def wrong_tables(text, recorded):
             wrong.append(f"a table with the row {rows[0]} does not name a recorded table, but has: {above}")
             continue
         found = {row["model"]: row for row in recorded[named[1]]["rows"] if row["checkpoint"] == "last"}
-        main = ""
+        host = main = ""
         for label, *cells in rows:
             if label in ADDED:
                 name = main + ADDED[label]
+            elif label in ON_HOST:
+                name = main = host + ON_HOST[label]
             else:
                 own = [row for row in found if re.match(rf"{re.escape(row)}($|[,:] )", label)]
-                name = main = ROWS.get(label, max(own, key=len, default=label))
+                name = main = max(own, key=len, default=label)
+                host = host or name
             if name not in found:
                 wrong.append(f"{named[1]} has no row {name}")
                 continue

@@ -114,7 +114,7 @@ TABLES = (
         _SEGMENTS,
         "all/mAP",
         steps=2000,
-        minutes=7.6,
+        minutes=7.5,
         quoted=_quoted(
             _LANESEGNET,
             _SEGMENT_COLUMNS,

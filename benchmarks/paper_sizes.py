@@ -122,17 +122,19 @@ def measured(name: str, folder: Path) -> dict[str, Any]:
 
 
 def run(out: Path, names: Sequence[str] = CONFIGS) -> dict[str, Any]:
-    """Measure the configurations, print the table, and write `paper_sizes.json` and `.md` into `out`."""
+    """Measure the configurations; after each, print the table and write `paper_sizes.json` and `.md` into `out`."""
     folder = out / "paper_sizes"
     if any(isinstance(load_config(name).data, OpenLaneV2Data) for name in names):
         written = ["--out", str(folder / "openlane_v2"), "--tracks", str(folder / "argoverse2")]
         if not (folder / "openlane_v2").exists() and tflane(["data", "export", "--config", _WORLD, *written]):
             raise SystemExit(2)
-    record = machine() | {"updates": UPDATES, "configs": {name: measured(name, folder) for name in names}}
-    header = ["configuration", "compile s", "s an update", "peak GiB", "loss"]
-    text = markdown_table(header, [_row(name, found) for name, found in record["configs"].items()])
-    print(text)
-    save(out, "paper_sizes", record, text)
+    header, found = ["configuration", "compile s", "s an update", "peak GiB", "loss"], {}
+    record = machine() | {"updates": UPDATES, "configs": found}
+    for name in names:
+        found[name] = measured(name, folder)
+        text = markdown_table(header, [_row(*one) for one in found.items()])
+        print(text, flush=True)
+        save(out, "paper_sizes", record, text)  # after each, because the next may take hours
     return record
 
 

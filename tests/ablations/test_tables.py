@@ -217,8 +217,9 @@ def test_a_table_with_more_steps_has_another_name_and_slower_schedules():
     assert main(["tables", "tf_lane.2", "--steps-factor", "0"]) == 2
 
 
-def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch):
+def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch, capsys):
     run_table(small(tiny), range(2), tmp_path, quick=True)
+    assert "6 runs, 0 complete; the others compile, train a few updates" in capsys.readouterr().out
     path = tmp_path / "quick" / "paper.9" / "table.md"
     assert "SMOKE TEST" in path.read_text()
     with pytest.raises(UserError, match="smoke test and no result"):

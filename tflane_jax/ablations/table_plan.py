@@ -117,7 +117,7 @@ def seed_by_seed(plan: Mapping[str, Sequence[Job]]) -> list[Job]:
     return list({job.folder: job for job in every}.values())
 
 
-def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int) -> None:
+def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, quick: bool = False) -> None:
     """Print how many runs are complete, how long the others take, and which exist with other thread settings.
 
     Args:
@@ -125,13 +125,16 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int) -> 
         seeds: of the plan.
         store: folder of its runs.
         jobs: trainings at a time.
+        quick: few updates, for which there are no figures.
     """
     every, table = plan.every(), plan.table
     complete = sum(job.is_complete() for job in every)
     text = f"{table.name}, {table.title}: {len(every)} runs, {complete} complete"
     if recorded := sum(job.recorded is not None for job in every):
         text += f" ({recorded} of them recorded)"
-    if complete < len(every):
+    if complete < len(every) and quick:
+        text += "; the others compile, train a few updates and are measured in minutes"
+    elif complete < len(every):
         seconds, guesses = remaining_seconds(plan.named(), plan.minutes())
         basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
         text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"

@@ -99,7 +99,7 @@ def run_table(
         for line in unused(plan, archive, table.declaration.scores):
             print(line)
     declared = declare(table.declaration, plan, planned.declared(), every, folder)
-    tell_work(planned, seeds, store_of(out, quick=quick), jobs)
+    tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
 
     failures = train_all(seed_by_seed(planned.host_jobs), jobs, cores)
     failures += train_all(seed_by_seed(plan), jobs, cores)

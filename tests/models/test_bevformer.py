@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.geometry.poses import yaw_pose
@@ -43,7 +44,7 @@ CONFIG = BevFormerConfig(GRID, 8, 2, 1, 16, 0.0, 2, 4, anchors=2, levels=2, came
 MODEL = BevFormer(CONFIG)
 
 
-@pytest.mark.parametrize("initial", ["mixed", "xavier", "normal"])
+@pytest.mark.parametrize("initial", with_slow(["mixed", "xavier", "normal"], quick=["xavier"]))
 def test_queries_and_positions_start_as_published(initial):
     grid = BevGrid(GRID.range, 20, 40)
     model = BevFormer(replace(CONFIG, grid=grid, initial=initial))

@@ -149,6 +149,7 @@ def test_both_hosts_have_one_loss(fitted):
     assert jax.tree.map(jnp.shape, gradient) == jax.tree.map(jnp.shape, learned)
 
 
+@pytest.mark.slow
 def test_loss_reports_every_term_for_any_number_of_targets(toponet):
     for lanes, elements in ((4, 2), (0, 0), (1, 1)):
         batch = batch_of(*[make_camera_example(5, lanes=lanes, elements=elements)] * 2)

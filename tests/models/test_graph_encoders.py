@@ -10,6 +10,7 @@ import pytest
 
 from tests.layers.test_image_graph import dense_stack
 from tests.parameters import random_params
+from tests.slow import with_slow
 from tflane_jax.errors import UserError
 from tflane_jax.layers.attention import MultiHeadAttention
 from tflane_jax.layers.graph_transformer import GTN_2022, meta_path_graphs
@@ -34,9 +35,11 @@ CONFIGS = {
     "han": HanEncoderConfig(hidden=16, semantic=8),
     "han meta-paths": HanEncoderConfig(1, hidden=16, semantic=8, relations=("near", "near+row", "row+column")),
 }
+# Each of these has a part that no other has; the slow ones have parts of several.
+QUICK = ("gtn every hop", "gtn similarity alone", "gcn", "han meta-paths")
 PARAMETERS = {"gtn": 23_360, "gcn": 19_072, "han": 22_016}
 
-every_config = pytest.mark.parametrize("name", CONFIGS)
+every_config = pytest.mark.parametrize("name", with_slow(CONFIGS, QUICK))
 
 
 def random_array(seed, *shape):

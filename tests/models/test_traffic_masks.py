@@ -93,7 +93,7 @@ def encoder(name, fusions):
     return jax.jit(module.apply), random_params(module.init, *arguments), arguments
 
 
-@pytest.mark.parametrize("fusions", [LANE_FUSIONS, ALL_FUSIONS])
+@pytest.mark.parametrize("fusions", [pytest.param(LANE_FUSIONS, marks=pytest.mark.slow), ALL_FUSIONS])
 @pytest.mark.parametrize("name", VARIANTS)
 def test_padding_changes_nothing_and_gradients_are_finite(name, fusions):
     apply, params, (features, position, traffic, mask) = encoder(name, fusions)

@@ -205,6 +205,7 @@ def curves_of(**options):
     return jax.jit(task.predict)(random_params(task.init, road_image(0)), road_image(0)).curves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{"shrink": 2}, {"located": True}, {"anchors": (0.4, 1.0)}])
 def test_options_change_the_prediction(changes):
     assert not np.array_equal(curves_of().curves, curves_of(**changes).curves)

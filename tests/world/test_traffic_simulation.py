@@ -160,6 +160,7 @@ def test_traffic_is_settled_in_the_first_frame():
     assert np.mean(early) == pytest.approx(np.mean(late), rel=0.25)
 
 
+@pytest.mark.slow
 def test_variety_spreads_the_amounts_and_keeps_the_means():
     network = crossroads("signals")
     counts = {0.0: [], 0.8: []}

@@ -28,7 +28,7 @@ def dataset():
 def test_cameras_without_opencv_are_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     ProceduralDataset(CONFIG)
-    with pytest.raises(UserError, match=re.escape("tflane_jax[images]")):
+    with pytest.raises(UserError, match=re.escape("pip install -e '.[images]'")):
         ProceduralDataset(replace(CONFIG, example=ExampleConfig(cameras=CameraRigConfig())))
 
 

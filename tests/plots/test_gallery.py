@@ -61,7 +61,7 @@ def test_nothing_to_show_is_an_error(tmp_path, size, count):
 
 def test_without_matplotlib_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(UserError, match=r"tflane_jax\[plot\]"):
+    with pytest.raises(UserError, match=r"pictures need matplotlib: run `pip install -e '\.\[plot\]'`"):
         new_figure()
 
 

@@ -114,9 +114,10 @@ def _without_repeated(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, An
     last = {row["model"]: row for row in rows if row["checkpoint"] == "last"}
 
     def repeats(row: Mapping[str, Any]) -> bool:
-        return row["checkpoint"] != "last" and row | {"checkpoint": "last"} == {
-            column: last.get(row["model"], {}).get(column) for column in row
-        }
+        shown = last.get(row["model"], {})
+        return row["checkpoint"] != "last" and all(
+            shown.get(column) == cell for column, cell in row.items() if column != "checkpoint"
+        )
 
     return [row for row in rows if not repeats(row)]
 

@@ -5,14 +5,17 @@ To be called first in a process: see `keep_freed_memory`.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 # Parameters of glibc's mallopt: sizes from which memory is given back and mapped apart, and the number of heaps.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 _KEPT = 2**30
+_TUNABLES, _HUGE_PAGES = "GLIBC_TUNABLES", "glibc.malloc.hugetlb"
 
 
 def keep_freed_memory() -> None:
@@ -42,6 +45,25 @@ def give_back_freed_memory() -> None:
     gc.collect()
     if (trim := _of_glibc("malloc_trim")) is not None:
         trim(0)
+
+
+@contextlib.contextmanager
+def huge_pages_for_children() -> Iterator[None]:
+    """Let processes that start inside ask for huge pages, of 2 MiB, where the system gives them to those that ask.
+
+    A step writes all of its temporary memory, some 80 MiB for a small host, and with pages of 4 KiB finding them costs
+    5 to 8 % of its time. glibc reads the setting when a process starts: too late for this one.
+    """
+    before = os.environ.get(_TUNABLES)
+    if _HUGE_PAGES not in (before or ""):
+        os.environ[_TUNABLES] = ":".join(filter(None, (before, f"{_HUGE_PAGES}=1")))
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(_TUNABLES, None)
+        else:
+            os.environ[_TUNABLES] = before
 
 
 def _of_glibc(name: str) -> Callable[..., int] | None:

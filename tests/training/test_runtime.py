@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from tests.shared import ROOT
+from tflane_jax.memory import huge_pages_for_children
 from tflane_jax.training import runtime
 
 PROGRAM = """
@@ -165,3 +166,16 @@ def test_memory_of_a_training_is_given_back():
     kept, given = map(int, said.split())
     assert kept < 2**14
     assert given > 180 * 2**10
+
+
+def test_children_ask_for_huge_pages(monkeypatch):
+    shown = [sys.executable, "-c", "import os; print(os.environ['GLIBC_TUNABLES'])"]
+    monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.check=1")
+    with huge_pages_for_children(), huge_pages_for_children():
+        said = subprocess.run(shown, capture_output=True, text=True, check=True).stdout
+    assert said.strip() == "glibc.malloc.check=1:glibc.malloc.hugetlb=1"
+    assert os.environ["GLIBC_TUNABLES"] == "glibc.malloc.check=1"
+    monkeypatch.delenv("GLIBC_TUNABLES")
+    with huge_pages_for_children():
+        assert os.environ["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
+    assert "GLIBC_TUNABLES" not in os.environ

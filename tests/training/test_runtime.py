@@ -121,7 +121,7 @@ try:
         workers.train_run = in_a_thread
         here, there = multiprocessing.Pipe()
         here.send(jobs.Job(load_config("gtn_lane/gtn"), Path(folder), threads={}))
-        workers._train_jobs(there, [], {})
+        workers._train_jobs(there, [], {}, 20.0)
 except (KeyboardInterrupt, SystemExit):
     pass
 print("faults", faults[-1])

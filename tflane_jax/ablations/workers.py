@@ -274,10 +274,12 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str], ren
             print(f"{time.strftime('%H:%M:%S')} {stage}", flush=True)
         tell("stage", stage)
 
+    def note(event: str, duration_secs: float, **_: object) -> None:
+        if event == _COMPILED:
+            compiling.append(duration_secs)
+
     compiling: list[float] = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, seconds, **_: compiling.append(seconds) if event == _COMPILED else None
-    )
+    jax.monitoring.register_event_duration_secs_listener(note)
     leaves = False
     try:
         while not leaves and (job := _next(pipe)) is not None:

@@ -39,9 +39,15 @@ def tiny(config):
     return LstrConfig(backbone, config["attn"], encoder, config["dec"], layer, config["q"])
 
 
+@pytest.fixture
+def plain_convolutions(monkeypatch):
+    """Leave out oneDNN: with so few channels its kernels gave wrong gradients and damaged the heap (PyTorch 2.13)."""
+    monkeypatch.setattr(torch_or_skip().backends.mkldnn, "enabled", False)
+
+
 @pytest.mark.golden
 @pytest.mark.parametrize("path", of_kind("tiny"), ids=case_id)
-def test_network_is_the_reference(path):
+def test_network_is_the_reference(path, plain_convolutions):
     torch, case = torch_or_skip(), load_module_case(path)
     network = torch_lstr.load(torch_lstr.build(tiny(case.meta["config"])), case.params)
     network.train(case.meta["mode"] == "train")

@@ -14,17 +14,18 @@ from collections.abc import Callable, Iterator
 
 # Parameters of glibc's mallopt: sizes from which memory is given back and mapped apart, and the number of heaps.
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-_KEPT = 2**30
+_KEPT = 2**31 - 1  # the most that mallopt takes
 _TUNABLES, _HUGE_PAGES = "GLIBC_TUNABLES", "glibc.malloc.hugetlb"
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep freed blocks of up to 1 GiB, in one heap.
+    """Let glibc keep freed blocks, up to 2 GiB of them, in one heap.
 
     Every call of a compiled program allocates its temporary memory anew. By default glibc maps blocks of this size from
-    the system each time, and the system clears every page: a seventh of the time of an LSTR training step. Heaps of
-    threads other than the first cannot hold more than 64 MiB and would still do so: a third of a step of a small host
-    with 64 queries. Threads of XLA allocate seldom, so that one heap for all costs nothing measurable.
+    the system each time, and the system clears every page: a seventh of the time of an LSTR training step, which frees
+    more than 1 GiB. Heaps of threads other than the first cannot hold more than 64 MiB and would still do so: a third
+    of a step of a small host with 64 queries. Threads of XLA allocate seldom, so that one heap for all costs nothing
+    measurable.
 
     Must come before any thread, JAX's backend among them: glibc takes the number of heaps when a second thread first
     allocates, and ignores later changes without a word.

@@ -142,6 +142,31 @@ def test_memory_of_one_step_is_used_by_the_next_in_any_thread(tmp_path, start):
     assert faults(start, tmp_path) < faults("backend", tmp_path) / 4
 
 
+LARGE = """
+import resource
+import numpy as np
+from tflane_jax.memory import keep_freed_memory
+
+def step():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    blocks = [np.empty(600 * 2**20, np.uint8) for _ in range(2)]
+    for block in blocks:
+        block[::4096] = 1
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+keep_freed_memory()
+print(step(), step())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
+def test_memory_of_a_large_step_is_used_by_the_next():
+    """More than a GiB of it, as in an update of LSTR at its full size."""
+    said = subprocess.run([sys.executable, "-c", LARGE], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    first, second = map(int, said.split())
+    assert second < first / 10
+
+
 KEPT = """
 from tflane_jax.memory import give_back_freed_memory, keep_freed_memory
 

@@ -11,11 +11,11 @@ import pytest
 from tests.ablations import test_tables
 from tests.test_cli import CONFIG, fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import workers
-from tflane_jax.ablations.archive import write_archive
+from tflane_jax.ablations.archive import read_archive, write_archive
 from tflane_jax.ablations.declaration import Claim
 from tflane_jax.ablations.paper.table import TableRow
 from tflane_jax.ablations.published import record
-from tflane_jax.ablations.reuse import find_archive, unused
+from tflane_jax.ablations.reuse import find_archives, unused
 from tflane_jax.ablations.scores import is_measured
 from tflane_jax.ablations.table_plan import plan_table
 from tflane_jax.ablations.table_run import run_table
@@ -76,6 +76,10 @@ def made(tiny, scored, tmp_path_factory):
     return out
 
 
+def recorded(results, table="paper.9"):
+    return find_archives(results, [table])[table]
+
+
 def summary(folder, name="paper.9"):
     """Return summary.json without provenance, and the commits in it."""
     content = json.loads((folder / name / "summary.json").read_text())
@@ -105,7 +109,7 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     monkeypatch.setattr("tflane_jax.ablations.scores.code_digest", lambda: OTHER_CODE)
     monkeypatch.setattr("tflane_jax.ablations.table_plan.worker_threads", lambda *_: {"cores": 96})
     results = made.with_name("results")
-    run_table(small(tiny), range(2), tmp_path, archive=find_archive(results, "paper.9"))
+    run_table(small(tiny), range(2), tmp_path, archive=recorded(results))
     told = capsys.readouterr().out
     assert "6 runs, 6 complete (6 of them recorded)\n" in told
     assert "not used" not in told
@@ -114,7 +118,7 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     effects = (tmp_path / "paper.9" / "effects.md").read_text()
     assert effects.count("95 % interval") == 1
     assert effects.count("points (95 %") == 4  # both claims, by a ratio and by a score that ranks detections
-    for run in find_archive(results, "paper.9").runs.values():
+    for run in recorded(results).runs.values():
         kept = {name: set(found.samples.get("", ())) for name, found in run.measured.items() if found is not None}
         assert kept == {name: set() if "geometric" in name else {"all/DET_l"} for name in kept}
     assert "all/TOP_ll, geometric" in (tmp_path / "paper.9" / "comparison.json").read_text()
@@ -132,17 +136,17 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
 
 
 def test_a_table_half_from_its_record_is_that_of_all_runs(tiny, made, tmp_path, monkeypatch):
-    whole = find_archive(made.with_name("results"), "paper.9")
+    whole = recorded(made.with_name("results"))
     first = replace(whole, runs={key: run for key, run in whole.runs.items() if run.seed == 0})
     write_archive(tmp_path / "results" / "scores" / "paper.9.json.gz", first)
     names = trainings(monkeypatch)
-    path = run_table(small(tiny), range(2), tmp_path, archive=find_archive(tmp_path / "results", "paper.9"))
+    path = run_table(small(tiny), range(2), tmp_path, archive=recorded(tmp_path / "results"))
     assert len(names) == 3
     for name in SAME:
         assert path.with_name(name).read_bytes() == (made / "paper.9" / name).read_bytes(), name
     assert path.with_name("comparison.png").exists()  # of the runs at hand
     record([path.with_name("summary.json")], tmp_path / "results")
-    now = find_archive(tmp_path / "results", "paper.9").runs
+    now = recorded(tmp_path / "results").runs
     assert {key: run.measured for key, run in now.items()} == {key: run.measured for key, run in whole.runs.items()}
 
 
@@ -150,18 +154,18 @@ def test_recorded_runs_of_another_configuration_are_trained(tiny, made, tmp_path
     *rows, _ = small(tiny).rows
     other = small(tiny, rows=(*rows, TableRow("again", f"{tiny}:faster")))
     names = trainings(monkeypatch)
-    run_table(other, range(1), tmp_path, archive=find_archive(made.with_name("results"), "paper.9"))
+    run_table(other, range(1), tmp_path, archive=recorded(made.with_name("results")))
     assert len(names) == 1
     told = capsys.readouterr().out
     assert "the recorded run of again, seed 0, is not used: optim.lr: 0.02 there, 0.03 here\n" in told
     assert told.count("not used") == 1
     # A claim that the record does not know is another declaration.
     other = small(tiny, claims=(Claim("again", "base"),))
-    run_table(other, range(1), tmp_path / "claim", archive=find_archive(made.with_name("results"), "paper.9"))
+    run_table(other, range(1), tmp_path / "claim", archive=recorded(made.with_name("results")))
     assert "the recorded declaration is another one" in capsys.readouterr().out
     assert "3 runs had begun already" in (tmp_path / "claim" / "paper.9" / "effects.md").read_text()
     # A score that was not measured then.
-    archive = find_archive(made.with_name("results"), "paper.9")
+    archive = recorded(made.with_name("results"))
     every = [
         scores for run in archive.runs.values() for found in run.measured.values() for scores in found.ways.values()
     ]
@@ -174,7 +178,7 @@ def test_recorded_runs_of_another_configuration_are_trained(tiny, made, tmp_path
 
 
 def test_runs_of_a_cpu_and_of_a_gpu_do_not_meet(tiny, made, tmp_path, monkeypatch):
-    archive = find_archive(made.with_name("results"), "paper.9")
+    archive = recorded(made.with_name("results"))
     monkeypatch.setattr("tflane_jax.ablations.table_plan.worker_threads", lambda *_: {"cores": 1, "device": "gpu: x"})
     every = plan_table(small(tiny), range(2), tmp_path, archive=archive).jobs
     assert all(job.recorded is not None for jobs in every.values() for job in jobs)
@@ -185,6 +189,23 @@ def test_runs_of_a_cpu_and_of_a_gpu_do_not_meet(tiny, made, tmp_path, monkeypatc
     assert lines[0].endswith("base, seed 0, is not used: runs of different devices do not meet in a table")
 
 
+def test_runs_that_another_table_recorded_are_shared(tiny, made, tmp_path, monkeypatch, capsys):
+    base, tfm, again = small(tiny).rows
+    rows = (replace(base, name="baseline"), tfm, replace(again, config=f"{tiny}:faster"))
+    other = small(tiny, name="paper.10", rows=rows, claims=(Claim("tfm", "baseline"),))
+    names = trainings(monkeypatch)
+    path = run_table(other, range(2), tmp_path, archive=recorded(made.with_name("results"), "paper.10"))
+    assert len(names) == 2  # of the row that no table has
+    assert "not used" not in capsys.readouterr().out
+    scores, theirs = (read_archive(folder / "scores.json.gz") for folder in (path.parent, made / "paper.9"))
+    mine = {(run.row, run.seed): run.measured for run in scores.runs.values()}
+    assert {name for name, _ in mine} == {"baseline", "tfm", "again"}
+    assert mine["baseline", 1] == next(r.measured for r in theirs.runs.values() if (r.row, r.seed) == ("base", 1))
+    # A run at hand can be measured for this table, and is taken before.
+    archive = recorded(made.with_name("results"), "paper.10")
+    assert [job.recorded for job in plan_table(other, range(2), made, archive=archive).jobs["tfm"]] == [None, None]
+
+
 @pytest.mark.slow
 def test_a_recorded_row_needs_no_host(tiny, tmp_path, monkeypatch):
     rows = (TableRow("base", f"{tiny}:baseline", start="host"), TableRow("tfm", str(tiny)))
@@ -192,7 +213,7 @@ def test_a_recorded_row_needs_no_host(tiny, tmp_path, monkeypatch):
     table = small(tiny, rows=rows, hosts=hosts)
     run_table(table, range(1), tmp_path / "a")
     record([tmp_path / "a" / "paper.9" / "summary.json"], tmp_path / "results")
-    archive = find_archive(tmp_path / "results", "paper.9")
+    archive = recorded(tmp_path / "results")
     assert not any(str(tmp_path) in json.dumps(run.config) for run in archive.runs.values())
     names = trainings(monkeypatch)
     run_table(table, range(1), tmp_path / "b", archive=archive)
@@ -229,10 +250,10 @@ def test_the_command_takes_recorded_runs(tiny, made, tmp_path, monkeypatch, caps
     ):
         assert main([*arguments, *more]) == 2
         assert message in capsys.readouterr().err
-    find_archive(made, "paper.9")
+    recorded(made)
     assert "no run of paper.9 is recorded there" in capsys.readouterr().out
     shutil.copy(made.with_name("results") / "scores" / "paper.9.json.gz", tmp_path / "paper.10.json.gz")
     (tmp_path / "scores").mkdir()
     (tmp_path / "paper.10.json.gz").rename(tmp_path / "scores" / "paper.10.json.gz")
     with pytest.raises(UserError, match=r"paper\.10\.json\.gz is the record of paper\.9"):
-        find_archive(tmp_path, "paper.10")
+        recorded(tmp_path, "paper.10")

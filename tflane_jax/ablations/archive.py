@@ -20,7 +20,7 @@ import gzip
 import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,11 +50,13 @@ class Archive:
         table: name.
         declaration: content of the file in which the comparison was declared; None for none.
         runs: by key.
+        shared: runs that other tables have recorded, by key; not written.
     """
 
     table: str
     declaration: Mapping[str, Any] | None
     runs: Mapping[str, RecordedRun]
+    shared: Mapping[str, RecordedRun] = field(default_factory=dict)
 
 
 def merged(there: Archive, new: Archive) -> Archive:

@@ -2,13 +2,15 @@
 
 A recorded run has the place of a training with the same configuration, seed and thread setting. If there is none with
 the thread setting of this process, one with another setting has it, because a table is made from what was trained,
-wherever that was. Runs of a CPU and of an accelerator do not meet in a table, see `with_recorded`.
+wherever that was. A run that another table recorded has the place of one that neither this table recorded nor this
+machine trained. Runs of a CPU and of an accelerator do not meet in a table, see `with_recorded`.
 """
 
 from __future__ import annotations
 
 import datetime
-from collections.abc import Collection, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,35 +27,43 @@ from tflane_jax.runs import current_form
 FILE = "scores.json.gz"
 """Name of the record in a table's folder."""
 
+_FOLDER, _SUFFIX = "scores", ".json.gz"
+
 Plan = Mapping[str, Sequence[Job]]
 
 
 def archive_path(folder: Path, table: str) -> Path:
     """Return the file of a table in a folder of results."""
-    return folder / "scores" / f"{table}.json.gz"
+    return folder / _FOLDER / f"{table}{_SUFFIX}"
 
 
-def find_archive(folder: Path, table: str) -> Archive:
-    """Return the record of a table in a folder of results; an empty one, with a message, if it has none.
+def find_archives(folder: Path, tables: Collection[str]) -> dict[str, Archive]:
+    """Return the record of each table in a folder of results; an empty one, with a message, if it has none.
 
-    Raises UserError if there is no such folder, or the record is damaged or of another table.
+    Raises UserError if there is no such folder, or a record in it is damaged or of another table.
     """
     if not folder.is_dir():
         raise UserError(f"--from {folder} is no folder: give the folder of results, such as docs/results")
-    path = archive_path(folder, table)
-    if not path.exists():
-        print(f"{path} does not exist: no run of {table} is recorded there")
-        return Archive(table, None, {})
-    archive = read_archive(path)
-    if archive.table != table:
-        raise UserError(f"{path} is the record of {archive.table}")
-    return archive
+    every: dict[str, Archive] = {}
+    for path in sorted((folder / _FOLDER).glob(f"*{_SUFFIX}")):
+        archive = read_archive(path)
+        if path != archive_path(folder, archive.table):
+            raise UserError(f"{path} is the record of {archive.table}")
+        every[archive.table] = archive
+    runs = {key: run for archive in every.values() for key, run in archive.runs.items()}
+    found = {}
+    for table in tables:
+        if table not in every:
+            print(f"{archive_path(folder, table)} does not exist: no run of {table} is recorded there")
+        own = every.get(table, Archive(table, None, {}))
+        found[table] = replace(own, shared={key: run for key, run in runs.items() if key not in own.runs})
+    return found
 
 
 def thread_settings(archive: Archive, own: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Return the thread settings that a run may have: that of this process, then those in the record."""
     found: list[Mapping[str, Any]] = [own]
-    for run in archive.runs.values():
+    for run in (*archive.runs.values(), *archive.shared.values()):
         if run.threads not in found:
             found.append(run.threads)
     return found
@@ -72,11 +82,15 @@ def with_recorded(plans: Sequence[Plan], archive: Archive, scores: Collection[st
     """
 
     def best(same: Sequence[Job]) -> Job:
-        for job in same:
-            run = archive.runs.get(job.folder.name)
-            if run is not None and not _why_not(run, job, scores):
-                return replace(job, recorded=run)
-        return same[0]
+        def recorded(runs: Mapping[str, RecordedRun]) -> Iterator[Job]:
+            for job in same:
+                run = runs.get(job.folder.name)
+                if run is not None and not _why_not(run, job, scores):
+                    yield replace(job, recorded=run)
+
+        # A run at hand can be measured for this table; what another one recorded has the parts by scene of its scores.
+        at_hand = same[:1] if same[0].is_complete() else ()
+        return next(itertools.chain(recorded(archive.runs), at_hand, recorded(archive.shared), same))
 
     own = _device(next(iter(plans[0].values()))[0])
     for allowed in (plans, [plan for plan in plans if _device(next(iter(plan.values()))[0]) == own]):
@@ -152,7 +166,9 @@ def archive_of(
     for name, jobs in trained.items():
         for job in jobs:
             key = job.folder.name
-            runs.setdefault(key, job.recorded or _recorded(key, name, job, scores, curves, now))
+            if key not in runs:
+                kept = None if job.recorded is None else replace(job.recorded, row=name)
+                runs[key] = kept or _recorded(key, name, job, scores, curves, now)
     return Archive(table, declaration, runs)
 
 

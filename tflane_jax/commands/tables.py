@@ -41,18 +41,18 @@ def run(options: argparse.Namespace) -> int:
         for table in chosen:
             search_rates(table, options.out, jobs=jobs, cores=options.cores, quick=options.quick)
         return 0
-    from tflane_jax.ablations.reuse import find_archive
+    from tflane_jax.ablations.reuse import find_archives
     from tflane_jax.ablations.table_plan import plan_table
     from tflane_jax.ablations.table_run import run_table
 
     how: dict[str, Any] = {"jobs": jobs, "cores": options.cores, "quick": options.quick}
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}
-    archives = {t.name: None if options.source is None else find_archive(options.source, t.name) for t in chosen}
+    archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
     if len(chosen) > 1:  # what is wrong in the last one is told before the first one is trained
         for table in chosen:
-            plan_table(table, seeds[table.name], options.out, archive=archives[table.name], **how)
-    written = [run_table(t, seeds[t.name], options.out, archive=archives[t.name], **how) for t in chosen]
+            plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
+    written = [run_table(t, seeds[t.name], options.out, archive=archives.get(t.name), **how) for t in chosen]
     if options.record is not None:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     return 0

@@ -1,7 +1,4 @@
-"""Freed memory is kept for the next step, and given back after a training.
-
-To be called first in a process: see `keep_freed_memory`.
-"""
+"""Freed memory is kept for the next step, and given back after a training."""
 
 from __future__ import annotations
 
@@ -12,29 +9,27 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 
-# Parameters of glibc's mallopt: sizes from which memory is given back and mapped apart, and the number of heaps.
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt: sizes to give back, and to map apart
 _KEPT = 2**31 - 1  # the most that mallopt takes
 _TUNABLES, _HUGE_PAGES = "GLIBC_TUNABLES", "glibc.malloc.hugetlb"
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep freed blocks, up to 2 GiB of them, in one heap.
+    """Let glibc keep freed blocks, up to 2 GiB of them.
 
     Every call of a compiled program allocates its temporary memory anew. By default glibc maps blocks of this size from
     the system each time, and the system clears every page: a seventh of the time of an LSTR training step, which frees
-    more than 1 GiB. Heaps of threads other than the first cannot hold more than 64 MiB and would still do so: a third
-    of a step of a small host with 64 queries. Threads of XLA allocate seldom, so that one heap for all costs nothing
-    measurable.
+    more than 1 GiB.
 
-    Must come before any thread, JAX's backend among them: glibc takes the number of heaps when a second thread first
-    allocates, and ignores later changes without a word.
+    Heaps of threads other than the first cannot hold more than 64 MiB, and would still do so: a third of a step of a
+    small host with 64 queries. The first heap should stay free of gaps: compiling leaves a hundred thousand, and to
+    find blocks among them took 38 of 205 ms of a step of LaneSegNet. Programs therefore run in the thread that calls
+    them (`training.runtime`) and are compiled in another one, with a heap of its own (`startup.compiled`).
     """
     if (mallopt := _of_glibc("mallopt")) is None:
         return
     mallopt(_M_MMAP_THRESHOLD, _KEPT)
     mallopt(_M_TRIM_THRESHOLD, _KEPT)
-    mallopt(_M_ARENA_MAX, 1)
 
 
 def give_back_freed_memory() -> None:

@@ -43,23 +43,6 @@ def test_a_worker_that_is_killed_is_named_by_its_run(tmp_path):
     assert "killed by SIGKILL" in job.log.read_text()
 
 
-@pytest.mark.parametrize(("renew_after", "processes"), [(-1.0, 2), (1.0, 1)])
-def test_another_process_follows_one_that_compiled_for_long(tmp_path, renew_after, processes):
-    """The jobs compile nothing, which is longer than -1 s: they fail at once."""
-    broken = dataclasses.replace(CONFIG, training=dataclasses.replace(CONFIG.training, init_from=str(tmp_path / "no")))
-    found = set()
-    with Worker(0, 1, renew_after=renew_after) as worker:
-        for seed in range(2):
-            worker.begin(Job(broken, tmp_path / f"seed_{seed}"))
-            found.add(worker._process.pid)
-            while worker.job is not None:
-                failure = worker.check()
-                time.sleep(0.01)
-            assert failure is not None
-            assert "no" in failure.reason
-    assert len(found) == processes
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["tracing the update step", "compiling the update step"])
 def test_workers_tell_their_stage_and_end_at_once(tmp_path, monkeypatch, stage):

@@ -78,50 +78,43 @@ def test_the_oldest_programs_are_dropped(tmp_path, monkeypatch, limit, kept):
     assert {file.name for file in tmp_path.iterdir()} == kept
 
 
-REUSE = """
+STEPS = """
 import resource
 import sys
-import threading
-import numpy as np
+import jax
+import jax.numpy as jnp
 
 faults = []
-def allocate():
+def steps(*_, **__):
+    step = jax.jit(lambda x: (x[:, None] * x[None, :]) @ jnp.stack([x, x + 1], 1))  # 100 MB between the products
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-        np.ones(100 * 2**20, np.uint8)
+        step(jnp.ones(5000)).block_until_ready()
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-def in_a_thread(*_, **__):
-    thread = threading.Thread(target=allocate)
-    thread.start()
-    thread.join()
     raise KeyboardInterrupt  # there is nothing to train
-def backend():
-    import jax
-    jax.jit(lambda x: x + 1)(1.0)
-    in_a_thread()
 
 start, folder = sys.argv[1:]
 try:
-    if start == "backend":
-        backend()
+    if start == "plain":
+        steps()
     elif start == "configured":
         from tflane_jax.training import runtime
         runtime.configure_jax(keep_programs=False)
-        backend()
+        steps()
     elif start == "train":
         from tflane_jax import cli
         from tflane_jax.commands import train
-        train.train_run = in_a_thread
+        train.train_run = steps
         cli.main(["train", "--config", "gtn_lane/gtn", "--out", folder])
     else:
         import multiprocessing
         from pathlib import Path
         from tflane_jax.ablations import jobs, workers
         from tflane_jax.config import load_config
-        workers.train_run = in_a_thread
+        workers.train_run = steps
         here, there = multiprocessing.Pipe()
         here.send(jobs.Job(load_config("gtn_lane/gtn"), Path(folder), threads={}))
-        workers._train_jobs(there, [], {}, 20.0)
+        workers._train_jobs(there, [], {})
 except (KeyboardInterrupt, SystemExit):
     pass
 print("faults", faults[-1])
@@ -129,7 +122,7 @@ print("faults", faults[-1])
 
 
 def faults(start, folder):
-    command = [sys.executable, "-c", REUSE, start, str(folder / "run")]
+    command = [sys.executable, "-c", STEPS, start, str(folder / "run")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr
     return int(done.stdout.split()[-1])
@@ -137,9 +130,30 @@ def faults(start, folder):
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
 @pytest.mark.parametrize("start", [pytest.param("configured", marks=pytest.mark.slow), "train", "worker"])
-def test_memory_of_one_step_is_used_by_the_next_in_any_thread(tmp_path, start):
+def test_memory_of_one_step_is_used_by_the_next(tmp_path, start):
     # Without the settings, 25,600 pages of 4 KiB or 50 of 2 MiB are mapped anew each time.
-    assert faults(start, tmp_path) < faults("backend", tmp_path) / 4
+    assert faults(start, tmp_path) < faults("plain", tmp_path) / 4
+
+
+HEAPS = """
+import ctypes
+from tflane_jax.memory import keep_freed_memory
+from tflane_jax.startup import in_another_thread
+
+keep_freed_memory()
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+here, there = libc.malloc(10_000), in_another_thread(lambda: libc.malloc(10_000))
+heap = next(line.split()[0] for line in open("/proc/self/maps") if line.rstrip().endswith("[heap]"))
+first, last = (int(end, 16) for end in heap.split("-"))
+print(first <= here < last, first <= there < last)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
+def test_compiling_leaves_no_gaps_in_the_heap_of_the_steps():
+    said = subprocess.run([sys.executable, "-c", HEAPS], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["True", "False"]
 
 
 LARGE = """

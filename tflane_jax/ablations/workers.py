@@ -15,7 +15,6 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import jax
 from tqdm import tqdm
 
 from tflane_jax import accelerators
@@ -33,9 +32,6 @@ from tflane_jax.training.provenance import thread_setting
 from tflane_jax.training.runtime import configure_jax
 
 _POLL_SECONDS = 1.0
-# Seconds of compiling in one job after which another process takes the next job.
-_LONG_COMPILATION = 20.0
-_COMPILED = "/jax/core/compile/backend_compile_duration"  # or read from the kept programs, which is short
 
 
 def train_all(jobs: Sequence[Job], parallel: int, cores: int | None = None) -> list[Failure]:
@@ -168,18 +164,10 @@ def _build(job: Job, built: set[Any]) -> None:
 
 
 class Worker:
-    """A process on its own cores and GPU that trains one job after the other, and compiles every model once.
+    """A process on its own cores and GPU that trains one job after the other, and compiles every model once."""
 
-    A job that compiled for more than `renew_after` seconds is the last of its process, and the next process reads the
-    kept programs: where a program was compiled, every program runs a seventh slower (178 against 154 ms an update of
-    LaneSegNet; loaded again there it is as slow, so it is the state of the memory; nothing more is known).
-    """
-
-    def __init__(
-        self, slot: int, parallel: int, cores: int | None = None, renew_after: float = _LONG_COMPILATION
-    ) -> None:
+    def __init__(self, slot: int, parallel: int, cores: int | None = None) -> None:
         self._cores, self._accelerator = _cores(slot, parallel, cores), accelerators.of_worker(slot, parallel)
-        self._renew_after = renew_after
         self.job: Job | None = None
         self.tasks: set[Any] = set()
         self.stage = ""
@@ -191,11 +179,10 @@ class Worker:
     def _begin_process(self) -> None:
         context = multiprocessing.get_context("spawn")
         self._pipe, far = context.Pipe()
-        given = far, self._cores, self._accelerator, self._renew_after
+        given = far, self._cores, self._accelerator
         self._process: Any = context.Process(target=_train_jobs, args=given, daemon=True)
         with huge_pages_for_children():
             self._process.start()
-        self._leaves = False
         far.close()  # so that reading fails, instead of waiting, once the process is gone
         self.tasks.clear()
 
@@ -210,8 +197,7 @@ class Worker:
 
     def begin(self, job: Job) -> None:
         """Let the process train a job."""
-        if self._leaves or self._process.exitcode is not None:
-            self._process.join()
+        if self._process.exitcode is not None:
             self._pipe.close()
             self._begin_process()
         self.job, self.stage = job, ""
@@ -232,10 +218,7 @@ class Worker:
             if what == "done":
                 job, self.job = self.job, None
                 return None if text is None else Failure(job, text)
-            if what == "leaves":
-                self._leaves = True
-            else:
-                self.stage = f" ({text})" if text else ""
+            self.stage = f" ({text})" if text else ""
         return None
 
 
@@ -253,11 +236,11 @@ def _train(job: Job) -> None:
         raise UserError(f"stopped by {signal.Signals(result.stopped_by).name} after step {result.step}")
 
 
-def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str], renew_after: float) -> None:
+def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> None:
     """Train and measure the jobs that come through the pipe; answer ("done", None) for each, or why it failed.
 
-    Before that, what a job is doing is told as ("stage", name), and ("stage", "") at its end; and ("leaves", None) if
-    this process takes no further job, see `Worker`. Messages go to the job's log.
+    Before that, what a job is doing is told as ("stage", name), and ("stage", "") at its end. Messages go to the job's
+    log.
     """
     keep_freed_memory()
     end_with_parent()
@@ -274,15 +257,8 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str], ren
             print(f"{time.strftime('%H:%M:%S')} {stage}", flush=True)
         tell("stage", stage)
 
-    def note(event: str, duration_secs: float, **_: object) -> None:
-        if event == _COMPILED:
-            compiling.append(duration_secs)
-
-    compiling: list[float] = []
-    jax.monitoring.register_event_duration_secs_listener(note)
-    leaves = False
     try:
-        while not leaves and (job := _next(pipe)) is not None:
+        while (job := _next(pipe)) is not None:
             failures: list[Failure] = []
             with job.log.open("a") as log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
                 configure_jax()
@@ -291,9 +267,6 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str], ren
                         _train(job)
                     measure_all(job)
             give_back_freed_memory()
-            if leaves := sum(compiling) > renew_after:
-                tell("leaves", None)
-            compiling.clear()
             tell("done", failures[0].reason if failures else None)
     except KeyboardInterrupt as error:  # the comparison tells of it
         code = 128 + getattr(error, "number", signal.SIGINT)

@@ -32,6 +32,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         return 0
     if options.config is None and options.start != "resume":
         raise UserError("say what to train: --config FILE (or a name, say tf_lane/toponet), or --resume with --out RUN")
+    configure_jax()  # before the first look at the devices, which starts JAX's backend
     if options.distributed or (options.coordinator, options.processes, options.process) != (None, None, None):
         processes.join(options.coordinator, options.processes, options.process)
     with processes.leaving():
@@ -41,7 +42,6 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
-    configure_jax()
     _tell_devices()
     before = _saved_at(out)
     try:

@@ -20,13 +20,15 @@ _PROGRAMS = 2 * 2**30  # bytes of kept programs
 
 
 def configure_jax(*, keep_programs: bool = True) -> None:
-    """Make silent broadcasting between ranks an error, keep freed memory and compiled programs, and trace faster.
+    """Make silent broadcasting between ranks an error, keep freed memory and compiled programs, trace faster.
 
     Args:
         keep_programs: keep compiled programs for the next process, in the folder `programs` of the cache (TFLANE_CACHE)
             or where JAX_COMPILATION_CACHE_DIR says. JAX_ENABLE_COMPILATION_CACHE=false keeps none.
     """
     jax.config.update("jax_numpy_rank_promotion", "raise")
+    # The heap of the calling thread keeps the memory of a step, see `keep_freed_memory`.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     keep_freed_memory()
     # Tracing makes millions of objects and little garbage: collecting at the default rate takes a tenth of its time.
     gc.set_threshold(100_000, 50, 100)

@@ -30,7 +30,7 @@ ROOT = 20_250_711
 # Frames that a scene has before its first key frame, unless its examples look back farther.
 HISTORY = 20
 # Drives that are tried on a recorded map, and frames that it must offer for each key frame.
-_DRIVES, _LEAST_STEP = 8, 4
+_DRIVES, _LEAST_STEP = 40, 4
 
 
 class Stream(enum.IntEnum):

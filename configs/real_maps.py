@@ -6,7 +6,7 @@
 
 FOLDER holds logs of Argoverse 2, scene files of nuScenes, segments of OpenLane-V2, or lanes as GeoJSON, in any depth.
 A log in `test_logs` or `val_logs` is no training map. The third command tests on recorded traffic; `tflane carry-over`
-does all of it, with each log left out once. No result yet; docs/real_roads.md tells what a run costs.
+does all of it, with each log left out once; docs/real_roads.md tells what a run costs, and a first result.
 
 Generated roads are those of the preset `real-like`, which was fitted to mean statistics of nine recorded logs.
 """

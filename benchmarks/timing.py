@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from tflane_jax.files.atomic import write_json, write_text
+from tflane_jax.startup import in_another_thread
 from tflane_jax.training.provenance import provenance, thread_setting
 
 Program = Callable[[], Any]
@@ -33,7 +34,7 @@ class Compiled(NamedTuple):
 def compile_jax(function: Callable[..., Any], *arguments: Any) -> Compiled:
     """Compile `function` for `arguments`; the program runs it on them and waits for the result."""
     start = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
+    compiled = in_another_thread(jax.jit(function).lower(*arguments).compile)  # as the library does
     return Compiled(lambda: jax.block_until_ready(compiled(*arguments)), time.perf_counter() - start)
 
 

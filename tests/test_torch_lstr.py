@@ -41,7 +41,7 @@ def tiny(config):
 
 @pytest.fixture
 def plain_convolutions(monkeypatch):
-    """Leave out oneDNN: with so few channels its kernels gave wrong gradients and damaged the heap (PyTorch 2.13)."""
+    """Leave out oneDNN: in this tiny network it gave wrong gradients and damaged the heap (PyTorch 2.13)."""
     monkeypatch.setattr(torch_or_skip().backends.mkldnn, "enabled", False)
 
 

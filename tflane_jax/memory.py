@@ -48,7 +48,7 @@ def huge_pages_for_children() -> Iterator[None]:
     """Let processes that start inside ask for huge pages, of 2 MiB, where the system gives them to those that ask.
 
     A step writes all of its temporary memory, some 80 MiB for a small host, and with pages of 4 KiB finding them costs
-    5 to 8 % of its time. glibc reads the setting when a process starts: too late for this one.
+    2 to 8 % of its time. glibc reads the setting when a process starts: too late for this one.
     """
     before = os.environ.get(_TUNABLES)
     if _HUGE_PAGES not in (before or ""):

@@ -87,7 +87,7 @@ import jax.numpy as jnp
 faults = []
 def steps(*_, **__):
     step = jax.jit(lambda x: (x[:, None] * x[None, :]) @ jnp.stack([x, x + 1], 1))  # 100 MB between the products
-    for _ in range(6):  # the first ones may find no gap that is large enough
+    for _ in range(6):  # the heap may grow once more in the second or third
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         step(jnp.ones(5000)).block_until_ready()
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
@@ -117,7 +117,7 @@ try:
         workers._train_jobs(there, [], {})
 except (KeyboardInterrupt, SystemExit):
     pass
-print("faults", min(faults[2:]))
+print("faults", max(faults[3:]))
 """
 
 

@@ -87,7 +87,7 @@ import jax.numpy as jnp
 faults = []
 def steps(*_, **__):
     step = jax.jit(lambda x: (x[:, None] * x[None, :]) @ jnp.stack([x, x + 1], 1))  # 100 MB between the products
-    for _ in range(6):  # the heap may grow once more in the second or third
+    for _ in range(9):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         step(jnp.ones(5000)).block_until_ready()
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
@@ -117,7 +117,7 @@ try:
         workers._train_jobs(there, [], {})
 except (KeyboardInterrupt, SystemExit):
     pass
-print("faults", max(faults[3:]))
+print("faults", sorted(faults)[len(faults) // 2])
 """
 
 
@@ -131,7 +131,8 @@ def faults(start, folder):
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
 @pytest.mark.parametrize("start", [pytest.param("configured", marks=pytest.mark.slow), "train", "worker"])
 def test_memory_of_one_step_is_used_by_the_next(tmp_path, start):
-    # Without the settings, 25,600 pages of 4 KiB or 50 of 2 MiB are mapped anew each time.
+    # Without the settings, 25,600 pages of 4 KiB or 50 of 2 MiB are mapped anew each time. With them the heap may grow
+    # once more, at any step, where a small block lies in the gap; so the median of the steps is compared.
     assert faults(start, tmp_path) < faults("plain", tmp_path) / 4
 
 

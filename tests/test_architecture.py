@@ -23,7 +23,7 @@ FLOORS = (
     "world.bev",
     "world.traffic",
     "world.cameras world.front_view",
-    "world.terrain",
+    "world.terrain world.mirror",
     "world.simulate",
     "world.presets",
     "markers",

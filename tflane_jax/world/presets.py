@@ -94,8 +94,10 @@ REAL_LIKE = replace(
         # Examples are made up to 30 m from the junction, where the box still shows it.
         ego_top_speed=8.0,
     ),
+    mirrored=0.5,
 )
-"""Generated roads whose frames hold about as much as those of nine recorded logs: lanes, connectors, road users.
+"""Generated roads whose frames hold about as much as those of nine recorded logs: lanes, connectors, road users. In
+every second scene traffic keeps to the left, as in five of the logs.
 
 Fitted by hand to the means of these logs (docs/real_roads.md), whose maps it does not contain.
 """
@@ -110,5 +112,7 @@ REAL_MAPS = replace(
         crossers_per_minute=5.0,
         early_s=90.0,
     ),
+    mirrored=0.5,
 )
-"""Traffic on recorded maps: they have more road, and more kerb to walk along, than the generated ones."""
+"""Traffic on recorded maps: they have more road, and more kerb to walk along, than the generated ones. Every second
+scene is on the mirror image of its map: twice as many places, and both sides of the road."""

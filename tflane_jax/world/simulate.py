@@ -7,6 +7,7 @@ and a change of one part (for example the tracker) does not change the others.
 from __future__ import annotations
 
 import enum
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,10 +18,11 @@ from tflane_jax.geometry import yaw_pose
 from tflane_jax.limits import Count, Fraction, Positive
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
+from tflane_jax.world.mirror import mirrored, mirrored_road_map
 from tflane_jax.world.roads.map_networks import build_map_network
 from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
 from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, build_road_network
-from tflane_jax.world.roads.road_map import RoadMap
+from tflane_jax.world.roads.road_map import RoadMap, drives_on_left
 from tflane_jax.world.terrain import TerrainConfig, on_terrain
 from tflane_jax.world.traffic.signals import element_states, show_signals
 from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
@@ -41,6 +43,7 @@ class Stream(enum.IntEnum):
     TRACKER = 2
     CONDITIONS = 3
     TERRAIN = 4
+    MIRROR = 5
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class WorldConfig:
         keyframes: moments at which examples are made, evenly spaced from the end of the first history to the end of
             the scene.
         terrain: hills; None: level ground. They change nothing else in a scene.
+        mirrored: fraction of the scenes that are seen in a mirror: generated roads then have left-hand traffic, and
+            recorded maps change sides. Nothing else differs.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -67,6 +72,7 @@ class WorldConfig:
     rate_hz: Positive = 10.0
     keyframes: Count = 4
     terrain: TerrainConfig | None = None
+    mirrored: Fraction = 0.0
 
     @property
     def frames(self) -> int:
@@ -96,7 +102,8 @@ def simulate(
 ) -> Log:
     """Return the scene with this number (not negative).
 
-    On a recorded map, key frames are spread over the frames in which the map is complete around the ego vehicle.
+    On a recorded map, key frames are spread over the frames in which the map is complete around the ego vehicle. Where
+    it has left-hand traffic, the scene is simulated on its mirror image and mirrored back.
 
     Args:
         scene_id: its number.
@@ -114,6 +121,10 @@ def simulate(
             f"{config.keyframes} key frames with {history} frames of history each do not fit in the {frames} frames of "
             f"{config.duration_s} s at {config.rate_hz} Hz: raise duration_s or lower keyframes"
         )
+    mirror = _stream(scene_id, Stream.MIRROR).random() < config.mirrored
+    if place is not None:
+        road_map, reversed_sides = _driven_on_right(place.road_map)
+        place, mirror = replace(place, road_map=road_map), mirror != reversed_sides
     density = 0.8 + 0.4 * config.severity
     amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
     if place is None:
@@ -153,9 +164,16 @@ def simulate(
         seed=scene_id,
         markers=place_markers(network.map, scene_id, config.markers, *_chosen_by_sight(network.map, scene_id, config)),
     )
+    log = mirrored(log) if mirror else log
     if config.terrain is None:
         return log
     return on_terrain(log, config.terrain.draw(_stream(scene_id, Stream.TERRAIN)))
+
+
+@functools.lru_cache(maxsize=64)
+def _driven_on_right(road_map: RoadMap) -> tuple[RoadMap, bool]:
+    """Return a map whose traffic keeps to the right, and whether it is the mirror image of the given one."""
+    return (mirrored_road_map(road_map), True) if drives_on_left(road_map.map) else (road_map, False)
 
 
 def _drive_on(

@@ -11,6 +11,9 @@ from tflane_jax.scene.logs import LaneSegment, VectorMap
 
 # Lanes shorter than this carry no traffic, metres.
 _SHORTEST = 0.5
+# Two lanes are oncoming if the cosine of their directions is below this; lanes are compared every so many metres, with
+# others up to this far beside them.
+_OPPOSED, _EVERY, _BESIDE = -0.9, 4.0, 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,37 @@ class RoadMap:
     complete: float
     parked: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     area: str = ""
+
+
+def drives_on_left(found: VectorMap) -> bool:
+    """Return whether traffic keeps to the left: whether oncoming lanes are mostly on the right side of lanes.
+
+    For every few metres of lane the nearest oncoming lane counts, if one is near. Without any, traffic keeps right.
+    """
+    lanes = [lane for lane in found.segments.values() if not lane.is_intersection and lane.vehicle]
+    lines = [lane.centerline[:, :2] for lane in lanes if _length(lane.centerline) >= _SHORTEST]
+    if not lines:
+        return False
+    at, ahead = (np.concatenate(parts) for parts in zip(*map(_directed, lines), strict=True))
+    oncoming = 0
+    for here, there in zip(at, ahead, strict=True):
+        step = at - here
+        along, left = np.abs(step @ there), there[0] * step[:, 1] - there[1] * step[:, 0]
+        beside = (ahead @ there < _OPPOSED) & (along < _EVERY) & (np.abs(left) > 1.0) & (np.abs(left) < _BESIDE)
+        if beside.any():
+            oncoming += int(np.sign(left[beside][np.abs(left[beside]).argmin()]))
+    return oncoming < 0
+
+
+def _directed(line: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:
+    """Return points of a line, some metres apart, and its directions there."""
+    step = np.diff(line, axis=0)
+    length = np.linalg.norm(step, axis=-1)
+    ends = np.cumsum(length)
+    wanted = np.arange(0.5 * min(_EVERY, ends[-1]), ends[-1], _EVERY)
+    k = np.searchsorted(ends, wanted)
+    ahead = step[k] / length[k, None]
+    return line[k + 1] - (ends[k] - wanted)[:, None] * ahead, ahead
 
 
 def traffic_lanes(segments: dict[int, LaneSegment]) -> dict[int, LaneSegment]:

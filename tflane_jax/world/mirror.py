@@ -1,0 +1,95 @@
+"""A drive seen in a mirror: what drove on the right drives on the left.
+
+The traffic of the built-in world keeps to the right: right of way, routes, parking and the sides of roads follow from
+it. Left-hand traffic is its mirror image, y -> -y in global coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.scene.logs import LaneSegment, Log, MapElement, Tracks, VectorMap
+from tflane_jax.world.roads.road_map import RoadMap
+
+_Y = np.array([1.0, -1.0, 1.0])
+_ACROSS = np.diag([1.0, -1.0, 1.0, 1.0])
+# A board is turned over, too, so that its pattern is not reversed: x runs along the board (`tflane_jax.markers`).
+_ALONG_BOARD = np.diag([-1.0, 1.0, 1.0, 1.0])
+# OpenLane-V2: left and right turns, forbidden turns, and slight turns.
+_ATTRIBUTE = np.array([0, 1, 2, 3, 4, 6, 5, 8, 7, 9, 10, 12, 11])
+
+
+def mirrored(log: Log) -> Log:
+    """Return a level drive seen in a mirror. Twice is once: every number has its old value again.
+
+    Its name, weather and random numbers of rendering stay. Traffic lights keep their states, signs of left turns show
+    right turns, and patterns of markers stay readable.
+    """
+    assert log.relief is None
+    poses = _poses(log.global_from_ego)
+    tracks = _tracks(log.tracks)
+    attribute, markers = log.element_attribute, log.markers
+    return replace(
+        log,
+        map=mirrored_map(log.map),
+        global_from_ego=poses,
+        tracks=tracks,
+        actors=tracks if log.actors is log.tracks else _tracks(log.actors),
+        keyframes=tuple(replace(moment, global_from_ego=_poses(moment.global_from_ego)) for moment in log.keyframes),
+        element_attribute=None if attribute is None else _ATTRIBUTE[attribute],
+        markers=None if markers is None else replace(markers, pose=_ACROSS @ markers.pose @ _ALONG_BOARD),
+    )
+
+
+def mirrored_road_map(found: RoadMap) -> RoadMap:
+    """Return a recorded map seen in a mirror."""
+    return replace(
+        found, map=mirrored_map(found.map), places=found.places * _Y[:2], parked=found.parked * [1.0, -1.0, -1.0]
+    )
+
+
+def mirrored_map(found: VectorMap) -> VectorMap:
+    """Return a map seen in a mirror: lanes keep their direction, and their left side becomes the right one."""
+    return replace(
+        found,
+        segments={number: _segment(lane) for number, lane in found.segments.items()},
+        crossings=_lines(found.crossings),
+        # The road stays on the left of them.
+        road_boundaries=tuple(line[::-1] for line in _lines(found.road_boundaries)),
+        elements=tuple(_element(element) for element in found.elements),
+        buildings=found.buildings * [1.0, -1.0, 1.0, 1.0, -1.0],
+        roads=_lines(found.roads),
+        dividers=None if found.dividers is None else _lines(found.dividers),
+    )
+
+
+def _lines(lines: Sequence[Float[np.ndarray, "_ 3"]]) -> tuple[Float[np.ndarray, "_ 3"], ...]:
+    return tuple(line * _Y for line in lines)
+
+
+def _segment(lane: LaneSegment) -> LaneSegment:
+    return replace(
+        lane,
+        centerline=lane.centerline * _Y,
+        left=lane.right * _Y,
+        right=lane.left * _Y,
+        left_type=lane.right_type,
+        right_type=lane.left_type,
+    )
+
+
+def _element(element: MapElement) -> MapElement:
+    attribute = int(_ATTRIBUTE[element.attribute])
+    return replace(element, position=element.position * _Y, yaw=-element.yaw, attribute=attribute)
+
+
+def _tracks(found: Tracks) -> Tracks:
+    return replace(found, position=found.position * _Y, yaw=-found.yaw)
+
+
+def _poses(poses: Float[np.ndarray, "*f 4 4"]) -> Float[np.ndarray, "*f 4 4"]:
+    return _ACROSS @ poses @ _ACROSS

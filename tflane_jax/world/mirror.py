@@ -6,13 +6,13 @@ it. Left-hand traffic is its mirror image, y -> -y in global coordinates.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.scene.logs import LaneSegment, Log, MapElement, Tracks, VectorMap
+from tflane_jax.scene.logs import LaneSegment, Log, Tracks, VectorMap
+from tflane_jax.world.moved_map import moved_map
 from tflane_jax.world.roads.road_map import RoadMap
 
 _Y = np.array([1.0, -1.0, 1.0])
@@ -54,37 +54,25 @@ def mirrored_road_map(found: RoadMap) -> RoadMap:
 
 def mirrored_map(found: VectorMap) -> VectorMap:
     """Return a map seen in a mirror: lanes keep their direction, and their left side becomes the right one."""
+    there = moved_map(found, _across, _across)
     return replace(
-        found,
-        segments={number: _segment(lane) for number, lane in found.segments.items()},
-        crossings=_lines(found.crossings),
-        # The road stays on the left of them.
-        road_boundaries=tuple(line[::-1] for line in _lines(found.road_boundaries)),
-        elements=tuple(_element(element) for element in found.elements),
-        buildings=found.buildings * [1.0, -1.0, 1.0, 1.0, -1.0],
-        roads=_lines(found.roads),
-        dividers=None if found.dividers is None else _lines(found.dividers),
+        there,
+        segments={number: _other_sides(lane) for number, lane in there.segments.items()},
+        road_boundaries=tuple(line[::-1] for line in there.road_boundaries),  # the road stays on their left
+        elements=tuple(
+            replace(element, yaw=-element.yaw, attribute=int(_ATTRIBUTE[element.attribute]))
+            for element in there.elements
+        ),
+        buildings=there.buildings * [1.0, -1.0, 1.0, 1.0, -1.0],
     )
 
 
-def _lines(lines: Sequence[Float[np.ndarray, "_ 3"]]) -> tuple[Float[np.ndarray, "_ 3"], ...]:
-    return tuple(line * _Y for line in lines)
+def _across(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:
+    return points * _Y
 
 
-def _segment(lane: LaneSegment) -> LaneSegment:
-    return replace(
-        lane,
-        centerline=lane.centerline * _Y,
-        left=lane.right * _Y,
-        right=lane.left * _Y,
-        left_type=lane.right_type,
-        right_type=lane.left_type,
-    )
-
-
-def _element(element: MapElement) -> MapElement:
-    attribute = int(_ATTRIBUTE[element.attribute])
-    return replace(element, position=element.position * _Y, yaw=-element.yaw, attribute=attribute)
+def _other_sides(lane: LaneSegment) -> LaneSegment:
+    return replace(lane, left=lane.right, right=lane.left, left_type=lane.right_type, right_type=lane.left_type)
 
 
 def _tracks(found: Tracks) -> Tracks:

@@ -27,6 +27,7 @@ from tflane_jax.world.terrain import TerrainConfig, on_terrain
 from tflane_jax.world.traffic.signals import element_states, show_signals
 from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
+from tflane_jax.world.warp import WarpConfig, warped
 
 ROOT = 20_250_711
 # Frames that a scene has before its first key frame, unless its examples look back farther.
@@ -44,6 +45,7 @@ class Stream(enum.IntEnum):
     CONDITIONS = 3
     TERRAIN = 4
     MIRROR = 5
+    WARP = 6
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class WorldConfig:
         terrain: hills; None: level ground. They change nothing else in a scene.
         mirrored: fraction of the scenes that are seen in a mirror: generated roads then have left-hand traffic, and
             recorded maps change sides. Nothing else differs.
+        warp: how ground plans are stretched, sheared and bent, map, road users and drive alike; None: not at all.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -73,6 +76,7 @@ class WorldConfig:
     keyframes: Count = 4
     terrain: TerrainConfig | None = None
     mirrored: Fraction = 0.0
+    warp: WarpConfig | None = None
 
     @property
     def frames(self) -> int:
@@ -122,9 +126,11 @@ def simulate(
             f"{config.duration_s} s at {config.rate_hz} Hz: raise duration_s or lower keyframes"
         )
     mirror = _stream(scene_id, Stream.MIRROR).random() < config.mirrored
+    warp = None if config.warp is None else config.warp.draw(_stream(scene_id, Stream.WARP))
     if place is not None:
         road_map, reversed_sides = _driven_on_right(place.road_map)
         place, mirror = replace(place, road_map=road_map), mirror != reversed_sides
+        place = place if warp is None else replace(place, sees=place.sees / warp.least_scale)
     density = 0.8 + 0.4 * config.severity
     amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
     if place is None:
@@ -164,6 +170,7 @@ def simulate(
         seed=scene_id,
         markers=place_markers(network.map, scene_id, config.markers, *_chosen_by_sight(network.map, scene_id, config)),
     )
+    log = log if warp is None else warped(log, warp)
     log = mirrored(log) if mirror else log
     if config.terrain is None:
         return log

@@ -7,7 +7,6 @@ and from the evidence sensor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +14,9 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
-from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Relief, Tracks, VectorMap
+from tflane_jax.scene.logs import KeyFrame, Log, Relief, Tracks
 from tflane_jax.scene.terrain import Terrain
+from tflane_jax.world.moved_map import moved_map
 
 # Straight lines get a vertex every so many metres, to follow the ground.
 _STEP = 4.0
@@ -65,33 +65,13 @@ def on_terrain(log: Log, terrain: Terrain) -> Log:
     tracks = _tracks(log.tracks, level, poses, terrain)
     return replace(
         log,
-        map=_map(log.map, terrain),
+        map=moved_map(log.map, lambda line: terrain.raised(with_vertices(line)), terrain.raised),
         global_from_ego=poses,
         tracks=tracks,
         actors=tracks if log.actors is log.tracks else _tracks(log.actors, level, poses, terrain),
         keyframes=tuple[KeyFrame, ...](moments),
         markers=None if log.markers is None else replace(log.markers, pose=_raised_poses(log.markers.pose, terrain)),
         relief=Relief(terrain, log),
-    )
-
-
-def _map(level: VectorMap, terrain: Terrain) -> VectorMap:
-    def lines(found: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-        return tuple(terrain.raised(with_vertices(line)) for line in found)
-
-    def segment(lane: LaneSegment) -> LaneSegment:
-        centerline, left, right = lines([lane.centerline, lane.left, lane.right])
-        return replace(lane, centerline=centerline, left=left, right=right)
-
-    return replace(
-        level,
-        segments={number: segment(lane) for number, lane in level.segments.items()},
-        # Their corners have a meaning.
-        crossings=tuple(terrain.raised(ring) for ring in level.crossings),
-        road_boundaries=lines(level.road_boundaries),
-        elements=tuple(replace(e, position=terrain.raised(np.asarray(e.position, float))) for e in level.elements),
-        roads=lines(level.roads),
-        dividers=None if level.dividers is None else lines(level.dividers),
     )
 
 

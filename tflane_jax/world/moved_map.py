@@ -1,0 +1,41 @@
+"""Every point of a map moved in the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.scene.logs import LaneSegment, VectorMap
+
+Move = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, "_ 3"]]
+"""Lines or points, global metres -> where they are now; a line may get further vertices."""
+
+
+def moved_map(found: VectorMap, line: Move, point: Move) -> VectorMap:
+    """Return a map with all lines, crossings and elements elsewhere. Yaws and buildings stay.
+
+    Args:
+        found: the map.
+        line: moves lines.
+        point: moves what must keep its vertices: rings of crossings, whose corners have a meaning, and elements.
+    """
+
+    def lines(given: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+        return tuple(line(one) for one in given)
+
+    def segment(lane: LaneSegment) -> LaneSegment:
+        centerline, left, right = lines([lane.centerline, lane.left, lane.right])
+        return replace(lane, centerline=centerline, left=left, right=right)
+
+    return replace(
+        found,
+        segments={number: segment(lane) for number, lane in found.segments.items()},
+        crossings=tuple(point(ring) for ring in found.crossings),
+        road_boundaries=lines(found.road_boundaries),
+        elements=tuple(replace(e, position=point(np.asarray(e.position, float)[None])[0]) for e in found.elements),
+        roads=lines(found.roads),
+        dividers=None if found.dividers is None else lines(found.dividers),
+    )

@@ -24,7 +24,7 @@ FLOORS = (
     "world.traffic",
     "world.cameras world.front_view",
     "world.moved_map",
-    "world.terrain world.mirror",
+    "world.terrain world.mirror world.view",
     "world.warp",
     "world.simulate",
     "world.presets",

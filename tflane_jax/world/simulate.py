@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.limits import Count, Fraction, Positive
+from tflane_jax.limits import Count, Fraction, Positive, PositiveOrZero
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.mirror import mirrored, mirrored_road_map
@@ -27,7 +28,8 @@ from tflane_jax.world.terrain import TerrainConfig, on_terrain
 from tflane_jax.world.traffic.signals import element_states, show_signals
 from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
-from tflane_jax.world.warp import WarpConfig, warped
+from tflane_jax.world.view import turned_view
+from tflane_jax.world.warp import Warp, WarpConfig, warped
 
 ROOT = 20_250_711
 # Frames that a scene has before its first key frame, unless its examples look back farther.
@@ -46,6 +48,7 @@ class Stream(enum.IntEnum):
     TERRAIN = 4
     MIRROR = 5
     WARP = 6
+    VIEW = 7
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ class WorldConfig:
         mirrored: fraction of the scenes that are seen in a mirror: generated roads then have left-hand traffic, and
             recorded maps change sides. Nothing else differs.
         warp: how ground plans are stretched, sheared and bent, map, road users and drive alike; None: not at all.
+        view_turn: largest angle between the frame in which a scene is perceived and the vehicle's heading, degrees;
+            each scene has its own.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -77,6 +82,7 @@ class WorldConfig:
     terrain: TerrainConfig | None = None
     mirrored: Fraction = 0.0
     warp: WarpConfig | None = None
+    view_turn: PositiveOrZero = 0.0
 
     @property
     def frames(self) -> int:
@@ -170,11 +176,19 @@ def simulate(
         seed=scene_id,
         markers=place_markers(network.map, scene_id, config.markers, *_chosen_by_sight(network.map, scene_id, config)),
     )
+    return _shown(log, scene_id, config, warp, mirror)
+
+
+def _shown(log: Log, scene_id: int, config: WorldConfig, warp: Warp | None, mirror: bool) -> Log:
+    """Return a scene, simulated on level ground with right-hand traffic, as the configuration wants it."""
     log = log if warp is None else warped(log, warp)
     log = mirrored(log) if mirror else log
-    if config.terrain is None:
-        return log
-    return on_terrain(log, config.terrain.draw(_stream(scene_id, Stream.TERRAIN)))
+    if config.view_turn > 0.0:
+        degrees = _stream(scene_id, Stream.VIEW).uniform(-config.view_turn, config.view_turn)
+        log = turned_view(log, math.radians(degrees))
+    if config.terrain is not None:
+        log = on_terrain(log, config.terrain.draw(_stream(scene_id, Stream.TERRAIN)))
+    return log
 
 
 @functools.lru_cache(maxsize=64)

@@ -1,0 +1,55 @@
+"""Frames that do not point where the vehicle drives: the same world, seen from a turned frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tflane_jax.datasets.base import ExampleConfig
+from tflane_jax.datasets.examples import make_example
+from tflane_jax.geometry import pose_yaw, transform_points, yaw_pose
+from tflane_jax.world.simulate import WorldConfig, simulate
+from tflane_jax.world.view import turned_view
+
+SCENE, TURN = 4, 0.4
+WORLD = WorldConfig(duration_s=4.0, keyframes=2)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return simulate(SCENE, WORLD)
+
+
+@pytest.mark.parametrize("name", ["tracks", "actors"])
+def test_everything_stays_where_it_is(scene, name):
+    there = turned_view(scene, TURN)
+    assert there.map is scene.map
+    at, now = (transform_points(log.global_from_ego, getattr(log, name).position) for log in (scene, there))
+    valid = getattr(scene, name).valid
+    np.testing.assert_allclose(now[valid], at[valid], atol=1e-9)
+    yaw = [getattr(log, name).yaw + pose_yaw(log.global_from_ego)[:, None] for log in (scene, there)]
+    np.testing.assert_allclose(np.sin(yaw[0] - yaw[1])[valid], 0.0, atol=1e-9)
+    np.testing.assert_allclose(there.keyframes[1].global_from_ego, there.global_from_ego[-1], atol=1e-12)
+
+
+def test_examples_are_turned(scene):
+    here, there = (make_example(log, 1, ExampleConfig(lanes=64)) for log in (scene, turned_view(scene, TURN)))
+    frame = yaw_pose(np.asarray(0.0), np.asarray(0.0), np.asarray(TURN))
+    flow = here.traffic_flow.valid & there.traffic_flow.valid
+    assert flow.any()
+    for k, f in zip(*np.nonzero(flow), strict=True):
+        # Slots of road users are the same in both: they are sorted by distance.
+        back = transform_points(frame, np.asarray(there.traffic_flow.position[k, f], float)[None])[0]
+        np.testing.assert_allclose(back, here.traffic_flow.position[k, f], atol=1e-3)
+
+
+def test_each_scene_has_its_own_angle_within_the_limit(scene):
+    turns = []
+    for number in range(6):
+        world = replace(WORLD, duration_s=2.2, keyframes=1, traffic=replace(WORLD.traffic, warm_up_s=0.0))
+        straight, turned = (simulate(number, w) for w in (world, replace(world, view_turn=30.0)))
+        turn = pose_yaw(turned.global_from_ego) - pose_yaw(straight.global_from_ego)
+        np.testing.assert_allclose(np.sin(turn - turn[0]), 0.0, atol=1e-9)
+        turns.append(np.degrees(np.arctan2(np.sin(turn[0]), np.cos(turn[0]))))
+    assert np.abs(turns).max() <= 30.0
+    assert np.ptp(turns) > 10.0

@@ -27,11 +27,13 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return `mixed`, every second scene on generated roads; `generated`, all of them; and the three without traffic.
 
-    `generated` has seen no recorded map: a control with the same capacities, steps and test data. `generated_city` is
-    the same on the preset `city`.
+    `generated` has seen no recorded map: a control with the same capacities, steps and test data. Its own controls:
+    `generated_right_hand`, where all traffic keeps to the right, and `generated_city`, on the preset `city`.
     """
     sources = {"mixed": replace(MAPS, generated=0.5), "generated": replace(MAPS, generated=1.0)}
     without = {name: _on(data, "tf_lane/toponet") for name, data in {"maps": MAPS, **sources}.items()}
+    right_hand = replace(REAL_LIKE, mirrored=0.0)
+    sources["generated_right_hand"] = replace(MAPS, generated=1.0, generated_world=right_hand)
     sources["generated_city"] = replace(MAPS, generated=1.0, generated_world=CITY)
     with_traffic = {name: _on(data, "tf_lane/toponet_tfm") for name, data in sources.items()}
     return with_traffic | {f"{name}_no_traffic": config for name, config in without.items()}

@@ -210,6 +210,8 @@ def test_the_shipped_models_are_measured_by_the_scores_of_the_tables():
     assert configs["maps"].data.generated == 0.0
     for row in ("generated", "mixed", "generated without traffic", "mixed without traffic"):
         assert configs[row].data.generated_world == REAL_LIKE
-    # The control differs in the preset alone.
+    # The controls differ in the preset alone, and in the side of the road.
+    right_hand = replace(configs["generated"].data, generated_world=replace(REAL_LIKE, mirrored=0.0))
+    assert configs["generated, right-hand traffic"] == replace(configs["generated"], data=right_hand)
     city = replace(configs["generated"].data, generated_world=CITY)
     assert configs["generated on city"] == replace(configs["generated"], data=city)

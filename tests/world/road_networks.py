@@ -23,9 +23,16 @@ def network(seed: int, kind: SceneKind | None = None) -> RoadNetwork:
     return build_road_network(np.random.default_rng([11, seed]), CONFIG if kind is None else _only(kind))
 
 
+@functools.cache
+def changing_network(seed: int) -> RoadNetwork:
+    """A network in which lanes open and close on the streets that meet an intersection."""
+    return build_road_network(np.random.default_rng([12, seed]), RoadConfig(lane_changes=1.0))
+
+
 def case_networks() -> list[RoadNetwork]:
-    """Twenty draws of the usual mix, and two of each kind."""
-    return [network(s) for s in SEEDS] + [network(s, kind) for kind in SceneKind for s in range(2)]
+    """Twenty draws of the usual mix, two of each kind, and eight with changing lanes."""
+    kinds = [network(s, kind) for kind in SceneKind for s in range(2)]
+    return [network(s) for s in SEEDS] + kinds + [changing_network(s) for s in range(8)]
 
 
 def heading(line: np.ndarray, end: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import itertools
 import math
 
@@ -148,6 +149,24 @@ def test_a_turn_may_end_on_every_lane():
         assert sorted(ends) == [5, 6]
         assert {m.source.segment for m in wide if m.turn == turn and m.arm == 0} == {source}
     assert len(wide) == len(narrow) + 8
+
+
+@pytest.mark.parametrize("kind", [SceneKind.T_JUNCTION, SceneKind.FOUR_WAY, SceneKind.TWO_JUNCTIONS, *NEW])
+def test_lanes_open_behind_an_intersection_and_close_before_it(kind):
+    forks, merges = 0, 0
+    for seed in range(6):
+        config = RoadConfig(kinds=((kind, 1.0),), lane_changes=1.0, reach=190.0)
+        segments = build_road_network(np.random.default_rng([5, seed]), config).map.segments
+        entries = collections.Counter(j for s in segments.values() for j in s.successors)
+        for number, lane in segments.items():
+            if lane.is_intersection or not lane.vehicle:
+                continue
+            following = [segments[j] for j in lane.successors]
+            forks += len(following) == 2 and not any(s.is_intersection for s in following)
+            before = [s for s in segments.values() if number in s.successors]
+            merges += entries[number] == 2 and not any(s.is_intersection for s in before)
+    assert forks >= 6
+    assert merges >= 6
 
 
 @pytest.mark.parametrize("kind", [SceneKind.ROAD, SceneKind.T_JUNCTION, SceneKind.FIVE_LEGS, SceneKind.ROUNDABOUT])

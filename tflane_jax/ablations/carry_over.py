@@ -44,6 +44,7 @@ from tflane_jax.tasks import Model
 
 ROWS: Mapping[str, str] = {
     "generated": "real_maps:generated",
+    "generated, right-hand traffic": "real_maps:generated_right_hand",
     "generated on city": "real_maps:generated_city",
     "maps": "real_maps",
     "mixed": "real_maps:mixed",
@@ -56,6 +57,7 @@ PRIMARY = "all/recall"
 COLUMNS = ("all/recall", "all/DET_l", "all/TOP_ll", "occluded/recall")
 CLAIMS = (
     Claim("generated", "generated on city", "generated roads that are closer to recorded logs help"),
+    Claim("generated", "generated, right-hand traffic", "scenes with left-hand traffic help"),
     Claim("mixed", "generated", "maps of other logs help on a log that was never seen"),
     Claim("mixed", "maps", "generated roads help beside them"),
     Claim("mixed", "mixed without traffic", "traffic flow helps a model that is trained with it"),

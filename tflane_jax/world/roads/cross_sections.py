@@ -17,6 +17,8 @@ from tflane_jax.world.roads.curves import smoothstep
 
 # Stations nearer than this are the same, metres: far below any spacing, far above rounding errors.
 SAME_STATION = 1e-6
+# A lane that opens or closes has its full width for at least so long, metres.
+_FULL = 10.0
 
 
 class Place(enum.Enum):
@@ -62,6 +64,8 @@ class SidePlan:
         extras: lanes along a part of the side.
         pockets: turning lanes before the junction at which the side ends.
         pocket_length, taper: of the turning lanes, metres.
+        opens: lanes that fork off and run on to the end: where, and how far behind the start they begin, metres.
+        closes: lanes that come from the start and merge: where, and how far before the end they are gone, metres.
     """
 
     lanes: int
@@ -74,6 +78,8 @@ class SidePlan:
     pockets: tuple[Place, ...] = ()
     pocket_length: float = 42.0
     taper: float = 22.0
+    opens: tuple[tuple[Place, float], ...] = ()
+    closes: tuple[tuple[Place, float], ...] = ()
 
     @property
     def outer(self) -> float:
@@ -92,7 +98,13 @@ class SidePlan:
         widening = sum(place is not Place.MEDIAN for place in self.pockets)
         return float(self.kerb(widening * self.lane_width))
 
-    def with_pockets_before(self, end: float) -> SidePlan:
-        """Return the plan with its pockets turned into extra lanes of a side `end` metres long."""
-        lanes = tuple(ExtraLane(p, end - self.pocket_length, end, forks=self.taper) for p in self.pockets)
-        return replace(self, extras=self.extras + lanes, pockets=())
+    def over(self, length: float) -> SidePlan:
+        """Return the plan of a side of this length, on which every lane that does not run through is an extra lane.
+
+        A lane opens or closes only where it fits with its taper.
+        """
+        room = length - self.taper - _FULL
+        pockets = [ExtraLane(p, length - self.pocket_length, length, forks=self.taper) for p in self.pockets]
+        opens = [ExtraLane(p, start, length, forks=self.taper) for p, start in self.opens if start < room]
+        closes = [ExtraLane(p, 0.0, length - before, merges=self.taper) for p, before in self.closes if before < room]
+        return replace(self, extras=(*self.extras, *pockets, *opens, *closes), pockets=(), opens=(), closes=())

@@ -77,6 +77,17 @@ class JunctionsPlan:
 
 def plan_junctions(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) -> JunctionsPlan:
     """Draw a network with intersections."""
+    plan = _plan_kind(rng, kind, config)
+    if not config.lane_changes or plan.ring is not None:
+        return plan
+    changed = (
+        replace(junction, arms=tuple(_with_changes(rng, arm, config) for arm in junction.arms))
+        for junction in plan.junctions
+    )
+    return replace(plan, junctions=tuple(changed))
+
+
+def _plan_kind(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) -> JunctionsPlan:
     heading = draw(rng, (-np.pi, np.pi))
     if kind is SceneKind.TWO_JUNCTIONS:
         return _plan_two(rng, heading, config)
@@ -290,6 +301,24 @@ def _with_pockets(rng: np.random.Generator, arm: ArmPlan, left: float, right: fl
         incoming, pockets=tuple(pockets), pocket_length=draw(rng, config.pocket), taper=draw(rng, config.taper)
     )
     return replace(arm, style=replace(arm.style, backward=incoming))
+
+
+def _with_changes(rng: np.random.Generator, arm: ArmPlan, config: RoadConfig) -> ArmPlan:
+    """Let a lane open on the way out of the intersection, and one close on the way in, with their probability."""
+    out, incoming = arm.style.forward, arm.style.backward
+    if out.lanes and chance(rng, config.lane_changes):
+        place = _place_of_change(rng, out.bike)
+        out = replace(out, opens=((place, draw(rng, config.change_distance)),), taper=draw(rng, config.taper))
+    if incoming.lanes and chance(rng, config.lane_changes):
+        before = draw(rng, config.change_distance) + incoming.pocket_length * bool(incoming.pockets)
+        place = _place_of_change(rng, incoming.bike)
+        incoming = replace(incoming, closes=((place, before),))
+    return replace(arm, style=replace(arm.style, forward=out, backward=incoming))
+
+
+def _place_of_change(rng: np.random.Generator, bike: float) -> Place:
+    """Return where a lane opens or closes: never in a median, in which the other direction may have one too."""
+    return Place.LEFT if chance(rng, 0.5) or bike else Place.RIGHT
 
 
 def _spread(arms: list[ArmPlan]) -> tuple[ArmPlan, ...]:

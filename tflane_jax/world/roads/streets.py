@@ -94,8 +94,8 @@ def build_street(plan: StreetPlan, network: LaneNetwork, solid_before_stop: floa
         spacing: largest distance between vertices, metres.
     """
     length = plan.stop - plan.start
-    forward = plan.forward.with_pockets_before(length)
-    backward = plan.backward.with_pockets_before(length)
+    forward = plan.forward.over(length)
+    backward = plan.backward.over(length)
     low, high = max(plan.ego[0] - plan.start, 0.0), min(plan.ego[1] - plan.start, length)
     solid_f = length - solid_before_stop if plan.stops_at_end else length
     solid_b = length - solid_before_stop if plan.stops_at_start else length

@@ -130,6 +130,7 @@ def test_training_changes_every_learned_parameter_and_the_statistics(fitted):
     assert still == ["decoder_0/self_attention/value/kernel"]
 
 
+@pytest.mark.slow
 def test_dropout_follows_its_key():
     batch = road_images(2)
     first, again, other = (float(fit("transformer").updated(batch, seed)[1]["loss"]) for seed in (0, 0, 1))

@@ -121,6 +121,9 @@ print("faults", sorted(faults)[len(faults) // 2])
 """
 
 
+_OTHERS = ("configured", "train")
+
+
 def faults(start, folder):
     command = [sys.executable, "-c", STEPS, start, str(folder / "run")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
@@ -129,7 +132,7 @@ def faults(start, folder):
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
-@pytest.mark.parametrize("start", [pytest.param("configured", marks=pytest.mark.slow), "train", "worker"])
+@pytest.mark.parametrize("start", ["worker", *(pytest.param(name, marks=pytest.mark.slow) for name in _OTHERS)])
 def test_memory_of_one_step_is_used_by_the_next(tmp_path, start):
     # Without the settings, 25,600 pages of 4 KiB or 50 of 2 MiB are mapped anew each time. With them the heap may grow
     # once more, at any step, where a small block lies in the gap; so the median of the steps is compared.
@@ -174,6 +177,7 @@ print(step(), step())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
 def test_memory_of_a_large_step_is_used_by_the_next():
     """More than a GiB of it, as in an update of LSTR at its full size."""

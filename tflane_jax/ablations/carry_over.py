@@ -66,7 +66,8 @@ CLAIMS = (
 )
 FITTED = (
     "The settings of generated roads (preset real-like) and of traffic were fitted to mean statistics of nine logs "
-    "(docs/real_roads.md): a tested log that is one of them contributed to these means."
+    "(docs/real_roads.md), and scenes with left-hand traffic were added after a model had failed on five of them: a "
+    "tested log that is one of the nine is known that far."
 )
 """What the models know of the logs that they are tested on, for every page."""
 # Training of one model on one core of the machine of docs/benchmarks.md, for estimates.

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.scene.logs import LaneSegment, Log, Tracks, VectorMap
-from tflane_jax.world.moved_map import moved_map
+from tflane_jax.world.moving import moved_boxes, moved_map
 from tflane_jax.world.roads.road_map import RoadMap
 
 _Y = np.array([1.0, -1.0, 1.0])
@@ -31,14 +31,14 @@ def mirrored(log: Log) -> Log:
     """
     assert log.relief is None
     poses = _poses(log.global_from_ego)
-    tracks = _tracks(log.tracks)
+    tracks, actors = moved_boxes(log, _tracks)
     attribute, markers = log.element_attribute, log.markers
     return replace(
         log,
         map=mirrored_map(log.map),
         global_from_ego=poses,
         tracks=tracks,
-        actors=tracks if log.actors is log.tracks else _tracks(log.actors),
+        actors=actors,
         keyframes=tuple(replace(moment, global_from_ego=_poses(moment.global_from_ego)) for moment in log.keyframes),
         element_attribute=None if attribute is None else _ATTRIBUTE[attribute],
         markers=None if markers is None else replace(markers, pose=_ACROSS @ markers.pose @ _ALONG_BOARD),

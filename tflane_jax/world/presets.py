@@ -15,7 +15,6 @@ from tflane_jax.world.simulate import WorldConfig
 from tflane_jax.world.terrain import TerrainConfig
 from tflane_jax.world.traffic.simulation import TrafficConfig
 from tflane_jax.world.traffic.tracker import TrackerConfig
-from tflane_jax.world.warp import WarpConfig
 
 CITY = WorldConfig(
     # The ego vehicle drives up to 160 m before its first key frame.
@@ -86,7 +85,6 @@ REAL_LIKE = replace(
         median=0.5,
         bike=0.25,
         crossings=0.3,
-        lane_changes=0.4,
     ),
     traffic=replace(
         CITY.traffic,
@@ -97,8 +95,6 @@ REAL_LIKE = replace(
         ego_top_speed=8.0,
     ),
     mirrored=0.5,
-    warp=WarpConfig(),
-    view_turn=30.0,
 )
 """Generated roads whose frames hold about as much as those of nine recorded logs: lanes, connectors, road users. In
 every second scene traffic keeps to the left, as in five of the logs.

@@ -16,7 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
 from tflane_jax.scene.logs import KeyFrame, Log, Relief, Tracks
 from tflane_jax.scene.terrain import Terrain
-from tflane_jax.world.moved_map import moved_map
+from tflane_jax.world.moving import moved_boxes, moved_map
 
 # Straight lines get a vertex every so many metres, to follow the ground.
 _STEP = 4.0
@@ -62,13 +62,13 @@ def on_terrain(log: Log, terrain: Terrain) -> Log:
     level = log.global_from_ego
     poses = terrain.pose(level[:, :2, 3], pose_yaw(level))
     moments = (replace(moment, global_from_ego=poses[moment.track_frame]) for moment in log.keyframes)
-    tracks = _tracks(log.tracks, level, poses, terrain)
+    tracks, actors = moved_boxes(log, lambda boxes: _tracks(boxes, level, poses, terrain))
     return replace(
         log,
         map=moved_map(log.map, lambda line: terrain.raised(with_vertices(line)), terrain.raised),
         global_from_ego=poses,
         tracks=tracks,
-        actors=tracks if log.actors is log.tracks else _tracks(log.actors, level, poses, terrain),
+        actors=actors,
         keyframes=tuple[KeyFrame, ...](moments),
         markers=None if log.markers is None else replace(log.markers, pose=_raised_poses(log.markers.pose, terrain)),
         relief=Relief(terrain, log),

@@ -13,6 +13,8 @@ from jaxtyping import Float
 
 from tflane_jax.geometry import transform_points, yaw_pose
 from tflane_jax.scene.logs import Log, Tracks
+from tflane_jax.world.moving import moved_boxes
+from tflane_jax.world.traffic.tracker import wrap_angle
 
 
 def turned_view(log: Log, turn: float) -> Log:
@@ -26,21 +28,20 @@ def turned_view(log: Log, turn: float) -> Log:
     """
     assert log.relief is None
     mounted: Float[np.ndarray, "4 4"] = yaw_pose(np.asarray(0.0), np.asarray(0.0), np.asarray(turn))
-    tracks = _tracks(log.tracks, turn)
+    tracks, actors = moved_boxes(log, lambda boxes: _tracks(boxes, turn))
     return replace(
         log,
         global_from_ego=log.global_from_ego @ mounted,
         tracks=tracks,
-        actors=tracks if log.actors is log.tracks else _tracks(log.actors, turn),
+        actors=actors,
         keyframes=tuple(replace(moment, global_from_ego=moment.global_from_ego @ mounted) for moment in log.keyframes),
     )
 
 
 def _tracks(found: Tracks, turn: float) -> Tracks:
     back = yaw_pose(np.asarray(0.0), np.asarray(0.0), np.asarray(-turn))
-    yaw = found.yaw - turn
     return replace(
         found,
         position=transform_points(back, found.position),
-        yaw=np.where(found.valid, np.arctan2(np.sin(yaw), np.cos(yaw)), found.yaw),
+        yaw=np.where(found.valid, wrap_angle(found.yaw - turn), found.yaw),
     )

@@ -17,8 +17,9 @@ from jaxtyping import Float
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
 from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, Rules
 from tflane_jax.scene.logs import Log, Tracks, VectorMap
-from tflane_jax.world.moved_map import moved_map
+from tflane_jax.world.moving import moved_boxes, moved_map
 from tflane_jax.world.terrain import with_vertices
+from tflane_jax.world.traffic.tracker import wrap_angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +114,14 @@ def warped(log: Log, warp: Warp) -> Log:
     at, yaw = log.global_from_ego[:, :2, 3], pose_yaw(log.global_from_ego)
     there = warp.moved(at)
     poses = yaw_pose(there[:, 0], there[:, 1], warp.turned(at, yaw))
-    tracks = _tracks(log.tracks, log.global_from_ego, poses, warp)
+    tracks, actors = moved_boxes(log, lambda boxes: _tracks(boxes, log.global_from_ego, poses, warp))
     markers = log.markers
     return replace(
         log,
         map=_map(log.map, warp),
         global_from_ego=poses,
         tracks=tracks,
-        actors=tracks if log.actors is log.tracks else _tracks(log.actors, log.global_from_ego, poses, warp),
+        actors=actors,
         keyframes=tuple(replace(moment, global_from_ego=poses[moment.track_frame]) for moment in log.keyframes),
         markers=None if markers is None else replace(markers, pose=_boards(markers.pose, warp)),
     )
@@ -146,7 +147,7 @@ def _tracks(found: Tracks, poses: np.ndarray, there: np.ndarray, warp: Warp) -> 
     return replace(
         found,
         position=np.where(found.valid[..., None], position, found.position),
-        yaw=np.where(found.valid, np.arctan2(np.sin(yaw), np.cos(yaw)), found.yaw),
+        yaw=np.where(found.valid, wrap_angle(yaw), found.yaw),
     )
 
 

@@ -1,4 +1,4 @@
-"""Every point of a map moved in the same way."""
+"""Changes of a whole scene: every point of its map, and all of its boxes, in the same way."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.scene.logs import LaneSegment, Log, Tracks, VectorMap
 
 Move = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, "_ 3"]]
 """Lines or points, global metres -> where they are now; a line may get further vertices."""
@@ -39,3 +39,9 @@ def moved_map(found: VectorMap, line: Move, point: Move) -> VectorMap:
         roads=lines(found.roads),
         dividers=None if found.dividers is None else lines(found.dividers),
     )
+
+
+def moved_boxes(log: Log, move: Callable[[Tracks], Tracks]) -> tuple[Tracks, Tracks]:
+    """Return the tracks and the true boxes of a log, moved; one object where they are one."""
+    tracks = move(log.tracks)
+    return tracks, tracks if log.actors is log.tracks else move(log.actors)

@@ -89,9 +89,13 @@ def test_recorded_frames_are_drawn_beside_simulated_ones(tmp_path, monkeypatch, 
         shown.extend((dataset.info(i).source, dataset.info(i).scene) for i in range(count))
         return out
 
+    def simulated(config):
+        assert config.world.mirrored == 0.0  # on the same side of the road as the recording
+        return FakeDataset(FakeConfig(2))
+
     # The map of this scene is too small to drive on, and drawing takes time.
     monkeypatch.setattr("tflane_jax.commands.data_maps.show_dataset", draw)
-    monkeypatch.setattr("tflane_jax.commands.data_maps.RealMapDataset", lambda config: FakeDataset(FakeConfig(2)))
+    monkeypatch.setattr("tflane_jax.commands.data_maps.RealMapDataset", simulated)
     assert main(["data", "maps", str(tmp_path), "--out", str(tmp_path / "maps.png")]) == 0
     assert shown == [("nuscenes-scenes", "scene-0061"), ("fake", FakeDataset(FakeConfig(2)).info(1).scene)]
     assert "maps.png" in capsys.readouterr().out

@@ -107,7 +107,10 @@ def test_signs_of_left_turns_show_right_turns(scene):
 def test_a_map_of_left_hand_traffic_has_the_mirror_images_of_its_mirror_image():
     here, there = (Place(found, 50.0) for found in (crossroads(), mirrored_road_map(crossroads())))
     assert (drives_on_left(here.road_map.map), drives_on_left(there.road_map.map)) == (False, True)
-    assert_equal(simulate(3, ON_MAP, place=there), mirrored(simulate(3, ON_MAP, place=here)))
+    scene = simulate(3, ON_MAP, place=here)
+    assert_equal(simulate(3, ON_MAP, place=there), mirrored(scene))
+    # Its own mirror image drives on the right.
+    assert_equal(simulate(3, replace(ON_MAP, mirrored=1.0), place=there), scene)
 
 
 def test_without_oncoming_lanes_traffic_keeps_to_the_right():

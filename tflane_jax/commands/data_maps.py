@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tflane_jax.datasets.base import Dataset, FrameInfo
 from tflane_jax.datasets.real_maps import RealMapConfig, RealMapDataset
@@ -12,6 +12,7 @@ from tflane_jax.datasets.road_maps import chosen_maps
 from tflane_jax.errors import UserError
 from tflane_jax.plots import show_dataset
 from tflane_jax.scene import Example
+from tflane_jax.world.presets import REAL_MAPS
 
 
 @dataclass
@@ -38,10 +39,12 @@ def run(options: argparse.Namespace) -> int:
     logs = [one.name for one in chosen_maps(options.root, options.logs) if one.recorded]
     if not logs:
         raise UserError(f"{options.root} holds maps without recordings: tflane data show --data real-maps draws those")
+    as_recorded = replace(REAL_MAPS, mirrored=0.0)
     frames: list[tuple[Dataset, int]] = []
     for log in logs:
         recorded = RecordedDataset(RecordedConfig(options.root, (log,)))
-        simulated = RealMapDataset(RealMapConfig(options.root, (log,), scenes=1, first=options.scene))
+        config = RealMapConfig(options.root, (log,), scenes=1, first=options.scene, world=as_recorded)
+        simulated = RealMapDataset(config)
         frames += [(recorded, int(len(recorded) * options.moment)), (simulated, len(simulated) - 1)]
     example = RecordedConfig(options.root).example
     path = show_dataset(_Chosen(tuple(frames)), len(frames), options.out, ground=example.ground, view=example.range)

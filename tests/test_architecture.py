@@ -13,7 +13,7 @@ from tests.shared import ROOT
 FLOORS = (
     "errors",
     "limits accelerators memory",
-    "config_io config_files migrations processes startup child_processes",
+    "config_io config_files migrations processes progress startup child_processes",
     "devices",
     "geometry",
     "files",

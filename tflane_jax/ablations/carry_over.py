@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.ablations.compare import draw_models, summary_of
 from tflane_jax.ablations.comparison import Scores, Variant, compact
@@ -39,6 +38,7 @@ from tflane_jax.datasets.real_maps import RealMapData
 from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.tasks import Model
 
@@ -243,7 +243,7 @@ def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, s
     found: dict[str, dict[str, dict[int, Scores]]] = {}
     protocol, failed = "", {failure.job.folder for failure in failures}
     pairs = [(row, log) for row in plan.jobs for log in plan.logs]
-    for row, log in tqdm(pairs, desc="test on recorded logs", unit="log"):
+    for row, log in progress_bar(pairs, desc="test on recorded logs", unit="log"):
         for job in plan.of(row, log):
             if job.folder in failed:
                 continue

@@ -13,8 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from tflane_jax.ablations.declaration import Declaration, check, declare
 from tflane_jax.ablations.effects import save_effects
 from tflane_jax.ablations.jobs import Failure, Job, Tests, check_rows, plan_jobs
@@ -26,6 +24,7 @@ from tflane_jax.accelerators import leave_to_workers
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
+from tflane_jax.progress import progress_bar
 from tflane_jax.runs import load_test_data, open_run
 from tflane_jax.tasks import Model
 
@@ -125,7 +124,7 @@ def evaluate_runs(trained: Mapping[str, Sequence[Job]], results: Results) -> lis
     failures: list[Failure] = []
     pairs = [(name, job) for name, done in trained.items() for job in done]
     for test in (OWN_TEST, *results.tests):
-        for name, job in tqdm(pairs, desc=f"evaluate {test or 'test split'}", unit="run"):
+        for name, job in progress_bar(pairs, desc=f"evaluate {test or 'test split'}", unit="run"):
             if any(failure.job is job for failure in failures):
                 continue
             with noted(job, failures):

@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-from tqdm import tqdm
-
 from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.config import apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
+from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run, load_test_data, open_run
 
 
@@ -50,7 +49,7 @@ def sweep(
     scores: dict[str, list[list[dict[str, float]]]] = {name: [] for name in runs}
     protocol = ""
     total = len(values) * sum(map(len, runs.values()))
-    with tqdm(total=total, unit="run") as bar:
+    with progress_bar(total=total, unit="run") as bar:
         for value in values:
             for name, trained in runs.items():
                 found = []

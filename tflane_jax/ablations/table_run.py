@@ -20,8 +20,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from tflane_jax.ablations.archive import Archive, write_archive
 from tflane_jax.ablations.compare import (
     draw_models,
@@ -49,6 +47,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
 from tflane_jax.plots.tables import format_table, latex_table, save_table
+from tflane_jax.progress import progress_bar
 
 GEOMETRIC = ", geometric"
 """Suffix of a topology score's name: with the score of `evaluation.geometric_topology` added to the learned one."""
@@ -162,7 +161,7 @@ def _rows(table: PaperTable, results: Results) -> list[dict[str, Any]]:
 def _add_geometric(trained: Mapping[str, Sequence[Job]], results: Results) -> None:
     """Add to every row that predicts topology its score with the geometric topology, at the last checkpoint."""
     pairs = [(name, job) for name, jobs in trained.items() for job in jobs]
-    for name, job in tqdm(pairs, desc="evaluate with geometric topology", unit="run"):
+    for name, job in progress_bar(pairs, desc="evaluate with geometric topology", unit="run"):
         scores = results.scores[OWN_TEST, "last"][name][job.config.training.seeds[0]]
         for evaluation in job.further:
             measured = measure(job, replace(job.config, evaluation=evaluation), "last")

@@ -15,8 +15,6 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from tqdm import tqdm
-
 from tflane_jax import accelerators
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
@@ -25,6 +23,7 @@ from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.child_processes import end_with_parent
 from tflane_jax.errors import Interrupted, UserError
 from tflane_jax.memory import give_back_freed_memory, huge_pages_for_children, keep_freed_memory
+from tflane_jax.progress import progress_bar
 from tflane_jax.run_checks import check_run
 from tflane_jax.runs import build_data, train_run
 from tflane_jax.startup import leave, showing, write
@@ -82,7 +81,7 @@ def noted(job: Job, failures: list[Failure]) -> Iterator[None]:
 
 def _tell(failures: Sequence[Failure]) -> None:
     for failure in failures:
-        tqdm.write(f"{failure}; the others go on", file=sys.stderr)
+        write(f"{failure}; the others go on")
 
 
 def _log(job: Job, text: str) -> None:
@@ -117,7 +116,7 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
         workers = [stack.enter_context(Worker(slot, parallel, cores)) for slot in range(min(parallel, len(queue)))]
         total, done = sum(job.config.training.steps for job in jobs), sum(job.step() for job in jobs)
         bar = stack.enter_context(
-            tqdm(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
+            progress_bar(total=total, initial=done, desc=f"train and measure {len(jobs)} runs", unit="step")
         )
         while len(queue) or any(worker.job for worker in workers):
             for worker in workers:

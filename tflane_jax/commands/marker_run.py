@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive, thinned
@@ -37,6 +36,7 @@ from tflane_jax.markers.store import MarkerStore, StaleMarkerWarning, UnknownMar
 from tflane_jax.markers.store_files import load_store, save_store
 from tflane_jax.plots import format_table
 from tflane_jax.plots.marker_drive import save_drive_frame
+from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.scene.marker_patterns import MarkerFamily, marker_count
 from tflane_jax.tasks.lane_pictures import lanes_of
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
         # The table counts them.
         warnings.simplefilter("ignore", UnknownMarkerWarning)
         warnings.simplefilter("ignore", StaleMarkerWarning)
-        for number, frame in enumerate(tqdm(drive.frames, desc="drive", unit="frame")):
+        for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
             views = drive.views(frame)
             found = search_views(views, detector)
             step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, found)
@@ -192,7 +192,7 @@ def render(options: argparse.Namespace) -> int:
     cv2, images = opencv(), options.out / "images"
     make_folder(images)
     frames = []
-    for number, moment in enumerate(tqdm(log.keyframes, desc="render", unit="frame")):
+    for number, moment in enumerate(progress_bar(log.keyframes, desc="render", unit="frame")):
         views, files = render_cameras(log, number, rig), {}
         for place, mount in enumerate(mounts):
             width, height = views.size[place].tolist()

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.photos import PhotoCamera, Placement, fit_photo
@@ -30,6 +29,7 @@ from tflane_jax.files.atomic import write_json
 from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
 from tflane_jax.plots.images import lanes_drawn, save_photo
+from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
 from tflane_jax.tasks.photo_lanes import PhotoLanes, PhotoReader
 
@@ -55,7 +55,7 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
     head = {"model": trained.name, "step": trained.step, "threshold": options.threshold}
     report = _Report(options.out / "predictions.json", head)
     try:
-        for path in tqdm(photos, desc="predict", unit="photo", disable=not photos):
+        for path in progress_bar(photos, desc="predict", unit="photo", disable=not photos):
             report.add("photos", path, lambda path=path: _photo(reader, path, options.out / names[path], camera))
         for path in videos:
             report.add("videos", path, lambda path=path: _video(reader, path, options.out / names[path], camera))
@@ -123,7 +123,7 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
         return head | {"video": None, "view": None, "warning": warning, "frames": []}
     frames, doubtful = [], 0
     with writing_video(out, info) as writer:
-        for frame in tqdm(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
+        for frame in progress_bar(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
             answer = reader.read_view(frame, view, known=camera is not None)
             writer.add(lanes_drawn(frame, answer.lanes))
             frames.append(_plain(answer, _VIDEO_POINTS))

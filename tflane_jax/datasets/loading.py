@@ -12,13 +12,13 @@ from functools import partial
 
 import jax
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.datasets.base import Dataset
 from tflane_jax.datasets.cache import CachedDataset
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
 from tflane_jax.datasets.streaming import InOrder, Streamed, StreamingConfig
 from tflane_jax.errors import UserError
+from tflane_jax.progress import progress_bar
 from tflane_jax.scene import Areas, Example, LaneGraph
 
 # Fields of `Example` that training on merged centerlines reads.
@@ -109,7 +109,7 @@ def _stacked(
     count, examples = len(dataset), map(dataset.example, range(len(dataset)))
     if workers is not None:
         examples = Streamed(dataset, workers).stream(InOrder(count), count)
-    bar = tqdm(examples, f"loading {dataset.name}", count, unit="example", disable=not progress)
+    bar = progress_bar(examples, f"loading {dataset.name}", unit="example", total=count, disable=not progress)
     for index, example in enumerate(bar):
         for name, leaf in example_leaves(example).items():
             if parts is not None and name.split(".")[0] not in parts:

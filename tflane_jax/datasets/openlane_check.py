@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, Split
 from tflane_jax.datasets.openlane_annotation import Annotation, read_annotation
@@ -33,6 +32,7 @@ from tflane_jax.datasets.openlane_tracks import SourceTracks, listed
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import load_json, member
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FrameKey
+from tflane_jax.progress import progress_bar
 
 # Metres per second; a higher speed between two frames means damaged poses.
 _FASTEST = 70.0
@@ -132,7 +132,7 @@ def _check_frames(
     counts: Counter[str] = Counter(dict.fromkeys((*_COUNTS, *of_logs), 0))
     before = None
     lacking: dict[tuple[str, str], list[FrameKey]] = {}
-    for key in tqdm(keys, f"checking {keys[0].split if keys else ''}", unit="frame", disable=not progress):
+    for key in progress_bar(keys, f"checking {keys[0].split if keys else ''}", unit="frame", disable=not progress):
         frame = _check_frame(root, key, subset, counts, faults, images)
         faults += _check_motion(before, key, frame, subset)
         if frame is None:

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from tqdm import tqdm
 
 from tflane_jax.datasets.base import Dataset, FrameInfo, Split
 from tflane_jax.datasets.identities import Identities, line_distances
@@ -25,6 +24,7 @@ from tflane_jax.files.images import opencv
 from tflane_jax.files.openlane import CENTERLINE, DENSE_POINTS, SEGMENT, FrameKey
 from tflane_jax.geometry import invert_pose
 from tflane_jax.geometry.polylines import resample
+from tflane_jax.progress import progress_bar
 from tflane_jax.scene import CameraViews, Example, LaneGraph, TrafficElements
 
 ImageFormat = Literal["jpg", "png"]
@@ -112,7 +112,7 @@ def _export_split(
     segments: dict[str, list[str]] = {}
     names: dict[str, str] = {}
     ids = Identities()
-    for index in tqdm(range(len(dataset)), f"writing {split}", unit="frame", disable=not progress):
+    for index in progress_bar(range(len(dataset)), f"writing {split}", unit="frame", disable=not progress):
         example, info = dataset.example(index), dataset.info(index)
         if info.scene not in names:
             names[info.scene] = f"{SUBSETS[subset].first_segment[split] + len(names):05d}"

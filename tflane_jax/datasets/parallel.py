@@ -19,12 +19,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.child_processes import end_with_parent
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.datasets.leaves import example_leaves
 from tflane_jax.errors import UserError
+from tflane_jax.progress import progress_bar
 
 # Examples per task of a worker. A multiple of 1, 2, 3, 4, 6, 8 and 12, so that scenes of that many frames are simulated
 # once.
@@ -100,7 +100,7 @@ def fill(
     blocks = [range(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK)]
     scenes: dict[int, str] = {}
     title = f"building {dataset.name}"
-    with tqdm(total=count, desc=title, unit="example", mininterval=0.5, disable=not progress) as bar:
+    with progress_bar(total=count, desc=title, unit="example", disable=not progress) as bar:
         for indices, names in _run(job, blocks, min(workers, len(blocks))):
             scenes.update(zip(indices, names, strict=True))
             bar.update(len(indices))

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.datasets.augmentation import AugmentationConfig
 from tflane_jax.datasets.base import SPLITS, FrameInfo, Split
@@ -30,6 +29,7 @@ from tflane_jax.datasets.streaming import Streamed, StreamingConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.images import read_image, resize
 from tflane_jax.files.tusimple import RowLanes, read_truth
+from tflane_jax.progress import progress_bar
 from tflane_jax.scene import LaneLines, RoadImage
 
 LabelSplit = Literal["train", "val", "test", "all"]
@@ -159,7 +159,9 @@ def load_road_images(dataset: TuSimpleDataset, *, progress: bool = True, workers
         return example.lines
 
     with ThreadPoolExecutor(workers) as pool:
-        bar = tqdm(pool.map(load, range(count)), f"loading {dataset.name}", count, unit="image", disable=not progress)
+        bar = progress_bar(
+            pool.map(load, range(count)), f"loading {dataset.name}", unit="image", total=count, disable=not progress
+        )
         try:
             lines = list(bar)
         except BaseException:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
@@ -41,6 +40,7 @@ from tflane_jax.metrics.segment_matching import (
     SegmentDetections,
     SegmentTruth,
 )
+from tflane_jax.progress import progress_bar
 
 # Published numbers use every 20th point of a centerline.
 _STRIDE = 20
@@ -100,7 +100,7 @@ def _annotations(path: Path, names: FieldNames, parse: _Parse[T], progress: bool
             f"{path} holds no annotations: expected <split>/<segment>/info/<timestamp>{names.suffix}.json in it{other}"
         )
     frames, origin = {}, {}
-    for file, stem in tqdm(files.items(), desc=f"read {path.name}", unit="frame", disable=not progress):
+    for file, stem in progress_bar(files.items(), desc=f"read {path.name}", unit="frame", disable=not progress):
         segment = file.parent.parent
         key = FrameKey(segment.parent.name, segment.name, stem)
         if key in origin:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.errors import UserError
+from tflane_jax.progress import progress_bar
 
 
 class Accumulator(Protocol):
@@ -69,7 +69,7 @@ class Scored:
             raise UserError("a bootstrap draws whole scenes, and there is only one: no interval can be given")
         rng = np.random.default_rng(seed)
         drawn: dict[str, list[float]] = {}
-        for _ in tqdm(range(samples), desc="bootstrap", unit="sample", disable=not progress):
+        for _ in progress_bar(range(samples), desc="bootstrap", unit="sample", disable=not progress):
             chosen = [scenes[i] for i in rng.integers(0, len(scenes), len(scenes))]
             for name, value in _merged(chosen).compute().items():
                 drawn.setdefault(name, []).append(value)
@@ -98,7 +98,7 @@ def score(
     """
     _check_frames(predictions, truth)
     scenes: dict[str, Accumulator] = {}
-    for key in tqdm(sorted(truth, key=str), desc="score", unit="frame", disable=not progress):
+    for key in progress_bar(sorted(truth, key=str), desc="score", unit="frame", disable=not progress):
         try:
             scenes.setdefault(scene_of(key), make()).update(predictions[key], truth[key])
         except UserError as error:

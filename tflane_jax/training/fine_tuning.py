@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 from flax.traverse_util import flatten_dict, unflatten_dict
-from tqdm import tqdm
 
 from tflane_jax.errors import UserError
 from tflane_jax.migrations import migrate
 from tflane_jax.models.parameters import Params
+from tflane_jax.startup import write
 from tflane_jax.training.checkpoint import Checkpoints
 from tflane_jax.training.run_folder import read_config
 from tflane_jax.training.state import TrainState, per_seed
@@ -103,7 +102,7 @@ def _params_of_run(folder: Path, fresh: Params, *, partly: bool, frozen: Sequenc
             )
     for names, what in ((added, "start afresh"), (dropped, "are left out")):
         if names:
-            tqdm.write(f"from {folder}: {_modules(names)} {what}", file=sys.stderr)
+            write(f"from {folder}: {_modules(names)} {what}")
     return unflatten_dict({name: saved.get(name, value) for name, value in wanted.items()}, sep="/")
 
 

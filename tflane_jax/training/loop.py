@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from tflane_jax.config_io import first_difference
 from tflane_jax.datasets.batches import Prepare, batches, first_example
@@ -25,6 +24,7 @@ from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.limits import DIFFERENT, NOT_EMPTY, Count, CountOrZero, Rules, check_settings, splits
 from tflane_jax.models.parameters import Params
 from tflane_jax.processes import AgreedError, agreed, apart, arrays_from_first, count, from_first, is_first, stop_signal
+from tflane_jax.progress import progress_bar
 from tflane_jax.startup import ready, showing, stage, write
 from tflane_jax.training.adaptive import Memory
 from tflane_jax.training.checkpoint import Checkpoints, Manifest
@@ -245,7 +245,7 @@ def train(
         stepping, saved_step, stopped = 0.0, first, stop_signal(stop.signal, 0)
         with (
             RecordWriter(folder, first) if is_first() else Unwritten() as writer,
-            tqdm(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
+            progress_bar(total=config.steps, initial=first, desc=folder.name, unit="step", disable=not progress) as bar,
         ):
             while batch is not None and stopped is None:
                 began = time.perf_counter()

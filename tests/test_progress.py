@@ -18,7 +18,7 @@ def lines_of(capsys) -> list[str]:
     """Return what was written on standard error, which must be whole lines."""
     text = capsys.readouterr().err
     assert "\r" not in text
-    assert text == "" or text.endswith("\n")
+    assert text[-1:] in ("", "\n")
     return text.splitlines()
 
 

@@ -23,7 +23,7 @@ FLOORS = (
     "world.bev",
     "world.traffic",
     "world.cameras world.front_view",
-    "world.moving",
+    "world.moving world.excerpt",
     "world.terrain world.mirror world.view",
     "world.warp",
     "world.simulate",

@@ -20,7 +20,8 @@ def example():
     lanes.points[0, :, 0] = np.linspace(0.0, 40.0, 21)
     angle = np.linspace(0.0, np.pi / 2, 21)
     lanes.points[1, :, :2] = np.stack([40.0 + 20.0 * np.sin(angle), 20.0 - 20.0 * np.cos(angle)], -1)
-    lanes.points[2:] = np.nan
+    lanes.left[0], lanes.right[0] = lanes.points[0] + [0.0, 1.5, 0.0], lanes.points[0] - [0.0, 2.0, 0.0]
+    lanes.points[2:], lanes.left[2:] = np.nan, np.nan
     lanes.visibility[:] = [0.75, 0.25, np.nan, np.nan]
     lanes.is_connector[:] = [False, True, True, True]
     lanes.successor[0, 1:] = True
@@ -35,6 +36,8 @@ def test_lanes_are_measured_and_padding_is_not():
     found = lane_quantities(example())
     assert tuple(found) == LANE_QUANTITIES
     np.testing.assert_allclose(found["length, m"], [40.0, 20.0 * np.pi / 2], rtol=1e-3)
+    # A connector has no width that counts.
+    np.testing.assert_allclose(found["width, m"], [3.5], rtol=1e-6)
     # The first and the last chord of the arc point half a step off its ends.
     np.testing.assert_allclose(found["turn, degrees"], [0.0, 90.0 * 19 / 20], rtol=1e-3)
     np.testing.assert_allclose(found["curvature, 1/100 m"], [0.0, 5.0], rtol=1e-2)
@@ -45,14 +48,40 @@ def test_frames_are_counted():
     found = {name: values.item() for name, values in frame_quantities(example()).items()}
     assert tuple(found) == FRAME_QUANTITIES
     assert found.pop("metres of lane") == pytest.approx(40.0 + 10.0 * np.pi, rel=1e-3)
-    assert found == {"lanes": 2, "connectors": 1, "topology links": 1, "crossings": 1, "road boundaries": 2}
+    # Of the 20 chords of the arc, 4.5 degrees apart, 14 lie at 15 to 75 degrees.
+    oblique = found.pop("oblique fraction of lane length")
+    assert oblique == pytest.approx(10.0 * np.pi * 14 / 20 / (40.0 + 10.0 * np.pi), rel=1e-2)
+    counts = {"lanes": 2, "connectors": 1, "topology links": 1, "crossings": 1, "road boundaries": 2}
+    assert found == counts | {"lanes beside the vehicle": 1, "- oncoming": 0, "vehicle on a connector": 0}
+
+
+@pytest.mark.parametrize(
+    ("moved", "turned", "beside", "oncoming", "on_connector"),
+    [
+        ((-50.0, 0.0), 0.0, 1, 0, 1),
+        ((-20.0, 4.0), 0.0, 1, 0, 0),
+        ((-20.0, 4.0), np.pi, 0, 1, 0),
+        ((-20.0, 4.0), np.pi / 2, 0, 0, 0),
+        ((20.0, 0.0), 0.0, 0, 0, 0),
+    ],
+)
+def test_lanes_around_the_vehicle(moved, turned, beside, oncoming, on_connector):
+    """The lanes are moved, then turned about the vehicle."""
+    frame = example()
+    cos, sin = np.cos(turned), np.sin(turned)
+    xy = frame.lanes.points[..., :2] + moved
+    frame.lanes.points[..., :2] = xy @ np.array([[cos, sin], [-sin, cos]])
+    found = frame_quantities(frame)
+    assert found["lanes beside the vehicle"].item() == beside
+    assert found["- oncoming"].item() == oncoming
+    assert found["vehicle on a connector"].item() == on_connector
 
 
 def test_a_frame_without_lanes_has_no_values_of_lanes():
     empty = example()
     empty.lanes.valid[:] = False
     assert all(len(values) == 0 for values in lane_quantities(empty).values())
-    assert frame_quantities(empty)["metres of lane"].item() == 0.0
+    assert all(frame_quantities(empty)[name].item() == 0.0 for name in ("metres of lane", "vehicle on a connector"))
 
 
 def test_pooling_keeps_every_value_and_the_order_of_quantities():

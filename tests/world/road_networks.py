@@ -12,6 +12,7 @@ from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, SceneKind, 
 
 CONFIG = RoadConfig()
 SEEDS = range(20)
+WIDE = (3.2, 6.5)
 
 
 def _only(kind: SceneKind) -> RoadConfig:
@@ -25,8 +26,9 @@ def network(seed: int, kind: SceneKind | None = None) -> RoadNetwork:
 
 @functools.cache
 def changing_network(seed: int) -> RoadNetwork:
-    """A network in which lanes open and close on the streets that meet an intersection."""
-    return build_road_network(np.random.default_rng([12, seed]), RoadConfig(lane_changes=1.0))
+    """A network of wide lanes and streets, in which lanes open and close where these meet an intersection."""
+    config = RoadConfig(lane_changes=1.0, another_lane=0.5, single_lane_width=WIDE)
+    return build_road_network(np.random.default_rng([12, seed]), config)
 
 
 def case_networks() -> list[RoadNetwork]:

@@ -85,7 +85,10 @@ RECORDED = {
     "connectors": 11.8,
     "metres of lane": 604,
     "topology links": 19.7,
+    "lanes beside the vehicle": 2.67,
+    "- oncoming": 2.15,
     "length, m": 27.9,
+    "width, m": 4.14,
     "turn, degrees": 27.7,
     "visible share": 0.615,
 }

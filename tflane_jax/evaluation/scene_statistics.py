@@ -16,10 +16,22 @@ FRAME_QUANTITIES = (
     "topology links",
     "crossings",
     "road boundaries",
+    "lanes beside the vehicle",
+    "- oncoming",
+    "vehicle on a connector",
+    "oblique fraction of lane length",
 )
-"""One value for each frame; those of road users follow, see `commands.data_stats`."""
-LANE_QUANTITIES = ("length, m", "turn, degrees", "curvature, 1/100 m", "visible share")
-"""One value for each lane; the curvature is the largest along the lane."""
+"""One value for each frame; those of road users follow, see `commands.data_stats`.
+
+Lanes beside the vehicle go its way, or against it, up to 45 degrees aside, where they pass it; its own counts too.
+The vehicle is on a connector (1, else 0) if that is the nearest lane. Oblique are pieces of lanes at 15 to 75 degrees
+from the vehicle's axis.
+"""
+LANE_QUANTITIES = ("length, m", "width, m", "turn, degrees", "curvature, 1/100 m", "visible share")
+"""One value for each lane; the curvature is the largest along the lane. Widths: of lanes that are no connectors, if
+their boundaries are known."""
+
+_ALONG, _OBLIQUE = np.cos(np.radians(45.0)), np.cos(np.radians((15.0, 75.0)))
 
 
 def frame_quantities(example: Example) -> dict[str, Float[np.ndarray, " 1"]]:
@@ -34,14 +46,17 @@ def frame_quantities(example: Example) -> dict[str, Float[np.ndarray, " 1"]]:
         "topology links": (np.asarray(lanes.successor) & valid[:, None] & valid).sum(),
         "crossings": (known & (category == AreaType.PEDESTRIAN_CROSSING)).sum(),
         "road boundaries": (known & (category == AreaType.ROAD_BOUNDARY)).sum(),
+        **_around_the_vehicle(lanes),
     }
     return {name: np.array([value], float) for name, value in found.items()}
 
 
 def lane_quantities(example: Example) -> dict[str, Float[np.ndarray, " n"]]:
     """Return `LANE_QUANTITIES` of the lanes of one example."""
-    lanes = example.lanes
-    points = np.asarray(lanes.points, float)[np.asarray(lanes.valid)][..., :2]
+    lanes, valid = example.lanes, np.asarray(example.lanes.valid)
+    points = np.asarray(lanes.points, float)[valid][..., :2]
+    sides = (np.asarray(side, float)[valid & ~np.asarray(lanes.is_connector)] for side in (lanes.left, lanes.right))
+    width = np.linalg.norm(np.subtract(*sides), axis=-1).mean(-1)
     step = np.diff(points, axis=1)
     metres = np.linalg.norm(step, axis=-1)
     turn = np.diff(np.unwrap(np.arctan2(step[..., 1], step[..., 0])), axis=1)
@@ -49,9 +64,31 @@ def lane_quantities(example: Example) -> dict[str, Float[np.ndarray, " n"]]:
     curvature = np.abs(turn) / np.maximum(between, 1e-6)
     return {
         "length, m": metres.sum(-1),
+        "width, m": width[width > 0.0],
         "turn, degrees": np.degrees(np.abs(turn.sum(-1))),
         "curvature, 1/100 m": 100.0 * curvature.max(-1, initial=0.0),
-        "visible share": np.asarray(lanes.visibility, float)[np.asarray(lanes.valid)],
+        "visible share": np.asarray(lanes.visibility, float)[valid],
+    }
+
+
+def _around_the_vehicle(lanes: LaneGraph) -> dict[str, float]:
+    """Return what lies beside and under the vehicle at the origin, and how the lanes lie to its axis x."""
+    points = np.asarray(lanes.points, float)[np.asarray(lanes.valid)][..., :2]
+    start, step = points[:, :-1], np.diff(points, axis=1)
+    metres = np.linalg.norm(step, axis=-1)
+    ahead = step[..., 0] / np.maximum(metres, 1e-6)
+    # A half-open piece counts a lane once where it passes the vehicle.
+    passes = (start[..., 0] <= 0.0) != (points[:, 1:, 0] <= 0.0)
+    # The nearest point of every piece: none where there are no lanes.
+    along = np.clip(-(start * step).sum(-1) / np.maximum(metres, 1e-6) ** 2, 0.0, 1.0)
+    distance = np.linalg.norm(start + along[..., None] * step, axis=-1).min(-1, initial=np.inf)
+    nearest = distance.argmin() if len(distance) else None
+    oblique = (np.abs(ahead) > _OBLIQUE[1]) & (np.abs(ahead) < _OBLIQUE[0])
+    return {
+        "lanes beside the vehicle": (passes & (ahead > _ALONG)).any(-1).sum(),
+        "- oncoming": (passes & (ahead < -_ALONG)).any(-1).sum(),
+        "vehicle on a connector": nearest is not None and np.asarray(lanes.is_connector)[lanes.valid][nearest],
+        "oblique fraction of lane length": (metres * oblique).sum() / max(metres.sum(), 1e-6),
     }
 
 

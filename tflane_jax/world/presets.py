@@ -68,18 +68,23 @@ REAL_LIKE = replace(
     roads=replace(
         CITY.roads,
         kinds=(
-            (SceneKind.ROAD, 0.02),
-            (SceneKind.T_JUNCTION, 0.03),
-            (SceneKind.FOUR_WAY, 0.4),
-            (SceneKind.TWO_JUNCTIONS, 0.27),
-            (SceneKind.FIVE_LEGS, 0.13),
-            (SceneKind.STAGGERED, 0.15),
+            (SceneKind.ROAD, 0.03),
+            (SceneKind.T_JUNCTION, 0.3),
+            (SceneKind.FOUR_WAY, 0.3),
+            (SceneKind.TWO_JUNCTIONS, 0.13),
+            (SceneKind.FIVE_LEGS, 0.1),
+            (SceneKind.STAGGERED, 0.14),
         ),
+        lane_width=(3.0, 4.2),
+        single_lane_width=(3.2, 6.5),
         corner_radius=(3.5, 7.0),
         junction_distance=(60.0, 70.0),
         side_lean=3.0,
         second_sides=0.6,
-        wide_turns=0.45,
+        another_lane=0.2,
+        wide_turns=0.65,
+        lane_changes=0.15,
+        change_distance=(8.0, 45.0),
         driveways=2.0,
         one_way=0.12,
         median=0.5,
@@ -89,15 +94,19 @@ REAL_LIKE = replace(
     traffic=replace(
         CITY.traffic,
         vehicles_per_metre=0.075,
-        pedestrians_per_metre=0.055,
+        pedestrians_per_metre=0.048,
         crossers_per_minute=5.0,
-        # Examples are made up to 30 m from the junction, where the box still shows it.
+        # Examples are made near the junction, where the box still shows it.
         ego_top_speed=8.0,
+        ego_passes_s=14.0,
     ),
+    longer_s=20.0,
+    keyframe_spacing="distance",
     mirrored=0.5,
 )
-"""Generated roads whose frames hold about as much as those of nine recorded logs: lanes, connectors, road users. In
-every second scene traffic keeps to the left, as in five of the logs.
+"""Generated roads whose frames hold about as much as those of nine recorded logs: lanes and their widths, connectors,
+road users, and how often the vehicle is inside a junction. In every second scene traffic keeps to the left, as in five
+of the logs.
 
 Fitted by hand to the means of these logs (docs/real_roads.md), whose maps it does not contain.
 """

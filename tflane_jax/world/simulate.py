@@ -10,6 +10,7 @@ import enum
 import functools
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +20,7 @@ from tflane_jax.geometry import yaw_pose
 from tflane_jax.limits import Count, Fraction, Positive, PositiveOrZero
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
+from tflane_jax.world.excerpt import excerpt
 from tflane_jax.world.mirror import mirrored, mirrored_road_map
 from tflane_jax.world.roads.map_networks import build_map_network
 from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
@@ -36,6 +38,8 @@ ROOT = 20_250_711
 HISTORY = 20
 # Drives that are tried on a recorded map, and frames that it must offer for each key frame.
 _DRIVES, _LEAST_STEP = 40, 4
+# Where key frames are spaced by distance, a vehicle that stands counts as moving so far in each frame, metres.
+_CREEP = 0.01
 
 
 class Stream(enum.IntEnum):
@@ -49,6 +53,7 @@ class Stream(enum.IntEnum):
     MIRROR = 5
     WARP = 6
     VIEW = 7
+    EXCERPT = 8
 
 
 @dataclass(frozen=True)
@@ -61,8 +66,11 @@ class WorldConfig:
         severity: 0 (clear) to 1 (worst): scales weather and paint wear and, weakly, traffic density and tracker
             noise.
         duration_s, rate_hz: length of a scene and its frame rate.
-        keyframes: moments at which examples are made, evenly spaced from the end of the first history to the end of
-            the scene.
+        longer_s: by how much the drive is longer than the scene, seconds. The scene then shows the part around a
+            moment in which the vehicle is inside an intersection, if there is one.
+        keyframes: moments at which examples are made, from the end of the first history to the end of the scene.
+        keyframe_spacing: "time": evenly spaced in time; "distance": along the drive, so that a vehicle that waits
+            gives no frame again and again, and the middle of its route is passed more often.
         terrain: hills; None: level ground. They change nothing else in a scene.
         mirrored: fraction of the scenes that are seen in a mirror: generated roads then have left-hand traffic, and
             recorded maps change sides. Nothing else differs.
@@ -78,7 +86,9 @@ class WorldConfig:
     severity: Fraction = 0.5
     duration_s: Positive = 8.0
     rate_hz: Positive = 10.0
+    longer_s: PositiveOrZero = 0.0
     keyframes: Count = 4
+    keyframe_spacing: Literal["time", "distance"] = "time"
     terrain: TerrainConfig | None = None
     mirrored: Fraction = 0.0
     warp: WarpConfig | None = None
@@ -141,13 +151,12 @@ def simulate(
     amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
     if place is None:
         network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
-        traffic = simulate_traffic(
-            _stream(scene_id, Stream.TRAFFIC), network, amounts, frames=frames, rate_hz=config.rate_hz
-        )
-        moments = np.linspace(history, frames - 1, config.keyframes).round().astype(int)
+        streams = (_stream(scene_id, stream) for stream in (Stream.TRAFFIC, Stream.EXCERPT))
+        traffic = _traffic(*streams, network, amounts, config, history)
+        eligible = np.arange(history, frames)
     else:
-        network, traffic, complete = _drive_on(place, scene_id, config, amounts, history)
-        moments = complete[np.linspace(0, len(complete) - 1, config.keyframes).round().astype(int)]
+        network, traffic, eligible = _drive_on(place, scene_id, config, amounts, history)
+    moments = eligible[_spaced(traffic.ego[eligible, :2], config)]
     global_from_ego = yaw_pose(*traffic.ego.T)
     actors = _in_ego_frames(traffic)
     tracks = track(
@@ -207,7 +216,8 @@ def _drive_on(
     Raises UserError if no drive stays there long enough.
     """
     passes = amounts.ego_passes_s
-    passes = 0.5 * (history / config.rate_hz + config.duration_s) if passes is None else passes
+    if passes is None:
+        passes = 0.5 * (history / config.rate_hz + config.duration_s + config.longer_s)
     amounts = replace(amounts, ego_passes_s=passes)
     needed = min(config.keyframes * _LEAST_STEP, config.frames - history)
     for attempt in range(_DRIVES):
@@ -218,8 +228,10 @@ def _drive_on(
             sees=place.sees,
             leads_s=passes + EGO_JOINS,
         )
-        stream = np.random.default_rng([ROOT, scene_id, Stream.TRAFFIC, attempt])
-        traffic = simulate_traffic(stream, network, amounts, frames=config.frames, rate_hz=config.rate_hz)
+        streams = (
+            np.random.default_rng([ROOT, scene_id, stream, attempt]) for stream in (Stream.TRAFFIC, Stream.EXCERPT)
+        )
+        traffic = _traffic(*streams, network, amounts, config, history)
         assert network.drive is not None
         complete = history + np.flatnonzero(network.drive.covers(traffic.ego[history:, :2]))
         if len(complete) >= needed:
@@ -228,6 +240,34 @@ def _drive_on(
         f"{place.road_map.source} {place.road_map.name} is too small a map: in {_DRIVES} drives, no {needed} frames "
         f"saw {place.sees:.0f} m of it in every direction. Leave it out (data.without), or perceive a smaller range"
     )
+
+
+def _traffic(
+    stream: np.random.Generator,
+    cut: np.random.Generator,
+    network: RoadNetwork,
+    amounts: TrafficConfig,
+    config: WorldConfig,
+    history: int,
+) -> Traffic:
+    """Return the traffic that a scene shows; `cut` draws which part of a longer drive that is."""
+    longer = round(config.longer_s * config.rate_hz)
+    traffic = simulate_traffic(stream, network, amounts, frames=config.frames + longer, rate_hz=config.rate_hz)
+    if not longer:
+        return traffic
+    return excerpt(cut, network.map, traffic, frames=config.frames, history=history, rate_hz=config.rate_hz)
+
+
+def _spaced(xy: Float[np.ndarray, "n 2"], config: WorldConfig) -> Int[np.ndarray, " k"]:
+    """Return indices of `config.keyframes` of n places, in order, evenly spaced as configured; none twice."""
+    count = config.keyframes
+    if config.keyframe_spacing == "time" or count == 1:
+        return np.linspace(0, len(xy) - 1, count).round().astype(int)
+    # Time counts a little, for vehicles that stand.
+    way = np.cumsum(np.linalg.norm(np.diff(xy, axis=0, prepend=xy[:1]), axis=-1) + _CREEP)
+    found = np.searchsorted(way, np.linspace(way[0], way[-1], count))
+    number = np.arange(count)
+    return np.minimum(np.maximum.accumulate(found - number) + number, len(xy) - count + number)
 
 
 def _stream(scene_id: int, stream: Stream) -> np.random.Generator:

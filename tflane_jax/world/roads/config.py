@@ -39,6 +39,7 @@ class RoadConfig:
             the diagonal of the perceived box.
         vertex_spacing: largest distance between vertices of a line.
         lane_width: vehicle lanes.
+        single_lane_width: the same on streets with at most one lane in each direction; None: no difference.
         ring_lane_width: the lane of a roundabout.
         bike_width: bike lanes.
         parking_width: kerb-side parking strips.
@@ -65,6 +66,7 @@ class RoadConfig:
         junction_lanes: largest number of through lanes per direction of an intersection's main road, roundabouts and
             two junctions aside.
         least_junction_lanes: smallest number of them; two junctions included.
+        another_lane: probability for such a main road of one lane more in each direction, beyond `junction_lanes` too.
         second_sides: probability for each of two junctions to be a four-way intersection, not a T junction.
         wide_turns: probability for an intersection that a turn may end on every lane of the road that it enters; else
             each lane that turns leads to one lane.
@@ -97,6 +99,7 @@ class RoadConfig:
     ego_reach: Positive = 70.0
     vertex_spacing: Positive = 1.6
     lane_width: Range = (2.9, 3.8)
+    single_lane_width: Range | None = None
     ring_lane_width: Range = (4.2, 5.2)
     bike_width: Range = (1.5, 1.9)
     parking_width: Range = (2.2, 2.5)
@@ -122,6 +125,7 @@ class RoadConfig:
     stagger: Range = (9.0, 60.0)
     junction_lanes: Count = 3
     least_junction_lanes: Count = 1
+    another_lane: Fraction = 0.0
     second_sides: Fraction = 0.25
     wide_turns: Fraction = 0.0
     lane_changes: Fraction = 0.0

@@ -99,7 +99,7 @@ def _plan_kind(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) ->
         return _plan_staggered(rng, heading, config)
     four = kind is SceneKind.FOUR_WAY
     major = int(rng.choice([1, 2, 3], p=[0.35, 0.5, 0.15] if four else [0.4, 0.4, 0.2]))
-    major = _allowed(major, config)
+    major = _allowed(rng, major, config)
     minor = int(rng.integers(1, 3)) if major == 2 else 1
     main = _draw_main(rng, major, config)
     signalised = chance(rng, config.signals if major > 1 else 0.5 * config.signals)
@@ -129,7 +129,7 @@ def _plan_kind(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) ->
 
 def _plan_five_legs(rng: np.random.Generator, heading: float, config: RoadConfig) -> JunctionsPlan:
     """Draw a four-way intersection whose side streets lean, with a fifth street in the quarter that this opens."""
-    major = _allowed(int(rng.choice([1, 2], p=[0.4, 0.6])), config)
+    major = _allowed(rng, int(rng.choice([1, 2], p=[0.4, 0.6])), config)
     main, side = _draw_main(rng, major, config), _draw_side(rng, 1, config)
     fifth = _draw_side(rng, 1, config)
     signalised = chance(rng, config.signals)
@@ -167,7 +167,7 @@ def _radius_beside(mains: list[ArmPlan], sides: list[ArmPlan], fifth: ArmPlan) -
 
 def _plan_staggered(rng: np.random.Generator, heading: float, config: RoadConfig) -> JunctionsPlan:
     """Draw two side streets on opposite sides of a main road, offset along it: one intersection or two T junctions."""
-    major = _allowed(int(rng.choice([1, 2], p=[0.6, 0.4])), config)
+    major = _allowed(rng, int(rng.choice([1, 2], p=[0.6, 0.4])), config)
     # A wide median leaves no room for its noses between the two junctions.
     median = config.narrow_median if chance(rng, config.median) else None
     main = draw_style(rng, config, (major, major), speed=config.urban_speed, median=median)
@@ -211,7 +211,7 @@ def _to_stop(arm: ArmPlan, others: tuple[ArmPlan, ...], radius: float) -> float:
 
 def _plan_two(rng: np.random.Generator, heading: float, config: RoadConfig) -> JunctionsPlan:
     """Draw two intersections on one street, T or four-way."""
-    major = max(int(rng.integers(1, 3)), config.least_junction_lanes)
+    major = _or_another(rng, max(int(rng.integers(1, 3)), config.least_junction_lanes), config)
     main = _draw_main(rng, major, config)
     distance = draw(rng, config.junction_distance)
     centers = [along(np.zeros(2), heading, d) for d in (-0.5 * distance, 0.5 * distance)]
@@ -244,8 +244,13 @@ def _plan_roundabout(rng: np.random.Generator, heading: float, config: RoadConfi
     return JunctionsPlan((junction,), ring=ring)
 
 
-def _allowed(lanes: int, config: RoadConfig) -> int:
-    return max(min(lanes, config.junction_lanes), config.least_junction_lanes)
+def _allowed(rng: np.random.Generator, lanes: int, config: RoadConfig) -> int:
+    return _or_another(rng, max(min(lanes, config.junction_lanes), config.least_junction_lanes), config)
+
+
+def _or_another(rng: np.random.Generator, lanes: int, config: RoadConfig) -> int:
+    # Nothing is drawn for presets without it, whose roads stay what they were.
+    return lanes + (config.another_lane > 0.0 and chance(rng, config.another_lane))
 
 
 def _draw_main(rng: np.random.Generator, lanes: int, config: RoadConfig) -> StreetStyle:

@@ -82,6 +82,7 @@ class Traffic:
         size: (N, 3) length, width, height.
         category: (N,) `RoadUser`.
         ego: (F, 3) x, y, yaw of the ego vehicle, which is not among the N.
+        on_route: number of frames until the ego vehicle comes to the end of its route.
         signals: traffic lights; t = 0 is the first frame.
     """
 
@@ -91,6 +92,7 @@ class Traffic:
     size: Float[np.ndarray, "n 3"]
     category: Int[np.ndarray, " n"]
     ego: Float[np.ndarray, "f 3"]
+    on_route: int
     signals: Signals
 
 
@@ -138,7 +140,14 @@ def simulate_traffic(
     driven = _driven(road.trips.take(rows), road.table, position[:, rows])
     walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]
     walking.append(crossers.paths(progress[:frames]))
-    return _assemble(rng, network, config, driven, walking, signals)
+    return _assemble(rng, network, config, driven, walking, _on_route(road, len(way), position[:, 0]), signals)
+
+
+def _on_route(road: Rollout, legs: int, position: Float[np.ndarray, " f"]) -> int:
+    """Return for how many frames the ego vehicle is on the first legs of its route; the rest leads to the border."""
+    start = road.trips.routes.start[0]
+    end = start[legs] if legs < len(start) and np.isfinite(start[legs]) else road.trips.routes.length[0]
+    return int(np.append(np.flatnonzero(position >= end), len(position))[0])
 
 
 def _varied(rng: np.random.Generator, config: TrafficConfig) -> TrafficConfig:
@@ -231,6 +240,7 @@ def _assemble(
     config: TrafficConfig,
     driven: _Driven,
     walking: list[Walkers],
+    on_route: int,
     signals: Signals,
 ) -> Traffic:
     """Join vehicles, parked vehicles and pedestrians; drop those that never come near the ego vehicle."""
@@ -256,4 +266,4 @@ def _assemble(
     present = present & (np.hypot(*(xy - ego[:, None, :2]).transpose(2, 0, 1)) < config.range)
     present[:, 0] = False
     seen = present.any(0)
-    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, signals)
+    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, on_route, signals)

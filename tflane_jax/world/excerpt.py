@@ -1,0 +1,69 @@
+"""The part of a longer drive that a scene shows: most often one in which the vehicle crosses a junction.
+
+Vehicles wait before junctions for most of the time that they spend near them, and recorded scenes are chosen for what
+happens in them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from tflane_jax.scene.logs import VectorMap
+from tflane_jax.world.traffic.simulation import Traffic
+
+# When the vehicle is on a connector, as a fraction of the time from the first key frame to the end of the scene: it
+# may cross the junction shortly before or after.
+_CROSSES = (-0.2, 1.2)
+# Farther from the nearest vertex of a lane, the vehicle is on none, metres.
+_NEAR = 3.0
+
+
+def excerpt(
+    rng: np.random.Generator, roads: VectorMap, traffic: Traffic, *, frames: int, history: int, rate_hz: float
+) -> Traffic:
+    """Return consecutive frames of a drive, while the vehicle is on its route.
+
+    One of the frames in which it is on a connector falls after the history, or little before or after the excerpt. Of a
+    drive without such a frame, the first part is returned.
+
+    Args:
+        rng: stream.
+        roads: the map.
+        traffic: the whole drive, of at least `frames` frames.
+        frames, history: wanted, and those of them that come before the first key frame.
+        rate_hz: frames a second.
+    """
+    spare = max(min(len(traffic.ego), traffic.on_route) - frames, 0)
+    crossing = np.flatnonzero(on_connector(roads, traffic.ego[: spare + frames, :2]))
+    crossing = crossing[crossing >= history]
+    start = 0
+    if len(crossing):
+        before = history + round(rng.uniform(*_CROSSES) * (frames - history))
+        start = min(max(int(rng.choice(crossing)) - before, 0), spare)
+    shown = slice(start, start + frames)
+    seen = traffic.present[shown].any(0)
+    return Traffic(
+        traffic.xy[shown, seen],
+        traffic.yaw[shown, seen],
+        traffic.present[shown, seen],
+        traffic.size[seen],
+        traffic.category[seen],
+        traffic.ego[shown],
+        min(max(traffic.on_route - start, 0), frames),
+        replace(traffic.signals, offset=traffic.signals.offset + start / rate_hz),
+    )
+
+
+def on_connector(roads: VectorMap, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Return at which places, in metres, the nearest lane of a map is one inside an intersection."""
+    lanes = list(roads.segments.values())
+    if not lanes or not len(xy):
+        return np.zeros(len(xy), bool)
+    vertices = np.concatenate([lane.centerline[:, :2] for lane in lanes])
+    inside = np.repeat([lane.is_intersection for lane in lanes], [len(lane.centerline) for lane in lanes])
+    distance, nearest = cKDTree(vertices).query(xy)
+    return inside[nearest] & (distance < _NEAR)

@@ -6,7 +6,7 @@ import enum
 from dataclasses import dataclass
 from typing import Annotated
 
-from tflane_jax.limits import SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range, Rules
+from tflane_jax.limits import ASCENDING, SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range, Rules
 
 CLOSEST_JUNCTIONS = 60.0
 """Two four-way intersections take up nearly this much of the street between them, metres."""
@@ -70,8 +70,8 @@ class RoadConfig:
         second_sides: probability for each of two junctions to be a four-way intersection, not a T junction.
         wide_turns: probability for an intersection that a turn may end on every lane of the road that it enters; else
             each lane that turns leads to one lane.
-        lane_changes: probability for each direction of a street that meets an intersection that a lane opens behind the
-            intersection, or closes before it.
+        lane_changes: probability for each direction of a street from an intersection to the border of the map that a
+            lane opens behind the intersection, or closes before it, where there is room.
         change_distance: between the intersection and such a change, or between the turning lanes and it.
         one_way, median, bike, parking: probability for a street.
         mid_block_crossing: probability for a street without intersection.
@@ -129,7 +129,7 @@ class RoadConfig:
     second_sides: Fraction = 0.25
     wide_turns: Fraction = 0.0
     lane_changes: Fraction = 0.0
-    change_distance: Range = (15.0, 70.0)
+    change_distance: Annotated[tuple[Positive, Positive], ASCENDING] = (15.0, 70.0)
     one_way: Fraction = 0.2
     median: Fraction = 0.35
     bike: Fraction = 0.25

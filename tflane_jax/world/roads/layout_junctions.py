@@ -317,7 +317,8 @@ def _with_changes(rng: np.random.Generator, arm: ArmPlan, config: RoadConfig) ->
     if incoming.lanes and chance(rng, config.lane_changes):
         before = draw(rng, config.change_distance) + incoming.pocket_length * bool(incoming.pockets)
         place = _place_of_change(rng, incoming.bike)
-        incoming = replace(incoming, closes=((place, before),))
+        taper = incoming.taper if incoming.pockets else draw(rng, config.taper)
+        incoming = replace(incoming, closes=((place, before),), taper=taper)
     return replace(arm, style=replace(arm.style, forward=out, backward=incoming))
 
 

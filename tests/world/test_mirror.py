@@ -11,6 +11,7 @@ from tests.world.small_map import crossroads
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.road_maps import find_maps
+from tflane_jax.world.cameras.paint import YELLOW, paint_of
 from tflane_jax.world.mirror import mirrored, mirrored_map, mirrored_road_map
 from tflane_jax.world.presets import REAL_LIKE, REAL_MAPS
 from tflane_jax.world.roads.markers import PlacementConfig
@@ -45,6 +46,8 @@ def assert_equal(a, b):
         elif isinstance(one, tuple):
             for x, y in zip(one, other, strict=True):
                 np.testing.assert_array_equal(x, y)
+        elif field.name == "buildings":  # turned round twice
+            np.testing.assert_allclose(one, other, atol=1e-12)
         else:
             np.testing.assert_array_equal(one, other, err_msg=field.name)
 
@@ -81,6 +84,10 @@ def test_examples_are_mirror_images(scene):
     np.testing.assert_allclose(here.segments.left * [1, -1, 1], there.segments.right, atol=1e-4)
     np.testing.assert_array_equal(here.segments.left_type, there.segments.right_type)
     np.testing.assert_array_equal(here.lanes.successor, there.lanes.successor)
+    np.testing.assert_allclose(here.lanes.visibility, there.lanes.visibility, atol=0.1)
+    np.testing.assert_array_equal(here.areas.category, there.areas.category)
+    ends = (np.sort(np.abs(one.areas.points[:, [0, -1]]), 1) for one in (here, there))  # edges run the other way
+    np.testing.assert_allclose(*ends, atol=1e-3)
     for name in ("valid", "category"):
         np.testing.assert_array_equal(getattr(here.traffic_flow, name), getattr(there.traffic_flow, name))
     np.testing.assert_allclose(here.sd_map.points * [1, -1], there.sd_map.points, atol=1e-4)
@@ -92,6 +99,34 @@ def test_markers_stay_readable(scene):
     np.testing.assert_allclose(np.linalg.det(there.pose[:, :3, :3]), 1.0, atol=1e-9)
     np.testing.assert_array_equal(there.pose[:, :3, 2], scene.markers.pose[:, :3, 2] * [1, -1, 1])  # where it faces
     np.testing.assert_array_equal(there.pose[:, 2, 1], scene.markers.pose[:, 2, 1])  # what is up
+
+
+def test_everything_on_the_ground_is_on_the_other_side(scene):
+    here, there = scene.map, mirrored_map(scene.map)
+    assert len(here.road_boundaries) * len(here.crossings) * len(here.elements) * len(here.buildings) > 0
+    for name in ("road_boundaries", "crossings", "roads"):
+        for one, other in zip(getattr(here, name), getattr(there, name), strict=True):
+            other = other[::-1] if name == "road_boundaries" else other
+            np.testing.assert_array_equal(one * [1, -1, 1], other, err_msg=name)
+    for one, other in zip(here.elements, there.elements, strict=True):
+        np.testing.assert_allclose([np.cos(one.yaw), -np.sin(one.yaw)], [np.cos(other.yaw), np.sin(other.yaw)])
+    # The left side of a building is its front.
+    fronts = [
+        np.stack([x - 0.5 * width * np.sin(yaw), y + 0.5 * width * np.cos(yaw)], 1)
+        for x, y, _, width, yaw in (buildings.T for buildings in (here.buildings, there.buildings))
+    ]
+    np.testing.assert_allclose(fronts[0] * [1, -1], fronts[1], atol=1e-9)
+
+
+def test_the_line_between_directions_is_yellow_on_both_sides(scene):
+    """The same lines are yellow: those beside oncoming lanes."""
+    found = []
+    for side, road_map in ((1, scene.map), (-1, mirrored_map(scene.map))):
+        paint = paint_of(np.random.default_rng(1), road_map, paint_wear=0.0, log_seed=0)
+        middle = paint.corners[(paint.colour == YELLOW).all(-1)].mean(1) * [1, side]
+        found.append(middle[np.lexsort(middle.round(3).T)])
+    assert len(found[0]) > 10
+    np.testing.assert_allclose(*found, atol=1e-6)
 
 
 def test_signs_of_left_turns_show_right_turns(scene):

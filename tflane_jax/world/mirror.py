@@ -63,7 +63,8 @@ def mirrored_map(found: VectorMap) -> VectorMap:
             replace(element, yaw=-element.yaw, attribute=int(_ATTRIBUTE[element.attribute]))
             for element in there.elements
         ),
-        buildings=there.buildings * [1.0, -1.0, 1.0, 1.0, -1.0],
+        # Turned round, which is the same box: the left side of a building is its front.
+        buildings=there.buildings * [1.0, -1.0, 1.0, 1.0, -1.0] + [0.0, 0.0, 0.0, 0.0, np.pi],
     )
 
 

@@ -15,6 +15,7 @@ from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.bev.map_samples import DASH, DASH_PERIOD, line_key, painted_lines
 from tflane_jax.world.bev.sensor import paint_left
+from tflane_jax.world.roads.road_map import drives_on_left
 
 WHITE, YELLOW = (0.86, 0.86, 0.84), (0.84, 0.66, 0.2)
 # Length of pieces with a constant wear, widths of lines and stop lines, metres.
@@ -75,13 +76,15 @@ def _faded(part: Paint, left: float) -> Paint:
 
 
 def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int) -> Paint:
-    lefts: dict[tuple[float, ...], int] = {}
+    # The inner boundary of a lane is that on the side of oncoming traffic.
+    inner: dict[tuple[float, ...], int] = {}
     shared: dict[tuple[float, ...], int] = {}
+    on_left = drives_on_left(vector_map)
     for segment in vector_map.segments.values():
-        for line, is_left in ((segment.left, 1), (segment.right, 0)):
+        for line, is_inner in ((segment.left, not on_left), (segment.right, on_left)):
             if len(line) > 1:
                 key = line_key(line)
-                lefts[key] = lefts.get(key, 0) + is_left
+                inner[key] = inner.get(key, 0) + is_inner
                 shared[key] = shared.get(key, 0) + 1
     lines = painted_lines(vector_map)
     middles, widths, lengths, normals, colours, numbers, stations = [], [], [], [], [], [], []
@@ -95,8 +98,8 @@ def _lines(vector_map: VectorMap, yellow: bool, paint_wear: float, log_seed: int
         length = np.maximum(np.linalg.norm(step, axis=-1), 1e-6)
         normal = np.stack([-step[:, 1], step[:, 0]], -1) / length[:, None]
         key = line_key(line)
-        # Left boundary of two lanes: divides opposite directions. Left boundary of one lane alone: a median's edge.
-        centre, edge = lefts[key] == 2, lefts[key] == 1 and shared[key] == 1
+        # Inner boundary of two lanes: divides opposite directions. Inner boundary of one lane alone: a median's edge.
+        centre, edge = inner[key] == 2, inner[key] == 1 and shared[key] == 1
         offsets = (-_DOUBLE, _DOUBLE) if centre and kind == LineType.SOLID else (0.0,)
         for offset in offsets:
             middles.append(ends + offset * normal)

@@ -199,6 +199,29 @@ def test_prediction_writes_arrays_json_and_pictures(trained, tmp_path):
         assert sorted(governed) == [0, 1]
 
 
+@pytest.mark.parametrize("version", ["v1.0", "v2.1"])
+def test_a_whole_split_is_predicted_in_parts_and_scored(trained, tmp_path, monkeypatch, version):
+    drawn = []
+    monkeypatch.setattr("tflane_jax.commands.predict_lanes.MOST_DRAWN", 2)
+    monkeypatch.setattr("tflane_jax.evaluation.predict._AT_ONCE", 2)
+    monkeypatch.setattr(
+        "tflane_jax.commands.predict_lanes.save_examples", lambda *_, titles, **__: drawn.extend(titles)
+    )
+    out = tmp_path / "predictions"
+    assert main(["predict", str(trained), "--count", "1000000", "--out", str(out)]) == 0
+    assert len(np.load(out / "predictions.npz")["points"]) == 5
+    assert len(drawn) == 2
+    files = [str(out / f"{name}.npz") for name in ("predictions", "truth")]
+    assert main(["score", f"openlane-{version}-centerline", *files, "--out", str(tmp_path / "score")]) == 0
+    scored = json.loads((tmp_path / "score.json").read_text())["rows"][0]
+    assert main(["eval", str(trained), "--split", "val", "--out", str(tmp_path / "eval")]) == 0
+    evaluated = json.loads((tmp_path / "eval.json").read_text())["rows"][0]
+    assert scored["frames"] == 5
+    assert scored["DET_l"] == pytest.approx(evaluated["DET_l"])
+    if version == "v2.1":  # what tflane eval measures
+        assert scored["TOP_ll"] == pytest.approx(evaluated["TOP_ll"])
+
+
 def test_a_baseline_has_no_traffic_flow_to_limit(config, tmp_path, capsys):
     folder = tmp_path / "baseline"
     command = ["train", "--config", f"{config}:baseline", "--out", str(folder), "--training.steps", "2"]

@@ -8,6 +8,7 @@ The cameras are nuScenes' ring with images of 800 x 480 pixels, as the paper has
 28,130 frames on eight GPUs, four frames each. `:bevformer` has BEVFormer's attention to the cameras instead of the
 kernel, `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 
+    tflane convert --config tf_lane/maptr_r50 --weights resnet50.pth --out runs/imagenet
     tflane train --config tf_lane/maptr_r50:published_weights --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
     tflane convert --config tf_lane/maptr_r50:published_weights --weights maptr_tiny_r50_24e.pth --out runs/maptr

@@ -9,6 +9,7 @@ Cameras, schedule and batch are those of `maptr_r50.py`; the built-in world give
 fourth class and 70 lines. `:argoverse2` has sizes and schedule of the paper's lines with heights on Argoverse 2: seven
 cameras and no depth. It reads the built-in world with that ring, not the data set.
 
+    tflane convert --config tf_lane/maptrv2_r50 --weights resnet50.pth --out runs/imagenet
     tflane train --config tf_lane/maptrv2_r50:published_weights --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
     tflane convert --config tf_lane/maptrv2_r50:published_weights --weights maptrv2_nusc_r50_24e.pth --out runs/maptrv2

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from tflane_jax.commands.predict_lanes import MOST_DRAWN
 from tflane_jax.commands.sources import chosen_source, make_folder
 from tflane_jax.datasets import sources
 from tflane_jax.errors import UserError
@@ -32,7 +33,7 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
         raise UserError(f"nothing to predict: {len(dataset)} images, --count {options.count}")
     indices = spread(len(dataset), options.count)
     examples = stack_examples([dataset.example(index) for index in indices])
-    answers = predict_curves(trained.config.task, trained.params[0], examples)
+    answers = predict_curves(trained.config.task, trained.params[0], examples, at_once=16)
     make_folder(options.out)
     predictions, truths = [], []
     for i, index in enumerate(indices):
@@ -43,8 +44,9 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
         predictions.append({"raw_file": name, "lanes": _plain(found), "run_time": 0.0})
     for name, rows in (("predictions.json", predictions), ("truth.json", truths)):
         write_text(options.out / name, "".join(json.dumps(row) + "\n" for row in rows))
-    title = f"{Path(trained.name).name}, step {trained.step}"
-    names = [dataset.info(index).scene for index in indices]
+    title, rows = f"{Path(trained.name).name}, step {trained.step}", spread(len(indices), MOST_DRAWN)
+    examples, answers = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, answers))
+    names = [dataset.info(indices[row]).scene for row in rows]
     save_road_images(options.out / "pictures.png", examples, {title: answers}, titles=names)
     print(f"{len(indices)} images written to {options.out}: predictions.json, truth.json, pictures.png")
     return 0

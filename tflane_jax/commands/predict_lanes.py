@@ -52,6 +52,8 @@ from tflane_jax.tasks import spread
 from tflane_jax.tasks.lane_pictures import Found, lanes_of, titles
 
 _RELATION_THRESHOLD = 0.5
+MOST_DRAWN = 16
+"""Frames in a picture, spread evenly over those that are predicted: a picture of a whole split cannot be drawn."""
 _OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
 
 
@@ -98,7 +100,12 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
     ]
     head = {"run": trained.name, "step": trained.step, "seed": trained.config.training.seeds[0]}
     write_json(options.out / "predictions.json", head | {"threshold": options.threshold, "frames": frames})
-    names, ground, view = titles(dataset, indices), source.example.ground, source.example.range
+    written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
+    # From here on, the frames that are drawn.
+    rows = spread(len(indices), MOST_DRAWN)
+    drawn = [indices[row] for row in rows]
+    examples, lanes, elements = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, lanes, elements))
+    names, ground, view = titles(dataset, drawn), source.example.ground, source.example.range
     save_examples(
         options.out / "pictures.png",
         examples,
@@ -108,8 +115,7 @@ def predict(trained: Run, options: argparse.Namespace) -> int:
         view=view,
         threshold=options.threshold,
     )
-    written = ["predictions.npz", *(["truth.npz"] if truth else []), "predictions.json", "pictures.png"]
-    shown, examples = with_images(examples, source, indices, rendered=options.cameras)
+    shown, examples = with_images(examples, source, drawn, rendered=options.cameras)
     if shown:
         save_camera_views(
             options.out / "cameras.png",

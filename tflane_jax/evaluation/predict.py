@@ -20,6 +20,9 @@ from tflane_jax.processes import all_rows
 from tflane_jax.scene import Example, Prediction, stack_examples
 from tflane_jax.startup import compiled
 
+# Examples of one call of `predict_examples`: a model needs memory for the activations of all of them.
+_AT_ONCE = 16
+
 
 class Predictor(Protocol):
     """The methods of a model that evaluation calls; hashable, because jit takes it as a static argument."""
@@ -125,10 +128,10 @@ def predict_examples(
     A model with memory first processes the earlier frames of each example's scene.
     """
     examples = stack_examples([dataset.example(index) for index in indices])
-    if not task.streams:
-        ((_, answer),) = predictions(task, params, examples, len(indices))
-        return examples, answer
-    every = [_streamed(task, params, dataset, index) for index in indices]
+    if task.streams:
+        every = [_streamed(task, params, dataset, index) for index in indices]
+    else:
+        every = [answer for _, answer in predictions(task, params, examples, min(len(indices), _AT_ONCE))]
     return examples, jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
 
 

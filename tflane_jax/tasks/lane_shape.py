@@ -204,9 +204,19 @@ def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float |
     return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH, threshold=threshold)
 
 
-def predict_curves(task: Predictor, params: Params, examples: RoadImage) -> CurvePrediction:
-    """Return the curves predicted for stacked images, as numpy arrays; raise ValueError for a task without them."""
-    ((_, answer),) = predictions(task, params, examples, len(examples.image))
+def predict_curves(
+    task: Predictor, params: Params, examples: RoadImage, *, at_once: int | None = None
+) -> CurvePrediction:
+    """Return the curves predicted for stacked images, as numpy arrays; raise ValueError for a task without them.
+
+    Args:
+        task, params: the model.
+        examples: B of them, stacked.
+        at_once: images of one call of the model, which needs memory for the activations of all; None: B.
+    """
+    size = min(len(examples.image), at_once or len(examples.image))
+    every = [answer for _, answer in predictions(task, params, examples, size)]
+    answer = jax.tree.map(lambda *leaves: np.concatenate(leaves), *every)
     if answer.curves is None:
         raise ValueError("this task predicts no lane shapes")
     return answer.curves

@@ -77,7 +77,12 @@ def predict(commands) -> None:
     )
     model_arguments(parser, "run folder; then photos, videos or folders of them, for models of lane lines in one image")
     example_arguments(parser, "val")
-    parser.add_argument("--count", type=int, default=8, help="examples, spread evenly over the split (default 8)")
+    parser.add_argument(
+        "--count",
+        type=int,
+        default=8,
+        help="examples, spread evenly over the split (default 8); more than there are: all. At most 16 are drawn",
+    )
     parser.add_argument(
         "--threshold",
         type=float,

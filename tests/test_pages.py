@@ -1,0 +1,80 @@
+"""The pages: commands that the parsers take, and links to headings that exist."""
+
+import re
+import shlex
+from collections.abc import Iterator
+from functools import cache
+
+import pytest
+
+from tests.shared import ROOT
+from tflane_jax.cli import build_parser
+from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.errors import UserError
+
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+}
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """Yield the words of the `tflane` commands in blocks of code; those with shell variables or "..." are left out."""
+    for block in re.findall(r"^```\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True) if line.startswith("tflane ") else []
+            if words and not any("..." in word or set(word) & set("${[") for word in words):
+                yield words[1:]
+
+
+def fault(words: list[str]) -> str | None:
+    """Return what is wrong with a command, None if it parses with all its settings."""
+    try:
+        options, rest = build_parser().parse_known_args(words)
+        if rest and not options.takes_overrides:
+            return f"unknown argument {rest[0]}"
+        if rest and getattr(options, "config", None):
+            apply_overrides(_config(options.config), rest)
+    except SystemExit as error:
+        return "wrong arguments" if error.code else None
+    except UserError as error:
+        return str(error)
+    return None
+
+
+_config = cache(load_config)
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub names them."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_commands_in_pages_parse():
+    found = [(page, words) for page, text in PAGES.items() for words in commands(text)]
+    assert len(found) > 80, "hardly anything found: has the pattern changed?"
+    wrong = {f"{page}: tflane {shlex.join(words)}": said for page, words in found if (said := fault(words))}
+    assert wrong == {}
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("train --config tf_lane/argoverse2 --data.root LOGS", "unknown setting --data.root"),
+        ("train --config markers/toponet_r50 --task.model.encoder.bev.remat True", "True"),
+        ("eval RUN --evaluation.versions v1.0", "unknown argument --evaluation.versions"),
+        ("predict RUN --split all", "wrong arguments"),
+    ],
+)
+def test_wrong_commands_are_found(command, said):
+    (words,) = commands(f"```\ntflane {command}    # a remark\n```\n")
+    assert said in (fault(words) or "")
+
+
+def test_links_lead_to_headings():
+    for page, text in PAGES.items():
+        for path, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#([^)\s]+)\)", text):
+            target = (ROOT / page).parent.joinpath(path).resolve() if path else ROOT / page
+            assert anchor in anchors(target.read_text("utf-8")), f"{page} links to {path}#{anchor}"

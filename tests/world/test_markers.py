@@ -11,10 +11,12 @@ from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene.logs import VectorMap
 from tflane_jax.world import simulate as simulate_module
 from tflane_jax.world.cameras.marker_sites import visible_places
+from tflane_jax.world.mirror import mirrored
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.markers import PlacementConfig, place_markers
-from tflane_jax.world.simulate import WorldConfig, simulate
+from tflane_jax.world.simulate import Stream, WorldConfig, _stream, simulate
 from tflane_jax.world.traffic.simulation import TrafficConfig
+from tflane_jax.world.warp import WarpConfig, warped
 
 EMPTY = TrafficConfig(
     vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0
@@ -93,6 +95,27 @@ def test_surveyed_boards_are_seen_better(scene):
     assert len(before) == len(after)
     assert before.min() < 0.8 < after.mean()
     assert after.mean() > before.mean()
+
+
+@pytest.mark.parametrize(
+    ("shown", "scenes"), [({"mirrored": 1.0}, (200_000_000, 200_000_001)), ({"warp": WarpConfig()}, (200_000_000,))]
+)
+def test_boards_are_surveyed_on_the_ground_that_is_shown(shown, scenes):
+    """Trees stand elsewhere in a mirror, and on bent ground: boards that were chosen for the plain scene are worse."""
+    pytest.importorskip("cv2")
+    world = WorldConfig(markers=PlacementConfig(side="both", site="clear"), traffic=EMPTY)
+    before, after = [], []
+    for scene in scenes:
+        plain, there = simulate(scene, world), simulate(scene, replace(world, **shown))
+        warp = None if "mirrored" in shown else shown["warp"].draw(_stream(scene, Stream.WARP))
+        seen = visible_places(there.map, scene, on_left=warp is None)
+        for log, found in ((mirrored(plain) if warp is None else warped(plain, warp), before), (there, after)):
+            # The heading of the traffic is against the board's, but for the toe-in.
+            yaw = np.arctan2(-log.markers.pose[:, 1, 2], -log.markers.pose[:, 0, 2])
+            yaw += np.deg2rad(-5.0 if warp is None else 5.0)
+            found += [seen(at, float(angle)) for at, angle in zip(log.markers.pose[:, :3, 3], yaw, strict=True)]
+    assert len(before) == len(after) > 0
+    assert np.mean(after) > np.mean(before) + 0.02
 
 
 def test_boards_behind_a_junction_face_crossing_traffic():

@@ -21,7 +21,7 @@ from tflane_jax.limits import Count, Fraction, Positive, PositiveOrZero
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.excerpt import excerpt
-from tflane_jax.world.mirror import mirrored, mirrored_road_map
+from tflane_jax.world.mirror import mirrored, mirrored_map, mirrored_road_map
 from tflane_jax.world.roads.map_networks import build_map_network
 from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
 from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, build_road_network
@@ -31,7 +31,7 @@ from tflane_jax.world.traffic.signals import element_states, show_signals
 from tflane_jax.world.traffic.simulation import EGO_JOINS, Traffic, TrafficConfig, simulate_traffic
 from tflane_jax.world.traffic.tracker import TrackerConfig, track, wrap_angle
 from tflane_jax.world.view import turned_view
-from tflane_jax.world.warp import Warp, WarpConfig, warped
+from tflane_jax.world.warp import Warp, WarpConfig, warped, warped_map
 
 ROOT = 20_250_711
 # Frames that a scene has before its first key frame, unless its examples look back farther.
@@ -113,8 +113,21 @@ class Place:
     sees: float
 
 
-def _chosen_by_sight(vector_map: VectorMap, scene_id: int, config: WorldConfig) -> tuple[Visible, ...]:
-    return (visible_places(vector_map, scene_id),) if config.markers.site == "clear" else ()
+def _chosen_by_sight(
+    vector_map: VectorMap, scene_id: int, config: WorldConfig, warp: Warp | None, mirror: bool
+) -> tuple[Visible, ...]:
+    """Return what a surveyor sees of a board, on the ground as it is shown: trees stand where that map lets them."""
+    if config.markers.site != "clear":
+        return ()
+    shown = vector_map if warp is None else warped_map(vector_map, warp)
+    seen = visible_places(mirrored_map(shown) if mirror else shown, scene_id, on_left=mirror)
+
+    def visible(place: Float[np.ndarray, "3"], heading: float) -> float:
+        if warp is not None:
+            place, heading = warp.moved(place), float(warp.turned(place[:2], np.asarray(heading)))
+        return seen(place * [1.0, -1.0, 1.0], -heading) if mirror else seen(place, heading)
+
+    return (visible,)
 
 
 def simulate(
@@ -183,7 +196,12 @@ def simulate(
         weather=float(weather),
         paint_wear=float(paint_wear),
         seed=scene_id,
-        markers=place_markers(network.map, scene_id, config.markers, *_chosen_by_sight(network.map, scene_id, config)),
+        markers=place_markers(
+            network.map,
+            scene_id,
+            config.markers,
+            *_chosen_by_sight(network.map, scene_id, config, warp, mirror),
+        ),
     )
     return _shown(log, scene_id, config, warp, mirror)
 

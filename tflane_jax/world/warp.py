@@ -118,7 +118,7 @@ def warped(log: Log, warp: Warp) -> Log:
     markers = log.markers
     return replace(
         log,
-        map=_map(log.map, warp),
+        map=warped_map(log.map, warp),
         global_from_ego=poses,
         tracks=tracks,
         actors=actors,
@@ -127,7 +127,8 @@ def warped(log: Log, warp: Warp) -> Log:
     )
 
 
-def _map(found: VectorMap, warp: Warp) -> VectorMap:
+def warped_map(found: VectorMap, warp: Warp) -> VectorMap:
+    """Return a map on a bent ground plan."""
     moved = moved_map(found, lambda line: warp.moved(with_vertices(line)), warp.moved)
     xy, (length, width), yaw = found.buildings[:, :2], found.buildings[:, 2:4].T, found.buildings[:, 4]
     sides = [np.linalg.norm(warp.along(xy, yaw + turn), axis=-1) for turn in (0.0, 0.5 * np.pi)]

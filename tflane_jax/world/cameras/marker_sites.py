@@ -10,19 +10,24 @@ from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.cameras.stage import map_boxes
 from tflane_jax.world.roads.markers import Visible
 
-# Where drivers look from: distances before the board, and to its left, metres; height of a camera.
+# Where drivers look from: distances before the board, and to its side towards the road, metres; height of a camera.
 VIEWS = tuple((ahead, aside) for ahead in (8.0, 14.0, 22.0, 35.0, 50.0) for aside in (3.0, 6.0))
 _EYE = 1.45
 # Points of a board of 1 m that are looked at, from its middle, metres.
 _ACROSS = np.linspace(-0.6, 0.6, 7)
 
 
-def visible_places(vector_map: VectorMap, seed: int) -> Visible:
+def visible_places(vector_map: VectorMap, seed: int, *, on_left: bool = False) -> Visible:
     """Return the function that says which fraction of a board drivers see, in the scene of this map and seed.
 
     The mean over `VIEWS` of the fraction of the board that no static body hides; a surveyor knows no road users.
+
+    Args:
+        vector_map: as it is shown.
+        seed: of the scene.
+        on_left: traffic keeps to the left, so that drivers are to the right of a board.
     """
-    boxes = map_boxes(vector_map, seed)
+    boxes, towards_road = map_boxes(vector_map, seed), -1.0 if on_left else 1.0
     reach = max(ahead for ahead, _ in VIEWS) + 10.0
 
     def visible(place: Float[np.ndarray, "3"], heading: float) -> float:
@@ -33,7 +38,7 @@ def visible_places(vector_map: VectorMap, seed: int) -> Visible:
         points = place[:2] + across[:, None] * left
         hidden = []
         for ahead, aside in VIEWS:
-            eye = place[:2] - ahead * along + aside * left
+            eye = place[:2] - ahead * along + towards_road * aside * left
             occluders = np.stack([x - eye[0], y - eye[1], length, width, yaw, high - low, low], -1)
             hidden.append(
                 hidden_points(

@@ -85,9 +85,9 @@ def test_a_folder_of_segments_is_a_folder_of_maps(root):
     assert all(path.stem.endswith("-ls") for path in one.files)  # they tell more
     assert [path.stem[:18] for path in one.files] == sorted(path.stem[:18] for path in one.files)
     assert find_maps(root / "val" / "10073")[0].content() == one.content()
-    roads = prepare_roads(one.read(), 2.0, 56.0)
+    roads = prepare_roads(one.read(), 2.0)
     assert len(roads.junctions) == 1
-    assert roads.spots
+    assert roads.spots(56.0)
     with pytest.raises(UserError, match="is a map without a recording"):
         one.log()
 

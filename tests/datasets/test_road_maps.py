@@ -181,7 +181,7 @@ def test_lanes_of_a_geojson_file_have_their_places_markings_and_successors(tmp_p
         assert sorted(lane_.successors) == sorted(numbers[j] for j in wanted.successors)
         assert (lane_.left_type, lane_.right_type) == (LineType.DASHED, LineType.SOLID)
     assert (len(town.map.crossings), len(town.map.road_boundaries)) == (1, 1)
-    assert len(prepare_roads(town, 1.8, 55.0).spots) > 10
+    assert len(prepare_roads(town, 1.8).spots(55.0)) > 10
 
 
 ARM = [(0, 0), (80, 0)]

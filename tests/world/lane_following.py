@@ -4,6 +4,7 @@ import numpy as np
 
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
+from tflane_jax.world.roads.curves import arc_length, points_at
 
 
 def fractions_on_lanes(log):
@@ -11,7 +12,7 @@ def fractions_on_lanes(log):
 
     It does within 1.5 m of the centerline of a lane, facing along it.
     """
-    lines = [s.centerline[:, :2] for s in log.map.segments.values()]
+    lines = [_dense(s.centerline[:, :2]) for s in log.map.segments.values()]
     at = np.concatenate([0.5 * (line[1:] + line[:-1]) for line in lines])
     ahead = np.concatenate([np.diff(line, axis=0) for line in lines])
     ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
@@ -26,3 +27,9 @@ def fractions_on_lanes(log):
         facing = np.stack([np.cos(yaw[:, k]), np.sin(yaw[:, k])], -1) @ ahead.T
         found.append(float((np.where(facing > 0.8, apart, np.inf).min(-1) < 1.5).mean()))
     return np.array(found)
+
+
+def _dense(line):
+    """Return a line with a vertex at least every metre."""
+    length = arc_length(line)[-1]
+    return points_at(line, np.linspace(0.0, length, int(length) + 2))

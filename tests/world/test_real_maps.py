@@ -217,7 +217,7 @@ def test_networks_differ_between_scenes_and_repeat_bit_by_bit():
 
 
 def test_nothing_stands_on_the_lanes():
-    points = prepare_roads(MAP, 1.8, SEES).points
+    points = prepare_roads(MAP, 1.8).points
     for x, y, length, width, yaw in network(0).map.buildings:
         at = (points - [x, y]) @ np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
         assert ((np.abs(at[:, 0]) > 0.5 * length) | (np.abs(at[:, 1]) > 0.5 * width)).all()

@@ -14,10 +14,11 @@ from tflane_jax.scene.terrain import Terrain
 from tflane_jax.world.cameras.light import look
 from tflane_jax.world.cameras.solids import pack
 from tflane_jax.world.cameras.surface import Surface, surface_at
+from tflane_jax.world.moving import with_vertices
 from tflane_jax.world.render.camera import FrontCamera, camera_pose
 from tflane_jax.world.render.polygons import Solid
 from tflane_jax.world.simulate import WorldConfig, simulate
-from tflane_jax.world.terrain import TerrainConfig, with_vertices
+from tflane_jax.world.terrain import TerrainConfig
 
 # A hill of 4 m, 60 m wide, along x.
 HILL = Terrain(np.array([[2 * np.pi / 60, 0.0]]), np.array([0.0]), np.array([2.0]))

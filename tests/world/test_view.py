@@ -38,9 +38,17 @@ def test_examples_are_turned(scene):
     flow = here.traffic_flow.valid & there.traffic_flow.valid
     assert flow.any()
     for k, f in zip(*np.nonzero(flow), strict=True):
-        # Slots of road users are the same in both: they are sorted by distance.
+        # Slots of road users are the same in both: they are in the order of the tracks.
         back = transform_points(frame, np.asarray(there.traffic_flow.position[k, f], float)[None])[0]
         np.testing.assert_allclose(back, here.traffic_flow.position[k, f], atol=1e-3)
+    # Lanes end elsewhere, at the border of a box that is turned, too.
+    near = here.lanes.points[here.lanes.valid]
+    near = near[np.linalg.norm(near, axis=-1) < 20.0]
+    found = transform_points(frame, np.asarray(there.lanes.points[there.lanes.valid], float))
+    steps = np.linspace(0.0, 1.0, 50)[:, None, None, None]
+    found = (found[:, :-1] + steps * np.diff(found, axis=1)).reshape(-1, 3)
+    assert len(near) > 5
+    assert np.linalg.norm(found - near[:, None], axis=-1).min(1).max() < 0.5
 
 
 def test_each_scene_has_its_own_angle_within_the_limit(scene):

@@ -8,13 +8,15 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.world.lane_following import fractions_on_lanes
+from tests.world.small_map import crossroads
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import pose_yaw, transform_points
+from tflane_jax.geometry import transform_points
 from tflane_jax.limits import check_settings
+from tflane_jax.world.presets import REAL_MAPS
 from tflane_jax.world.roads.markers import PlacementConfig
-from tflane_jax.world.simulate import Stream, WorldConfig, _stream, simulate
+from tflane_jax.world.simulate import Place, Stream, WorldConfig, _stream, simulate
 from tflane_jax.world.warp import Warp, WarpConfig, warped
 
 SCENE = 4
@@ -114,7 +116,27 @@ def test_vehicles_drive_along_the_lanes_of_a_bent_scene(scenes):
 
 
 def test_scenes_are_bent_in_their_own_way_and_repeat(scenes):
-    _, bent, _ = scenes
+    _, bent, warp = scenes
     assert simulate(SCENE, BENT).global_from_ego.tobytes() == bent.global_from_ego.tobytes()
-    turns = [pose_yaw(log.global_from_ego)[0] for log in (simulate(0, BENT), simulate(0, WORLD))]
-    assert abs(np.sin(turns[0] - turns[1])) > 1e-4
+    other = BENT.warp.draw(_stream(SCENE + 1, Stream.WARP))
+    assert np.abs(other.matrix - warp.matrix).max() > 0.01
+    assert np.abs(other.phase - warp.phase).max() > 0.1
+
+
+def test_a_recorded_map_is_bent():
+    """Its lanes and vehicles move together, and the map's own places are asked for more room."""
+    world = replace(
+        REAL_MAPS,
+        traffic=replace(REAL_MAPS.traffic, ego_passes_s=3.0, early_s=30.0, variety=0.0),
+        duration_s=5.0,
+        keyframes=2,
+        mirrored=0.0,
+        warp=WarpConfig(),
+    )
+    log = simulate(3, world, place=Place(crossroads(), 40.0))
+    found = fractions_on_lanes(log)
+    assert len(found) >= 2
+    assert found.min() > 0.9
+    tiny = replace(crossroads(), complete=1.0, places=crossroads().places[:1] + 500.0)
+    with pytest.raises(UserError, match=r"is too small a map: .* or bend it less \(world.warp\)"):
+        simulate(3, world, place=Place(tiny, 40.0))

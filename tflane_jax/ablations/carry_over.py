@@ -1,9 +1,9 @@
 """Does a model find lanes on logs whose map it has never seen? Each recorded log is left out of training once.
 
-Every model is trained on the built-in world: on generated roads (of the preset `real-like`; of `city` as a control), on
-the maps of the other logs, or on both. It is tested on the key frames of the log that was left out, with that log's
-recorded tracks as traffic flow: as they are, without them, and with the tracks of another log. Models that see no map
-are trained once and tested on every log.
+Every model is trained on the built-in world: on generated roads (of the preset `real-like`; as controls, of `city`, and
+of `real-like` with right-hand traffic alone), on the maps of the other logs, or on both. It is tested on the key frames
+of the log that was left out, with that log's recorded tracks as traffic flow: as they are, without them, and with the
+tracks of another log. Models that see no map are trained once and tested on every log.
 
 <out>/runs/KEY              the runs; the same command resumes what was stopped
 <out>/declaration.json      claims and primary measure, written before the trainings

@@ -210,7 +210,7 @@ def check_real_maps(root: Path) -> FolderCheck:
         row: dict[str, str | int | float] = {"map": one.name, "format": one.kind}
         try:
             road_map = one.read()
-            roads = prepare_roads(road_map, REAL_MAPS.roads.sidewalk, sees(RECORDED_EXAMPLE))
+            roads = prepare_roads(road_map, REAL_MAPS.roads.sidewalk)
         except UserError as error:
             faults.append(str(error))
         else:
@@ -220,7 +220,7 @@ def check_real_maps(root: Path) -> FolderCheck:
                 "crossings": len(roads.crossings),
                 "parking places": len(roads.parking),
                 "complete m": road_map.complete,
-                "places for examples, m of lane": 3 * len(roads.spots),
+                "places for examples, m of lane": 3 * len(roads.spots(sees(RECORDED_EXAMPLE))),
             }
         rows.append(row)
     return FolderCheck("recorded maps", rows, faults)

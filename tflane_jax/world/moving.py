@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from tflane_jax.scene.logs import LaneSegment, Log, Tracks, VectorMap
 
+# Straight lines get a vertex every so many metres, to follow what becomes of the ground.
+_STEP = 4.0
 Move = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, "_ 3"]]
 """Lines or points, global metres -> where they are now; a line may get further vertices."""
 
@@ -45,3 +47,15 @@ def moved_boxes(log: Log, move: Callable[[Tracks], Tracks]) -> tuple[Tracks, Tra
     """Return the tracks and the true boxes of a log, moved; one object where they are one."""
     tracks = move(log.tracks)
     return tracks, tracks if log.actors is log.tracks else move(log.actors)
+
+
+def with_vertices(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return a line with further vertices, at most 4 m apart; a line driven the other way gets the same ones."""
+    if len(line) < 2:
+        return line
+    start, step = line[:-1], np.diff(line, axis=0)
+    count = np.maximum(np.ceil(np.linalg.norm(step[:, :2], axis=-1) / _STEP), 1).astype(int)
+    parts = [
+        a + np.arange(n)[:, None] / n * d if n > 1 else a[None] for a, d, n in zip(start, step, count, strict=True)
+    ]
+    return np.concatenate([*parts, line[-1:]])

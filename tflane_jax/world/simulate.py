@@ -73,10 +73,11 @@ class WorldConfig:
             gives no frame again and again, and the middle of its route is passed more often.
         terrain: hills; None: level ground. They change nothing else in a scene.
         mirrored: fraction of the scenes that are seen in a mirror: generated roads then have left-hand traffic, and
-            recorded maps change sides. Nothing else differs.
+            recorded maps change sides. Roads and traffic are mirror images; paint wear, sensor noise and scenery are
+            drawn anew.
         warp: how ground plans are stretched, sheared and bent, map, road users and drive alike; None: not at all.
         view_turn: largest angle between the frame in which a scene is perceived and the vehicle's heading, degrees;
-            each scene has its own.
+            each scene has its own. Cameras turn with it.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -257,6 +258,7 @@ def _drive_on(
     raise UserError(
         f"{place.road_map.source} {place.road_map.name} is too small a map: in {_DRIVES} drives, no {needed} frames "
         f"saw {place.sees:.0f} m of it in every direction. Leave it out (data.without), or perceive a smaller range"
+        f"{' or bend it less (world.warp)' if config.warp is not None else ''}"
     )
 
 

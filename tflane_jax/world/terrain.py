@@ -16,10 +16,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
 from tflane_jax.scene.logs import KeyFrame, Log, Relief, Tracks
 from tflane_jax.scene.terrain import Terrain
-from tflane_jax.world.moving import moved_boxes, moved_map
-
-# Straight lines get a vertex every so many metres, to follow the ground.
-_STEP = 4.0
+from tflane_jax.world.moving import moved_boxes, moved_map, with_vertices
 
 
 @dataclass(frozen=True)
@@ -73,18 +70,6 @@ def on_terrain(log: Log, terrain: Terrain) -> Log:
         markers=None if log.markers is None else replace(log.markers, pose=_raised_poses(log.markers.pose, terrain)),
         relief=Relief(terrain, log),
     )
-
-
-def with_vertices(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Return a line with further vertices, at most 4 m apart; a line driven the other way gets the same ones."""
-    if len(line) < 2:
-        return line
-    start, step = line[:-1], np.diff(line, axis=0)
-    count = np.maximum(np.ceil(np.linalg.norm(step[:, :2], axis=-1) / _STEP), 1).astype(int)
-    parts = [
-        a + np.arange(n)[:, None] / n * d if n > 1 else a[None] for a, d, n in zip(start, step, count, strict=True)
-    ]
-    return np.concatenate([*parts, line[-1:]])
 
 
 def _tracks(level: Tracks, poses: np.ndarray, raised: np.ndarray, terrain: Terrain) -> Tracks:

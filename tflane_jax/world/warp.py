@@ -17,8 +17,7 @@ from jaxtyping import Float
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
 from tflane_jax.limits import ASCENDING, Count, Fraction, Positive, Rules
 from tflane_jax.scene.logs import Log, Tracks, VectorMap
-from tflane_jax.world.moving import moved_boxes, moved_map
-from tflane_jax.world.terrain import with_vertices
+from tflane_jax.world.moving import moved_boxes, moved_map, with_vertices
 from tflane_jax.world.traffic.tracker import wrap_angle
 
 

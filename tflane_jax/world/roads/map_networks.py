@@ -7,7 +7,7 @@ parked cars and buildings are not in it: they are derived or drawn for each scen
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,7 +56,8 @@ class PreparedRoads:
         parking: x, y, yaw.
         roads: centre lines.
         points: of all lanes.
-        spots: (S, 3) lane, station and distance from the places, of points where examples may be made.
+        complete: distance from the places up to which every lane is in the map, metres.
+        beside: distance from the nearest place, lane, station and point, every few metres of lane.
     """
 
     segments: dict[int, LaneSegment]
@@ -73,17 +74,26 @@ class PreparedRoads:
     parking: Float[np.ndarray, "p 3"]
     roads: tuple[Float[np.ndarray, "_ 2"], ...]
     points: Float[np.ndarray, "p 2"]
-    spots: list[tuple[int, float, Float[np.ndarray, "2"]]]
+    complete: float
+    beside: list[tuple[float, int, float, Float[np.ndarray, "2"]]]
+
+    def within(self, sees: float) -> float:
+        """Return how far from the map's places examples are made that see so far, metres."""
+        return max(self.complete - sees, _LEAST_MARGIN)
+
+    def spots(self, sees: float) -> list[tuple[int, float, Float[np.ndarray, "2"]]]:
+        """Return places of examples: lane, distance along it and point; the nearest one if none is near enough."""
+        near = [one[1:] for one in self.beside if one[0] <= self.within(sees)]
+        return near or [min(self.beside, key=lambda one: one[0])[1:]]
 
 
 @functools.lru_cache(maxsize=64)
-def prepare_roads(road_map: RoadMap, sidewalk: float, sees: float) -> PreparedRoads:
+def prepare_roads(road_map: RoadMap, sidewalk: float) -> PreparedRoads:
     """Return what all scenes on a map share; the last maps stay in memory.
 
     Args:
         road_map: the map.
         sidewalk: distance of the walking line behind the kerb, metres.
-        sees: distance up to which an example must be complete, metres.
 
     Raises UserError for a map without a lane open to motor vehicles.
     """
@@ -120,7 +130,8 @@ def prepare_roads(road_map: RoadMap, sidewalk: float, sees: float) -> PreparedRo
         parking=map_roadside.parking_places(segments, kerbs, crossings, road_map.parked),
         roads=road_lines_of(lanes, junctions),
         points=points,
-        spots=_spots(lanes, road_map.places, max(road_map.complete - sees, _LEAST_MARGIN)),
+        complete=road_map.complete,
+        beside=_beside(lanes, road_map.places),
     )
 
 
@@ -136,8 +147,8 @@ def build_map_network(
         sees: distance up to which an example must be complete, metres.
         leads_s: time that the ego vehicle drives before examples are made, seconds.
     """
-    roads = prepare_roads(road_map, config.sidewalk, sees)
-    way, aim, spot = _ego_way(rng, roads)
+    roads = prepare_roads(road_map, config.sidewalk)
+    way, aim, spot = _ego_way(rng, roads, roads.spots(sees))
     speed = draw(rng, config.urban_speed)
     lanes = {i: lane for i, lane in roads.lanes.items() if _near(lane.centerline, spot, _TRAFFIC) or i in way}
     yields = {i: others for i, others in roads.merges.items() if i in lanes and others[0] in lanes}
@@ -185,19 +196,21 @@ def build_map_network(
             aim=aim,
             top_speed=max(aim / (_PACE * leads_s), _SLOWEST),
             places=road_map.places[np.linalg.norm(road_map.places - spot, axis=-1) < _WITHIN],
-            within=max(road_map.complete - sees, _LEAST_MARGIN),
+            within=roads.within(sees),
         ),
     )
 
 
-def _ego_way(rng: np.random.Generator, roads: PreparedRoads) -> tuple[tuple[int, ...], float, Float[np.ndarray, "2"]]:
+def _ego_way(
+    rng: np.random.Generator, roads: PreparedRoads, spots: Sequence[tuple[int, float, Float[np.ndarray, "2"]]]
+) -> tuple[tuple[int, ...], float, Float[np.ndarray, "2"]]:
     """Draw a place for examples and a route through it: lanes, distance of the place along them, and the place.
 
     Of a few draws, the one with the longest way before the place is taken, up to `_BEFORE`.
     """
     best: tuple[tuple[int, ...], float, Float[np.ndarray, "2"]] | None = None
     for _ in range(_ROUTE_TRIES):
-        lane, station, spot = roads.spots[int(rng.integers(len(roads.spots)))]
+        lane, station, spot = spots[int(rng.integers(len(spots)))]
         way, ahead, behind = [lane], roads.length[lane] - station, station
         while behind < _BEFORE and (onto := [i for i in roads.before[way[0]] if i not in way]):
             way.insert(0, onto[int(rng.integers(len(onto)))])
@@ -213,10 +226,10 @@ def _ego_way(rng: np.random.Generator, roads: PreparedRoads) -> tuple[tuple[int,
     return best
 
 
-def _spots(
-    lanes: Mapping[int, LaneSegment], places: Float[np.ndarray, "n 2"], within: float
-) -> list[tuple[int, float, Float[np.ndarray, "2"]]]:
-    """Return points of lanes open to motor vehicles near the places; where there are none, the nearest one."""
+def _beside(
+    lanes: Mapping[int, LaneSegment], places: Float[np.ndarray, "n 2"]
+) -> list[tuple[float, int, float, Float[np.ndarray, "2"]]]:
+    """Return points of lanes open to motor vehicles: distance from the nearest place, lane, station and point."""
     from scipy.spatial import KDTree
 
     tree, found = KDTree(places), []
@@ -225,8 +238,7 @@ def _spots(
             line = map_roadside.evenly(lane.centerline[:, :2], 3.0)
             stations = np.linspace(0.0, arc_length(line)[-1], len(line))
             found += [(float(d), i, float(s), xy) for d, s, xy in zip(tree.query(line)[0], stations, line, strict=True)]
-    near = [(i, s, xy) for d, i, s, xy in found if d <= within]
-    return near or [min(found, key=lambda one: one[0])[1:]]
+    return found
 
 
 def _near(line: Float[np.ndarray, "n d"], spot: Float[np.ndarray, "2"], metres: float) -> bool:

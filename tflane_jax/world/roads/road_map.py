@@ -50,10 +50,10 @@ def drives_on_left(found: VectorMap) -> bool:
         return False
     at, ahead = (np.concatenate(parts) for parts in zip(*map(_directed, lines), strict=True))
     oncoming = 0
-    for here, there in zip(at, ahead, strict=True):
-        step = at - here
-        along, left = np.abs(step @ there), there[0] * step[:, 1] - there[1] * step[:, 0]
-        beside = (ahead @ there < _OPPOSED) & (along < _EVERY) & (np.abs(left) > 1.0) & (np.abs(left) < _BESIDE)
+    for place, heading in zip(at, ahead, strict=True):
+        step = at - place
+        along, left = np.abs(step @ heading), heading[0] * step[:, 1] - heading[1] * step[:, 0]
+        beside = (ahead @ heading < _OPPOSED) & (along < _EVERY) & (np.abs(left) > 1.0) & (np.abs(left) < _BESIDE)
         if beside.any():
             oncoming += int(np.sign(left[beside][np.abs(left[beside]).argmin()]))
     return oncoming < 0

@@ -12,7 +12,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.world.cameras.paint import YELLOW, paint_of
-from tflane_jax.world.mirror import mirrored, mirrored_map, mirrored_road_map
+from tflane_jax.world.mirror import markers_beside, mirrored, mirrored_map, mirrored_road_map
 from tflane_jax.world.presets import REAL_LIKE, REAL_MAPS
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.road_map import drives_on_left
@@ -146,6 +146,18 @@ def test_a_map_of_left_hand_traffic_has_the_mirror_images_of_its_mirror_image():
     assert_equal(simulate(3, ON_MAP, place=there), mirrored(scene))
     # Its own mirror image drives on the right.
     assert_equal(simulate(3, replace(ON_MAP, mirrored=1.0), place=there), scene)
+
+
+def test_virtual_markers_of_a_recorded_map_stand_on_the_side_of_its_traffic():
+    here, there = crossroads().map, mirrored_road_map(crossroads()).map
+    right, left = (markers_beside(found, 3, PlacementConfig()) for found in (here, there))
+    assert len(right.pose) > 0
+    np.testing.assert_array_equal(right.marker_id, left.marker_id)
+    np.testing.assert_allclose(left.pose[:, :3, 3], right.pose[:, :3, 3] * [1, -1, 1], atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(left.pose[:, :3, :3]), 1.0, atol=1e-9)
+    asked = []
+    markers_beside(there, 3, PlacementConfig(site="clear"), lambda place, _: asked.append(place[1]) or 1.0)
+    assert {round(y, 3) for y in left.pose[:, 1, 3]} <= {round(y, 3) for y in asked}
 
 
 def test_without_oncoming_lanes_traffic_keeps_to_the_right():

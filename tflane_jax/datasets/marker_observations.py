@@ -21,7 +21,8 @@ from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers
 from tflane_jax.world.cameras.ring import CameraRigConfig
-from tflane_jax.world.roads.markers import place_markers
+from tflane_jax.world.mirror import markers_beside
+from tflane_jax.world.roads.markers import PlacementConfig
 
 # Detections in images by log, track frame and settings: key frames are also the earlier moment of later ones.
 _DETECTED: dict[tuple[int, int, CameraRigConfig, PixelConfig], DetectedMarkers] = {}
@@ -30,7 +31,7 @@ _REMEMBERED: dict[tuple[int, float, bool], tuple[PlacedMarkers, MarkerStore]] = 
 
 def markers_of(log: Log) -> PlacedMarkers:
     """Return the markers of a log; real logs have none and get virtual ones (marker paper, section IV-A)."""
-    return place_markers(log.map, log.seed) if log.markers is None else log.markers
+    return markers_beside(log.map, log.seed, PlacementConfig()) if log.markers is None else log.markers
 
 
 def store_of_log(

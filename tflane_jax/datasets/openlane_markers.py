@@ -27,8 +27,9 @@ from tflane_jax.markers.store import MarkerStore, store_of
 from tflane_jax.markers.visibility import in_images
 from tflane_jax.scene import MarkerObservations
 from tflane_jax.scene.logs import KeyFrame, Log, PlacedMarkers, Tracks, VectorMap
+from tflane_jax.world.mirror import markers_beside
 from tflane_jax.world.render.camera import FrontCamera
-from tflane_jax.world.roads.markers import PlacementConfig, Visible, marker_pose, place_markers
+from tflane_jax.world.roads.markers import PlacementConfig, Visible, marker_pose
 
 # Metres before a board at which drivers should see it, and to the side of the line along which its traffic comes.
 _NEAREST, _FARTHEST, _ASIDE = 8.0, 50.0, 15.0
@@ -155,7 +156,7 @@ class _Segment:
         poses = self.log.global_from_ego
         clear = boards.placement.site == "clear"
         seen = _seen_by(poses, self.cameras, boards.placement.size) if clear else None
-        self.markers = place_markers(self.log.map, self.log.seed, boards.placement, seen)
+        self.markers = markers_beside(self.log.map, self.log.seed, boards.placement, seen)
         self.store: MarkerStore = store_of(lanes, self.markers, radius=radius, source=name)
         # Lanes are in the store; what is left of the log is small.
         self.log = replace(self.log, map=VectorMap({}))

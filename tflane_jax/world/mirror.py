@@ -11,9 +11,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.scene.logs import LaneSegment, Log, Tracks, VectorMap
+from tflane_jax.scene.logs import LaneSegment, Log, PlacedMarkers, Tracks, VectorMap
 from tflane_jax.world.moving import moved_boxes, moved_map
-from tflane_jax.world.roads.road_map import RoadMap
+from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
+from tflane_jax.world.roads.road_map import RoadMap, drives_on_left
 
 _Y = np.array([1.0, -1.0, 1.0])
 _ACROSS = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -32,7 +33,7 @@ def mirrored(log: Log) -> Log:
     assert log.relief is None
     poses = _poses(log.global_from_ego)
     tracks, actors = moved_boxes(log, _tracks)
-    attribute, markers = log.element_attribute, log.markers
+    attribute = log.element_attribute
     return replace(
         log,
         map=mirrored_map(log.map),
@@ -41,7 +42,7 @@ def mirrored(log: Log) -> Log:
         actors=actors,
         keyframes=tuple(replace(moment, global_from_ego=_poses(moment.global_from_ego)) for moment in log.keyframes),
         element_attribute=None if attribute is None else _ATTRIBUTE[attribute],
-        markers=None if markers is None else replace(markers, pose=_ACROSS @ markers.pose @ _ALONG_BOARD),
+        markers=None if log.markers is None else _boards(log.markers),
     )
 
 
@@ -66,6 +67,27 @@ def mirrored_map(found: VectorMap) -> VectorMap:
         # Turned round, which is the same box: the left side of a building is its front.
         buildings=there.buildings * [1.0, -1.0, 1.0, 1.0, -1.0] + [0.0, 0.0, 0.0, 0.0, np.pi],
     )
+
+
+def markers_beside(
+    found: VectorMap, seed: int, config: PlacementConfig, visible: Visible | None = None
+) -> PlacedMarkers:
+    """Return the virtual markers of a recorded map, beside the lanes on the side on which traffic keeps.
+
+    See `place_markers`, which is for right-hand traffic.
+    """
+    if not drives_on_left(found):
+        return place_markers(found, seed, config, visible)
+
+    def seen(place: Float[np.ndarray, "3"], heading: float) -> float:
+        assert visible is not None
+        return visible(place * _Y, -heading)
+
+    return _boards(place_markers(mirrored_map(found), seed, config, None if visible is None else seen))
+
+
+def _boards(markers: PlacedMarkers) -> PlacedMarkers:
+    return replace(markers, pose=_ACROSS @ markers.pose @ _ALONG_BOARD)
 
 
 def _across(points: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, "_ 3"]:

@@ -77,6 +77,7 @@ def build_parser() -> argparse.ArgumentParser:
     models.train(commands)
     models.evaluate(commands)
     models.predict(commands)
+    models.submit(commands)
     models.convert(commands)
     models.export(commands)
     data.data(commands)

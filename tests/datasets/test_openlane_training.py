@@ -11,19 +11,25 @@ from tests.models.cases import CAMERA, CAMERA_TOPONET
 from tests.models.test_marker_fusion import CONFIG as MARKERS
 from tests.parameters import random_params
 from tflane_jax.cli import main
-from tflane_jax.config import OpenLaneV2Data
+from tflane_jax.config import OpenLaneV2Data, RunConfig
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import batches, count, first_example
 from tflane_jax.datasets.openlane_sd_map import read_sd_lines
+from tflane_jax.datasets.openlane_v2 import OpenLaneV2Dataset
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.centerlines import detections_from_prediction
 from tflane_jax.evaluation.predict import predictions
 from tflane_jax.markers.simulation import PERFECT, MarkerConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SdMapModuleConfig
+from tflane_jax.runs import open_run, train_run
 from tflane_jax.scene import stack_examples
+from tflane_jax.scoring.openlane_v2 import read_predictions
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.training.loop import TrainingConfig
+from tflane_jax.training.schedule import OptimConfig
 from tflane_jax.world.roads.sd_map import SdMapConfig
 
 SCENES, FRAMES, CLIP = 5, 4, 2
@@ -110,3 +116,32 @@ def test_a_missing_sd_map_is_named(data):
             TASK.shapes(data)
     finally:
         (data.root / "sdmap.json").rename(data.root / "train/00000/sdmap.json")
+
+
+def test_a_submission_holds_what_the_model_predicts(data, tmp_path, capsys):
+    """Boxes are in pixels of the files, which the model sees at another size."""
+    example = replace(EXAMPLE, lanes=64, elements=16, markers=None, sd_map=None)
+    model = replace(CAMERA_TOPONET, priors=PriorsConfig(), encoder=replace(CAMERA, bev=replace(CAMERA.bev, cameras=7)))
+    config = RunConfig(
+        task=LaneGraphTask(model),
+        data=replace(data, test="train", example=example, image=ImageConfig(divisor=16, scale=0.8)),
+        optim=OptimConfig(warmup_steps=0),
+        training=TrainingConfig(steps=1, batch_size=2, eval_every=1, checkpoint_every=1),
+    )
+    train_run(config, tmp_path / "run", progress=False)
+    submission = tmp_path / "submission.pkl"
+    assert main(["submit", str(tmp_path / "run"), "--out", str(submission), "--method", "one step"]) == 0
+    assert f"{SCENES * FRAMES} frames" in capsys.readouterr().out
+    run, source = open_run(tmp_path / "run"), config.data.source("test")
+    written, keys = read_predictions(submission), OpenLaneV2Dataset(source).keys
+    assert list(written) == keys
+    arrays = config.task.load(source, progress=False)
+    for indices, answers in predictions(config.task, run.params[0], arrays, 8):
+        for row, index in enumerate(indices):
+            answer = jax.tree.map(lambda leaf, i=row: leaf[i], answers)
+            wanted, found = detections_from_prediction(answer.centerlines, answer.elements), written[keys[index]]
+            np.testing.assert_allclose(np.array(found.points), wanted.points, rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-4)
+            np.testing.assert_allclose(found.successor, wanted.successor, atol=1e-4)
+            np.testing.assert_allclose(found.elements.boxes, wanted.elements.boxes / 0.8, rtol=1e-2, atol=0.1)
+            np.testing.assert_allclose(found.elements.lane, wanted.elements.lane, atol=1e-4)

@@ -180,6 +180,10 @@ class OpenLaneV2Dataset:
         """Return the segment of one frame; reads no file."""
         return self.keys[self._checked(index)].scene
 
+    def in_files(self, boxes: Float[np.ndarray, "e 2 2"]) -> Float[np.ndarray, "e 2 2"]:
+        """Return boxes of examples, of the front camera, in pixels of its files."""
+        return boxes if self._fits[0] is None else self._fits[0].in_file(boxes)
+
     def _time(self, index: int) -> int:
         return int(self.keys[index].timestamp) * SUBSETS[self.config.subset].tick_ns
 

@@ -82,6 +82,10 @@ class ImageFit:
         """
         return np.clip((boxes - (0.0, self.rows[0])) * self.scale, 0.0, self.size)
 
+    def in_file(self, boxes: Float[np.ndarray, "e 2 2"]) -> Float[np.ndarray, "e 2 2"]:
+        """Return boxes of the result in pixels of the file."""
+        return boxes / self.scale + (0.0, self.rows[0])
+
 
 def fit_image(width: int, height: int, config: ImageConfig, *, front: bool) -> ImageFit:
     """Return the cropping and scaling for a camera whose files have this size.

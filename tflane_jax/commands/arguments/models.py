@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arguments, model_arguments
+from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arguments, model_arguments, split_arguments
 
 _PREDICT = """Lane lines in photos and videos of any size:
   tflane predict RUN photo.jpg drive.mp4 folder/                     with a model trained by tflane
@@ -98,6 +98,22 @@ def predict(commands) -> None:
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("runs/predict"), help="folder to write (default runs/predict)"
     )
+
+
+def submit(commands) -> None:
+    """Add `tflane submit`."""
+    parser = command(
+        commands, "submit", "write OpenLane-V2's submission for a whole split", module="submit", function="run"
+    )
+    model_arguments(parser)
+    split_arguments(parser, "test")
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the submission, a pickle")
+    about = parser.add_argument_group("what the server asks for; not needed to score the file yourself")
+    about.add_argument("--method", default="", help="its name")
+    about.add_argument("--authors", nargs="+", default=[], metavar="NAME")
+    about.add_argument("--email", default="")
+    about.add_argument("--institution", default="", help="or company")
+    about.add_argument("--country", default="", help="or region, as in ISO 3166")
 
 
 def convert(commands) -> None:

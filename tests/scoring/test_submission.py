@@ -1,0 +1,93 @@
+"""A submission holds what was detected, at the official numbers of points, and its own reader takes it."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.datasets.view_images import ImageConfig, fit_image
+from tflane_jax.files.openlane import FrameKey
+from tflane_jax.files.plain_pickle import load_plain_pickle
+from tflane_jax.metrics.frames import ElementDetections, LaneDetections
+from tflane_jax.metrics.segment_matching import AreaDetections, SegmentDetections
+from tflane_jax.scoring.openlane_v2 import read_predictions, read_segment_predictions
+from tflane_jax.scoring.submission import Author, centerline_record, segment_record, write_submission
+
+KEY = FrameKey("test", "00007", "315966070559696000")
+
+
+def detections(lanes: int, points: int, elements: int | None = 3) -> LaneDetections:
+    rng = np.random.default_rng(lanes + points)
+    found = None
+    if elements is not None:
+        low = rng.uniform(0.0, 500.0, (elements, 1, 2))
+        boxes = np.concatenate([low, low + rng.uniform(5.0, 50.0, low.shape)], 1)
+        scores = rng.random(elements)
+        found = ElementDetections(boxes, rng.integers(0, 13, elements), scores, rng.random((lanes, elements)))
+    line = rng.normal(size=(lanes, points, 3)).cumsum(1) * 5.0
+    return LaneDetections(line, rng.random(lanes), rng.random((lanes, lanes)), found)
+
+
+def same_lanes(found: LaneDetections, wanted: LaneDetections) -> None:
+    np.testing.assert_allclose(np.array(found.points), wanted.points, rtol=1e-6)
+    np.testing.assert_allclose(found.scores, wanted.scores)
+    np.testing.assert_allclose(found.successor, wanted.successor, rtol=1e-6)
+    assert found.elements is not None
+    assert wanted.elements is not None
+    for name in ("boxes", "attributes", "scores", "lane"):
+        np.testing.assert_allclose(getattr(found.elements, name), getattr(wanted.elements, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("lanes", "elements"), [(5, 3), (1, 0), (0, 2)])
+def test_centerlines_come_back(tmp_path, lanes, elements):
+    wanted = detections(lanes, 11, elements)
+    path = write_submission(tmp_path / "submission.pkl", {KEY: centerline_record(wanted)}, Author())
+    (found,) = read_predictions(path).values()
+    if lanes:
+        same_lanes(found, wanted)
+    assert (len(found.points), len(found.elements.scores)) == (lanes, elements)
+
+
+def test_segments_come_back(tmp_path):
+    rng = np.random.default_rng(3)
+    areas = AreaDetections(rng.normal(size=(2, 20, 3)), np.array([1, 2]), rng.random(2))
+    left, right = rng.normal(size=(2, 4, 10, 3))
+    wanted = SegmentDetections(detections(4, 10), left, right, areas, np.array([0, 1, 2, 1]), np.array([2, 2, 0, 1]))
+    path = write_submission(tmp_path / "submission.pkl", {KEY: segment_record(wanted)}, Author())
+    (found,) = read_segment_predictions(path).values()
+    same_lanes(found.lanes, wanted.lanes)
+    for name in ("left", "right", "left_type", "right_type"):
+        np.testing.assert_allclose(np.array(getattr(found, name)), getattr(wanted, name), rtol=1e-6)
+    for name in ("points", "categories", "scores"):
+        np.testing.assert_allclose(np.array(getattr(found.areas, name)), getattr(areas, name), rtol=1e-6)
+
+
+def test_lines_get_the_official_number_of_points():
+    straight = np.linspace([0.0, 0.0, 0.0], [30.0, 0.0, 0.0], 4)[None]
+    found = LaneDetections(straight, np.ones(1), np.zeros((1, 1)))
+    (lane,) = centerline_record(found)["lane_centerline"]
+    np.testing.assert_allclose(lane["points"][:, 0], np.linspace(0.0, 30.0, 11), rtol=1e-6)
+    assert centerline_record(found)["topology_lcte"].shape == (1, 0)
+    areas = AreaDetections(straight, np.array([1]), np.ones(1))
+    record = segment_record(SegmentDetections(found, straight, straight, areas))
+    lines = ("centerline", "left_laneline", "right_laneline")
+    assert {len(record["lane_segment"][0][name]) for name in lines} == {10}
+    assert record["lane_segment"][0]["left_laneline_type"] == 0
+    assert len(record["area"][0]["points"]) == 20
+
+
+def test_the_file_has_what_the_server_asks_for(tmp_path):
+    author = Author("TF", ("A. B.", "C. D."), "a@b.c", "None", "NL")
+    record = centerline_record(detections(2, 11))
+    content = load_plain_pickle(write_submission(tmp_path / "s.pkl", {KEY: record}, author))
+    head = {"method": "TF", "authors": ["A. B.", "C. D."], "e-mail": "a@b.c"}
+    head |= {"institution / company": "None", "country / region": "NL"}
+    assert {name: content[name] for name in head} == head
+    assert list(content["results"]) == [("test", "00007", "315966070559696000")]
+    assert [e["category"] for e in record["traffic_element"]] == [
+        1 if e["attribute"] <= 3 else 2 for e in record["traffic_element"]
+    ]
+
+
+def test_boxes_go_back_to_pixels_of_the_file():
+    fit = fit_image(1550, 2048, ImageConfig(front_rows=(356, 1906), scale=0.5), front=True)
+    boxes = np.array([[[100.0, 600.0], [180.0, 700.0]]])
+    np.testing.assert_allclose(fit.in_file(fit.boxes(boxes)), boxes)

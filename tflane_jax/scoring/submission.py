@@ -1,0 +1,111 @@
+"""OpenLane-V2's submission: the file that its server and `tflane score` read, see `scoring.openlane_v2`."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tflane_jax.files.atomic import write_bytes
+from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FieldNames, FrameKey
+from tflane_jax.geometry.polylines import resample
+from tflane_jax.metrics.frames import ElementDetections, LaneDetections, Lines
+from tflane_jax.metrics.segment_matching import SegmentDetections
+from tflane_jax.scoring.openlane_v2 import AREA_POINTS, CENTERLINE_POINTS, LINE_POINTS
+
+# Attributes up to this one are states of traffic lights (category 1), the others kinds of signs (category 2).
+_LAST_STATE = 3
+
+
+@dataclass(frozen=True)
+class Author:
+    """What the server asks of a submission; it may all be empty for a file of one's own.
+
+    Attributes:
+        method: its name.
+        authors: their names.
+        email, institution: of them.
+        country: or region, as in ISO 3166.
+    """
+
+    method: str = ""
+    authors: tuple[str, ...] = ()
+    email: str = ""
+    institution: str = ""
+    country: str = ""
+
+
+def centerline_record(found: LaneDetections) -> dict[str, Any]:
+    """Return the predictions of a frame for the centerline task; lines get 11 points."""
+    return _record(found, CENTERLINE, CENTERLINE_POINTS, [{} for _ in found.points])
+
+
+def segment_record(found: SegmentDetections) -> dict[str, Any]:
+    """Return the predictions of a frame for the lane-segment task; lines get 10 points, areas 20.
+
+    Without predicted types, boundaries have the type 0, none.
+    """
+    sides = {"left": (found.left, found.left_type), "right": (found.right, found.right_type)}
+    further: list[dict[str, Any]] = [{} for _ in found.lanes.points]
+    for side, (lines, kinds) in sides.items():
+        for i, line in enumerate(_with_points(lines, LINE_POINTS)):
+            further[i] |= {f"{side}_laneline": line, f"{side}_laneline_type": 0 if kinds is None else int(kinds[i])}
+    areas = zip(_with_points(found.areas.points, AREA_POINTS), found.areas.categories, found.areas.scores, strict=True)
+    return _record(found.lanes, SEGMENT, LINE_POINTS, further) | {
+        "area": [
+            {"id": i, "points": points, "category": int(category), "confidence": float(score)}
+            for i, (points, category, score) in enumerate(areas)
+        ]
+    }
+
+
+def write_submission(path: Path, records: Mapping[FrameKey, Mapping[str, Any]], author: Author) -> Path:
+    """Write a submission: a pickle of plain containers, numbers and arrays.
+
+    Raises UserError if the file cannot be written.
+    """
+    content = {
+        "method": author.method,
+        "authors": list(author.authors),
+        "e-mail": author.email,
+        "institution / company": author.institution,
+        "country / region": author.country,
+        "results": {tuple(key): {"predictions": record} for key, record in records.items()},
+    }
+    return write_bytes(path, pickle.dumps(content, protocol=4))
+
+
+def _record(found: LaneDetections, names: FieldNames, count: int, further: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    lines = zip(_with_points(found.points, count), found.scores, further, strict=True)
+    none = ElementDetections(np.zeros((0, 2, 2)), np.zeros(0, int), np.zeros(0), np.zeros((len(found.scores), 0)))
+    elements = none if found.elements is None else found.elements
+    return {
+        names.lanes: [
+            {"id": i, names.line: line, "confidence": float(score)} | more
+            for i, (line, score, more) in enumerate(lines)
+        ],
+        "traffic_element": [
+            {
+                "id": i,
+                "category": 1 if attribute <= _LAST_STATE else 2,
+                "attribute": int(attribute),
+                "points": np.asarray(box, np.float32),
+                "confidence": float(score),
+            }
+            for i, (box, attribute, score) in enumerate(
+                zip(elements.boxes, elements.attributes, elements.scores, strict=True)
+            )
+        ],
+        names.lane_lane: np.asarray(found.successor, np.float32),
+        names.lane_element: np.asarray(elements.lane, np.float32),
+    }
+
+
+def _with_points(lines: Lines, count: int) -> list[Float[np.ndarray, "n 3"]]:
+    """Return lines with the official number of points."""
+    return [np.asarray(line if len(line) == count else resample(line, count), np.float32) for line in lines]

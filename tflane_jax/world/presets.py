@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from tflane_jax.scene import LineType
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.simulate import WorldConfig
 from tflane_jax.world.terrain import TerrainConfig
@@ -77,6 +78,11 @@ REAL_LIKE = replace(
         ),
         lane_width=(3.0, 4.2),
         single_lane_width=(3.2, 6.5),
+        # Recorded maps have few lines at kerbs and medians.
+        inner_marking=((LineType.SOLID, 0.4), (LineType.DASHED, 0.25), (LineType.NONE, 0.35)),
+        outer_marking=((LineType.NONE, 0.75), (LineType.SOLID, 0.2), (LineType.DASHED, 0.05)),
+        divider_marking=((LineType.DASHED, 0.85), (LineType.NONE, 0.1), (LineType.SOLID, 0.05)),
+        solid_before_stop=10.0,
         corner_radius=(3.5, 7.0),
         junction_distance=(60.0, 70.0),
         side_lean=3.0,
@@ -93,13 +99,15 @@ REAL_LIKE = replace(
     ),
     traffic=replace(
         CITY.traffic,
-        vehicles_per_metre=0.075,
+        vehicles_per_metre=0.08,
         pedestrians_per_metre=0.048,
         crossers_per_minute=5.0,
         # Examples are made near the junction, where the box still shows it.
         ego_top_speed=8.0,
         ego_passes_s=14.0,
     ),
+    # Recorded evidence is rendered in fine weather.
+    severity=0.3,
     longer_s=20.0,
     keyframe_spacing="distance",
     mirrored=0.5,

@@ -7,9 +7,14 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from tflane_jax.limits import ASCENDING, SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range, Rules
+from tflane_jax.scene import LineType
 
 CLOSEST_JUNCTIONS = 60.0
 """Two four-way intersections take up nearly this much of the street between them, metres."""
+
+
+Markings = Annotated[tuple[tuple[LineType, PositiveOrZero], ...], SOME_WEIGHT]
+"""Markings of lines with their relative frequencies."""
 
 
 class SceneKind(enum.Enum):
@@ -52,7 +57,10 @@ class RoadConfig:
         fast_bend_radius: arcs of roads with ramps and changing lane counts.
         corner_radius: kerb roundings of intersections.
         crossing_width: along the road.
-        solid_before_stop: length of the solid divider before a stop line.
+        inner_marking, outer_marking: markings of the leftmost and the rightmost line of a direction of travel, with
+            their relative frequencies over streets.
+        divider_marking: the same of the lines between lanes of one direction.
+        solid_before_stop: length of the solid divider before a stop line, where dividers are painted.
         taper: length over which a lane opens or closes.
         fast_taper: the same on fast roads.
         pocket: length of a turning lane, taper included.
@@ -114,6 +122,9 @@ class RoadConfig:
     fast_bend_radius: Range = (180.0, 600.0)
     corner_radius: Range = (4.5, 9.0)
     crossing_width: Range = (2.6, 4.2)
+    inner_marking: Markings = ((LineType.SOLID, 1.0),)
+    outer_marking: Markings = ((LineType.SOLID, 1.0),)
+    divider_marking: Markings = ((LineType.DASHED, 1.0),)
     solid_before_stop: PositiveOrZero = 25.0
     taper: Range = (18.0, 26.0)
     fast_taper: Range = (30.0, 45.0)

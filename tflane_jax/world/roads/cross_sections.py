@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.scene import LineType
 from tflane_jax.world.roads.curves import smoothstep
 
 # Stations nearer than this are the same, metres: far below any spacing, far above rounding errors.
@@ -65,6 +66,7 @@ class SidePlan:
         pockets: turning lanes before the junction at which the side ends.
         pocket_length, taper: of the turning lanes, metres.
         opens: lanes that fork off and run on to the end: where, and how far behind the start they begin, metres.
+        inner_marking, outer_marking, divider_marking: of the leftmost line, the rightmost one, and those between lanes.
         closes: lanes that come from the start and merge: where, and how far before the end they are gone, metres.
     """
 
@@ -80,6 +82,9 @@ class SidePlan:
     taper: float = 22.0
     opens: tuple[tuple[Place, float], ...] = ()
     closes: tuple[tuple[Place, float], ...] = ()
+    inner_marking: LineType = LineType.SOLID
+    outer_marking: LineType = LineType.SOLID
+    divider_marking: LineType = LineType.DASHED
 
     @property
     def outer(self) -> float:

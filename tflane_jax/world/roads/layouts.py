@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.world.roads.config import Range, RoadConfig
+from tflane_jax.scene import LineType
+from tflane_jax.world.roads.config import Markings, Range, RoadConfig
 from tflane_jax.world.roads.cross_sections import Place, SidePlan
 from tflane_jax.world.roads.curves import direction, right_of
 from tflane_jax.world.roads.intersections import Arm
@@ -113,6 +114,14 @@ def chance(rng: np.random.Generator, probability: float) -> bool:
     return bool(rng.random() < probability)
 
 
+def draw_marking(rng: np.random.Generator, markings: Markings) -> LineType:
+    """Return one of some markings; of a single one, nothing is drawn."""
+    if len(markings) == 1:
+        return markings[0][0]
+    weight = np.array([weight for _, weight in markings])
+    return markings[int(rng.choice(len(weight), p=weight / weight.sum()))][0]
+
+
 def draw_style(
     rng: np.random.Generator,
     config: RoadConfig,
@@ -139,6 +148,8 @@ def draw_style(
     bike = draw(rng, config.bike_width) if chance(rng, strips * config.bike) else 0.0
     parking = draw(rng, config.parking_width)
     parked = [chance(rng, strips * config.parking) for _ in range(2)]
+    markings = (draw_marking(rng, m) for m in (config.inner_marking, config.outer_marking, config.divider_marking))
+    inner_marking, outer_marking, divider_marking = markings
     sides = [
         SidePlan(
             lanes=n,
@@ -147,6 +158,9 @@ def draw_style(
             bike=bike if n else 0.0,
             parking=parking if n and p else 0.0,
             gutter=gutter,
+            inner_marking=inner_marking,
+            outer_marking=outer_marking,
+            divider_marking=divider_marking,
         )
         for n, p in zip(lanes, parked, strict=True)
     ]

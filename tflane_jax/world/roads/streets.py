@@ -174,8 +174,8 @@ def _build_side(
         order = sorted(present, key=lambda i: _rank(i, columns[i].extra))
         row = {}
         for place, i in enumerate(order):
-            left_type = _divider(columns, order, place - 1, middle, solid)
-            right_type = _divider(columns, order, place, middle, solid)
+            left_type = _marking(plan, columns, order, place - 1, middle, solid)
+            right_type = _marking(plan, columns, order, place, middle, solid)
             row[i] = network.add(
                 Draft(
                     columns[i].left[a : b + 1],
@@ -232,15 +232,21 @@ def _pocket(extra: ExtraLane | None) -> int:
     return 1 if extra.place is Place.RIGHT else -1
 
 
-def _divider(columns: Sequence[_Column], order: Sequence[int], place: int, middle: float, solid: float) -> LineType:
+def _marking(
+    plan: SidePlan, columns: Sequence[_Column], order: Sequence[int], place: int, middle: float, solid: float
+) -> LineType:
     """Return the marking between the columns at `place` and `place + 1` of a section."""
-    if place < 0 or place + 1 >= len(order):
-        return LineType.SOLID
+    if place < 0:
+        return plan.inner_marking
+    if place + 1 >= len(order):
+        return plan.outer_marking
     for i in order[place : place + 2]:
         extra = columns[i].extra
         if extra and (middle < extra.start + extra.forks or middle > extra.stop - extra.merges):
             return LineType.NONE  # the two lanes overlap along the taper
-    return LineType.SOLID if middle > solid else LineType.DASHED
+    if plan.divider_marking is LineType.NONE:
+        return LineType.NONE
+    return LineType.SOLID if middle > solid else plan.divider_marking
 
 
 def _connect_sections(

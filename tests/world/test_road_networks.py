@@ -11,7 +11,7 @@ import pytest
 from tests.world.road_networks import CONFIG, WIDE, case_networks, changing_network, network, turn_between
 from tflane_jax.geometry.polylines import arc_length
 from tflane_jax.scene import LineType
-from tflane_jax.world.roads.networks import RoadNetwork, SceneKind, build_road_network
+from tflane_jax.world.roads.networks import RoadConfig, RoadNetwork, SceneKind, build_road_network
 
 
 def test_successors_exist_and_start_where_their_predecessor_ends():
@@ -88,6 +88,40 @@ def test_markings():
             on_ring = net.kind is SceneKind.ROUNDABOUT and segment.left_type == LineType.SOLID
             if segment.is_intersection and not on_ring:
                 assert kinds == {LineType.NONE}
+
+
+@pytest.mark.parametrize("kind", [SceneKind.ROAD, SceneKind.FOUR_WAY, SceneKind.ON_RAMP])
+def test_streets_without_paint(kind):
+    """Lanes of vehicles have no marking, bicycles keep their lines; geometry is that of the same streets with paint."""
+    none = ((LineType.NONE, 1.0),)
+    unpainted = {"inner_marking": none, "outer_marking": none, "divider_marking": none}
+    configs = (RoadConfig(kinds=((kind, 1.0),), bike=1.0, **markings) for markings in ({}, unpainted))
+    painted, bare = (build_road_network(np.random.default_rng(3), config).map.segments for config in configs)
+    assert painted.keys() == bare.keys()
+    for one, other in zip(painted.values(), bare.values(), strict=True):
+        assert one.centerline.tobytes() == other.centerline.tobytes()
+        types = LineType.NONE if other.vehicle or other.is_intersection else LineType.SOLID
+        assert (other.left_type, other.right_type) == (types, types)
+    assert any(s.left_type != LineType.NONE for s in painted.values() if s.vehicle)
+
+
+def test_markings_are_drawn_for_each_street():
+    """One street in four has no line at the kerb, the others have a solid one; lines between lanes are dashed."""
+    config = RoadConfig(
+        kinds=((SceneKind.ROAD, 1.0),), outer_marking=((LineType.NONE, 1.0), (LineType.SOLID, 3.0)), bike=0.0
+    )
+    bare = 0
+    for seed in range(40):
+        segments = build_road_network(np.random.default_rng([9, seed]), config).map.segments
+        outer = {s.right_type for s in segments.values() if not any(_beside(s, other) for other in segments.values())}
+        assert outer in ({LineType.NONE}, {LineType.SOLID})
+        bare += outer == {LineType.NONE}
+    assert 4 <= bare <= 18
+
+
+def _beside(lane, other) -> bool:
+    """Whether a lane's right line is the left line of another."""
+    return other is not lane and np.array_equal(lane.right, other.left)
 
 
 def test_neighbours_agree_on_the_line_between_them():

@@ -129,8 +129,16 @@ def _plan_ramp(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) ->
 
 
 def ramp_side(road: StreetStyle) -> SidePlan:
-    """Return the cross-section of a ramp beside a road: one lane as wide as the road's, its left line on the axis."""
-    return SidePlan(lanes=1, lane_width=road.forward.lane_width, gutter=road.forward.gutter)
+    """Return the cross-section of a ramp beside a road: one lane as wide as the road's, painted alike, its left
+    line on the axis."""
+    side = road.forward
+    return SidePlan(
+        lanes=1,
+        lane_width=side.lane_width,
+        gutter=side.gutter,
+        inner_marking=side.inner_marking,
+        outer_marking=side.outer_marking,
+    )
 
 
 def _through(

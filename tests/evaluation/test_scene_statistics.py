@@ -11,7 +11,7 @@ from tflane_jax.evaluation.scene_statistics import (
     lane_quantities,
     pooled,
 )
-from tflane_jax.scene import Areas, AreaType, LaneGraph
+from tflane_jax.scene import Areas, AreaType, LaneGraph, LineType
 
 
 def example():
@@ -21,6 +21,7 @@ def example():
     angle = np.linspace(0.0, np.pi / 2, 21)
     lanes.points[1, :, :2] = np.stack([40.0 + 20.0 * np.sin(angle), 20.0 - 20.0 * np.cos(angle)], -1)
     lanes.left[0], lanes.right[0] = lanes.points[0] + [0.0, 1.5, 0.0], lanes.points[0] - [0.0, 2.0, 0.0]
+    lanes.left_type[0], lanes.left_type[1] = LineType.DASHED, LineType.SOLID
     lanes.points[2:], lanes.left[2:] = np.nan, np.nan
     lanes.visibility[:] = [0.75, 0.25, np.nan, np.nan]
     lanes.is_connector[:] = [False, True, True, True]
@@ -38,6 +39,7 @@ def test_lanes_are_measured_and_padding_is_not():
     np.testing.assert_allclose(found["length, m"], [40.0, 20.0 * np.pi / 2], rtol=1e-3)
     # A connector has no width that counts.
     np.testing.assert_allclose(found["width, m"], [3.5], rtol=1e-6)
+    np.testing.assert_allclose(found["painted sides"], [0.5])
     # The first and the last chord of the arc point half a step off its ends.
     np.testing.assert_allclose(found["turn, degrees"], [0.0, 90.0 * 19 / 20], rtol=1e-3)
     np.testing.assert_allclose(found["curvature, 1/100 m"], [0.0, 5.0], rtol=1e-2)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.scene import AreaType, Example, LaneGraph
+from tflane_jax.scene import AreaType, Example, LaneGraph, LineType
 
 FRAME_QUANTITIES = (
     "lanes",
@@ -27,9 +27,12 @@ Lanes beside the vehicle go its way, or against it, up to 45 degrees aside, wher
 The vehicle is on a connector (1, else 0) if that is the nearest lane. Oblique are pieces of lanes at 15 to 75 degrees
 from the vehicle's axis.
 """
-LANE_QUANTITIES = ("length, m", "width, m", "turn, degrees", "curvature, 1/100 m", "visible share")
-"""One value for each lane; the curvature is the largest along the lane. Widths: of lanes that are no connectors, if
-their boundaries are known."""
+LANE_QUANTITIES = ("length, m", "width, m", "painted sides", "turn, degrees", "curvature, 1/100 m", "visible share")
+"""One value for each lane; the curvature is the largest along the lane.
+
+Widths, and which fraction of the two sides has a marking: of lanes that are no connectors, if their boundaries are
+known.
+"""
 
 _ALONG, _OBLIQUE = np.cos(np.radians(45.0)), np.cos(np.radians((15.0, 75.0)))
 
@@ -55,16 +58,19 @@ def lane_quantities(example: Example) -> dict[str, Float[np.ndarray, " n"]]:
     """Return `LANE_QUANTITIES` of the lanes of one example."""
     lanes, valid = example.lanes, np.asarray(example.lanes.valid)
     points = np.asarray(lanes.points, float)[valid][..., :2]
-    sides = (np.asarray(side, float)[valid & ~np.asarray(lanes.is_connector)] for side in (lanes.left, lanes.right))
+    between = valid & ~np.asarray(lanes.is_connector)
+    sides = (np.asarray(side, float)[between] for side in (lanes.left, lanes.right))
     width = np.linalg.norm(np.subtract(*sides), axis=-1).mean(-1)
+    types = np.stack([np.asarray(side)[between] for side in (lanes.left_type, lanes.right_type)])
     step = np.diff(points, axis=1)
     metres = np.linalg.norm(step, axis=-1)
     turn = np.diff(np.unwrap(np.arctan2(step[..., 1], step[..., 0])), axis=1)
-    between = 0.5 * (metres[:, 1:] + metres[:, :-1])
-    curvature = np.abs(turn) / np.maximum(between, 1e-6)
+    step_length = 0.5 * (metres[:, 1:] + metres[:, :-1])
+    curvature = np.abs(turn) / np.maximum(step_length, 1e-6)
     return {
         "length, m": metres.sum(-1),
         "width, m": width[width > 0.0],
+        "painted sides": (types != LineType.NONE).mean(0)[width > 0.0],
         "turn, degrees": np.degrees(np.abs(turn.sum(-1))),
         "curvature, 1/100 m": 100.0 * curvature.max(-1, initial=0.0),
         "visible share": np.asarray(lanes.visibility, float)[valid],

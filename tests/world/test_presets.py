@@ -89,7 +89,7 @@ RECORDED = {
     "- oncoming": 2.15,
     "length, m": 27.9,
     "width, m": 4.14,
-    "painted sides": 0.6,
+    "painted sides": 0.57,
     "turn, degrees": 27.7,
     "visible share": 0.615,
 }

@@ -19,6 +19,7 @@ from tflane_jax.progress import progress_bar
 from tflane_jax.scene import Prediction
 from tflane_jax.scoring.submission import Author, centerline_record, segment_record, write_submission
 from tflane_jax.startup import showing, stage
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 
 
@@ -35,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
     if not isinstance(source, OpenLaneV2Config):
         raise UserError("only frames of OpenLane-V2 can be submitted: add --root and the dataset's folder")
     dataset, task = OpenLaneV2Dataset(source), trained.config.task
+    assert isinstance(task, LaneGraphTask)  # only it sees such frames
     if not {"centerlines", "segments"} & set(task.model.predicts):
         raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
     records = {}
@@ -60,7 +62,8 @@ def _record(dataset: OpenLaneV2Dataset, answer: Prediction) -> dict[str, Any]:
     """Return the predictions of a frame; a model of both kinds of lanes submits its segments."""
     elements = answer.elements
     if elements is not None:
-        elements = elements.replace(box=dataset.in_files(np.asarray(elements.box)))
+        boxes = dataset.in_files(np.asarray(elements.box))
+        elements = elements.replace(box=boxes)  # pyright: ignore[reportAttributeAccessIssue]
     if answer.segments is not None:
         return segment_record(detections_of_segments(answer.segments, elements))
     assert answer.centerlines is not None

@@ -88,12 +88,12 @@ def _around_the_vehicle(lanes: LaneGraph) -> dict[str, float]:
     # The nearest point of every piece: none where there are no lanes.
     along = np.clip(-(start * step).sum(-1) / np.maximum(metres, 1e-6) ** 2, 0.0, 1.0)
     distance = np.linalg.norm(start + along[..., None] * step, axis=-1).min(-1, initial=np.inf)
-    nearest = distance.argmin() if len(distance) else None
+    on_connector = len(distance) > 0 and bool(np.asarray(lanes.is_connector)[lanes.valid][distance.argmin()])
     oblique = (np.abs(ahead) > _OBLIQUE[1]) & (np.abs(ahead) < _OBLIQUE[0])
     return {
         "lanes beside the vehicle": (passes & (ahead > _ALONG)).any(-1).sum(),
         "- oncoming": (passes & (ahead < -_ALONG)).any(-1).sum(),
-        "vehicle on a connector": nearest is not None and np.asarray(lanes.is_connector)[lanes.valid][nearest],
+        "vehicle on a connector": float(on_connector),
         "oblique fraction of lane length": (metres * oblique).sum() / max(metres.sum(), 1e-6),
     }
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from tflane_jax.scene.logs import VectorMap
 from tflane_jax.world.traffic.simulation import Traffic
@@ -65,5 +65,5 @@ def on_connector(roads: VectorMap, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndar
         return np.zeros(len(xy), bool)
     vertices = np.concatenate([lane.centerline[:, :2] for lane in lanes])
     inside = np.repeat([lane.is_intersection for lane in lanes], [len(lane.centerline) for lane in lanes])
-    distance, nearest = cKDTree(vertices).query(xy)
+    distance, nearest = KDTree(vertices).query(xy)
     return inside[nearest] & (distance < _NEAR)

@@ -165,8 +165,8 @@ def simulate(
     amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
     if place is None:
         network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
-        streams = (_stream(scene_id, stream) for stream in (Stream.TRAFFIC, Stream.EXCERPT))
-        traffic = _traffic(*streams, network, amounts, config, history)
+        stream, cut = (_stream(scene_id, one) for one in (Stream.TRAFFIC, Stream.EXCERPT))
+        traffic = _traffic(stream, cut, network, amounts, config, history)
         eligible = np.arange(history, frames)
     else:
         network, traffic, eligible = _drive_on(place, scene_id, config, amounts, history)
@@ -247,10 +247,10 @@ def _drive_on(
             sees=place.sees,
             leads_s=passes + EGO_JOINS,
         )
-        streams = (
-            np.random.default_rng([ROOT, scene_id, stream, attempt]) for stream in (Stream.TRAFFIC, Stream.EXCERPT)
+        stream, cut = (
+            np.random.default_rng([ROOT, scene_id, one, attempt]) for one in (Stream.TRAFFIC, Stream.EXCERPT)
         )
-        traffic = _traffic(*streams, network, amounts, config, history)
+        traffic = _traffic(stream, cut, network, amounts, config, history)
         assert network.drive is not None
         complete = history + np.flatnonzero(network.drive.covers(traffic.ego[history:, :2]))
         if len(complete) >= needed:

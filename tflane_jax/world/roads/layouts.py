@@ -141,8 +141,8 @@ def draw_style(
         median: range of the raised median, None without one.
         strips: factor on the probabilities of bike lanes and parking strips.
     """
-    narrow = config.single_lane_width is None or max(lanes) > 1
-    lane_width = draw(rng, config.lane_width if narrow else config.single_lane_width)
+    single = config.single_lane_width if max(lanes) == 1 else None
+    lane_width = draw(rng, config.lane_width if single is None else single)
     gutter = draw(rng, config.gutter)
     width = draw(rng, median) if median and min(lanes) > 0 else 0.0
     bike = draw(rng, config.bike_width) if chance(rng, strips * config.bike) else 0.0

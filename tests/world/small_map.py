@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tests.datasets.small_logs import lane_map, segment
+from tflane_jax.world.presets import REAL_MAPS
 from tflane_jax.world.roads.road_map import RoadMap
 
 ARM, HALF, NEAR = 150.0, 1.75, 12.0
 # Arms in the order east, north, west, south: the direction from the middle outwards.
 OUT = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]], float)
+# A short scene on a recorded map, seen as it is.
+ON_MAP = replace(
+    REAL_MAPS,
+    traffic=replace(REAL_MAPS.traffic, ego_passes_s=3.0, early_s=30.0, variety=0.0),
+    duration_s=5.0,
+    keyframes=2,
+    mirrored=0.0,
+)
 
 
 def right_of(direction):

@@ -7,13 +7,13 @@ import pytest
 
 from tests.shared import shared_path
 from tests.world.lane_following import fractions_on_lanes
-from tests.world.small_map import crossroads
+from tests.world.small_map import ON_MAP, crossroads
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.world.cameras.paint import YELLOW, paint_of
 from tflane_jax.world.mirror import markers_beside, mirrored, mirrored_map, mirrored_road_map
-from tflane_jax.world.presets import REAL_LIKE, REAL_MAPS
+from tflane_jax.world.presets import REAL_LIKE
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.roads.road_map import drives_on_left
 from tflane_jax.world.roads.sd_map import SdMapConfig
@@ -21,13 +21,6 @@ from tflane_jax.world.simulate import Place, WorldConfig, simulate
 
 SCENE = 4
 WORLD = WorldConfig(duration_s=4.0, keyframes=2, markers=PlacementConfig(side="both"))
-ON_MAP = replace(
-    REAL_MAPS,
-    traffic=replace(REAL_MAPS.traffic, ego_passes_s=3.0, early_s=30.0, variety=0.0),
-    duration_s=5.0,
-    keyframes=2,
-    mirrored=0.0,
-)
 
 
 def assert_equal(a, b):

@@ -8,13 +8,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.world.lane_following import fractions_on_lanes
-from tests.world.small_map import crossroads
+from tests.world.small_map import ON_MAP, crossroads
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import transform_points
 from tflane_jax.limits import check_settings
-from tflane_jax.world.presets import REAL_MAPS
 from tflane_jax.world.roads.markers import PlacementConfig
 from tflane_jax.world.simulate import Place, Stream, WorldConfig, _stream, simulate
 from tflane_jax.world.warp import Warp, WarpConfig, warped
@@ -125,14 +124,7 @@ def test_scenes_are_bent_in_their_own_way_and_repeat(scenes):
 
 def test_a_recorded_map_is_bent():
     """Its lanes and vehicles move together, and the map's own places are asked for more room."""
-    world = replace(
-        REAL_MAPS,
-        traffic=replace(REAL_MAPS.traffic, ego_passes_s=3.0, early_s=30.0, variety=0.0),
-        duration_s=5.0,
-        keyframes=2,
-        mirrored=0.0,
-        warp=WarpConfig(),
-    )
+    world = replace(ON_MAP, warp=WarpConfig())
     log = simulate(3, world, place=Place(crossroads(), 40.0))
     found = fractions_on_lanes(log)
     assert len(found) >= 2

@@ -97,8 +97,7 @@ RECORDED = {
 
 @pytest.mark.slow
 def test_frames_of_real_like_hold_as_much_as_recorded_ones():
-    data = WorldData.real_like(train=40).source("train")
-    dataset = ProceduralDataset(replace(data, world=replace(data.world, keyframes=2)))
+    dataset = ProceduralDataset(WorldData.real_like(train=60).source("train"))
     examples = [dataset.example(i) for i in range(len(dataset))]
     found = pooled([frame_quantities(e) | lane_quantities(e) for e in examples])
     for quantity, recorded in RECORDED.items():

@@ -66,8 +66,8 @@ class SidePlan:
         pockets: turning lanes before the junction at which the side ends.
         pocket_length, taper: of the turning lanes, metres.
         opens: lanes that fork off and run on to the end: where, and how far behind the start they begin, metres.
-        inner_marking, outer_marking, divider_marking: of the leftmost line, the rightmost one, and those between lanes.
         closes: lanes that come from the start and merge: where, and how far before the end they are gone, metres.
+        inner_marking, outer_marking, divider_marking: of the leftmost line, the rightmost one, and those between lanes.
     """
 
     lanes: int

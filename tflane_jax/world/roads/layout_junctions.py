@@ -250,7 +250,7 @@ def _allowed(rng: np.random.Generator, lanes: int, config: RoadConfig) -> int:
 
 def _or_another(rng: np.random.Generator, lanes: int, config: RoadConfig) -> int:
     # Nothing is drawn for presets without it, whose roads stay what they were.
-    return lanes + (config.another_lane > 0.0 and chance(rng, config.another_lane))
+    return lanes + int(config.another_lane > 0.0 and chance(rng, config.another_lane))
 
 
 def _draw_main(rng: np.random.Generator, lanes: int, config: RoadConfig) -> StreetStyle:

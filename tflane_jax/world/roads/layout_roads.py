@@ -129,8 +129,7 @@ def _plan_ramp(rng: np.random.Generator, kind: SceneKind, config: RoadConfig) ->
 
 
 def ramp_side(road: StreetStyle) -> SidePlan:
-    """Return the cross-section of a ramp beside a road: one lane as wide as the road's, painted alike, its left
-    line on the axis."""
+    """Return the cross-section of a ramp: one lane, as wide and painted as the road's, its left line on the axis."""
     side = road.forward
     return SidePlan(
         lanes=1,

@@ -30,6 +30,10 @@ def example():
     areas = Areas.empty(4, 3)
     areas.category[:] = [AreaType.PEDESTRIAN_CROSSING, AreaType.ROAD_BOUNDARY, AreaType.ROAD_BOUNDARY, 1]
     areas.valid[:3] = True
+    areas.points[0, :, :2], areas.points[3] = [[0.0, -2.0], [20.0, -2.0], [40.0, -2.0]], np.nan
+    # Road boundaries, the first one less than a metre beside the unpainted right side of the first lane.
+    areas.points[1, :, :2] = [[-10.0, -2.9], [20.0, -2.9], [50.0, -2.9]]
+    areas.points[2, :, :2] = [[-10.0, 9.0], [20.0, 9.0], [50.0, 9.0]]
     return FakeDataset(FakeConfig(1)).example(0).replace(lanes=lanes, areas=areas)
 
 
@@ -40,10 +44,31 @@ def test_lanes_are_measured_and_padding_is_not():
     # A connector has no width that counts.
     np.testing.assert_allclose(found["width, m"], [3.5], rtol=1e-6)
     np.testing.assert_allclose(found["painted sides"], [0.5])
+    np.testing.assert_array_equal(found["unpainted sides at the road's edge"], [1.0])
     # The first and the last chord of the arc point half a step off its ends.
     np.testing.assert_allclose(found["turn, degrees"], [0.0, 90.0 * 19 / 20], rtol=1e-3)
     np.testing.assert_allclose(found["curvature, 1/100 m"], [0.0, 5.0], rtol=1e-2)
     np.testing.assert_array_equal(found["visible share"], [0.75, 0.25])
+
+
+@pytest.mark.parametrize(
+    ("beside", "expected"), [(-2.9, [1.0]), (-1.1, [1.0]), (-3.1, [0.0]), (1.5, [0.0]), (None, [])]
+)
+def test_unpainted_sides_at_the_edge_of_the_road(beside, expected):
+    """The right side of the first lane, at y = -2, has no paint; the painted left side does not count."""
+    frame = example()
+    if beside is None:
+        frame.areas.category[:] = AreaType.PEDESTRIAN_CROSSING
+    else:
+        frame.areas.points[1, :, 1] = beside
+    found = lane_quantities(frame)
+    np.testing.assert_array_equal(found["unpainted sides at the road's edge"], expected)
+
+
+def test_a_lane_that_a_corner_of_the_box_cuts_to_millimetres_has_no_curvature():
+    frame = example()
+    frame.lanes.points[1, :, :2] = [40.0, 0.0] + 1e-4 * frame.lanes.points[1, :, :2]
+    assert len(lane_quantities(frame)["curvature, 1/100 m"]) == 1
 
 
 def test_frames_are_counted():

@@ -1,4 +1,4 @@
-"""Five-leg and staggered junctions, turns onto any lane, and driveways."""
+"""Five-leg and staggered junctions, turns onto any lane, driveways and car parks."""
 
 from __future__ import annotations
 
@@ -218,6 +218,46 @@ def test_no_driveway_one_and_more_than_fit(density):
         assert all(shapely.LineString(line[:, :2]).is_simple for line in net.map.road_boundaries)
 
 
+def box_of(place, length=5.0, width=2.0):
+    x, y, yaw = place
+    box = shapely.box(x - length / 2, y - width / 2, x + length / 2, y + width / 2)
+    return shapely.affinity.rotate(box, yaw, (x, y), use_radians=True)
+
+
+@pytest.mark.parametrize("kind", [SceneKind.ROAD, SceneKind.T_JUNCTION, SceneKind.FIVE_LEGS, SceneKind.ROUNDABOUT])
+@pytest.mark.parametrize("driveways", [0.0, 3.0])
+def test_car_parks_stand_off_the_road(kind, driveways):
+    """Roads are as without; places are clear of roads, driveways, sidewalks, houses and one another."""
+    vehicles = 0
+    for plain, other in zip(
+        networks(kind, 4, driveways=driveways), networks(kind, 4, driveways=driveways, car_parks=2.0), strict=True
+    ):
+        assert [b.tobytes() for b in plain.map.road_boundaries] == [b.tobytes() for b in other.map.road_boundaries]
+        assert [s.centerline.tobytes() for s in plain.map.segments.values()] == [
+            s.centerline.tobytes() for s in other.map.segments.values()
+        ]
+        assert other.parking[: len(plain.parking)].tolist() == plain.parking.tolist()
+        boxes = [box_of(place) for place in other.parking[len(plain.parking) :]]
+        houses = [box_of((x, y, yaw), length, width) for x, y, length, width, yaw in other.map.buildings]
+        used = [drivable(other), *houses, *(shapely.LineString(walk) for walk in other.sidewalks)]
+        assert all(box.distance(thing) > 0.5 for box in boxes for thing in used)
+        assert all(a.distance(b) > 0.3 for i, a in enumerate(boxes) for b in boxes[:i])
+        vehicles += len(boxes)
+    assert vehicles > 40
+
+
+def test_no_car_parks_on_fast_roads():
+    for net in networks(SceneKind.EXIT_RAMP, 3, car_parks=5.0):
+        assert not len(net.parking)
+
+
+@pytest.mark.parametrize("density", [0.001, 50.0])
+def test_few_car_parks_and_more_than_fit(density):
+    for net in networks(SceneKind.STAGGERED, 2, car_parks=density, parking=0.0):
+        boxes = [box_of(place) for place in net.parking]
+        assert all(a.distance(b) > 0.3 for i, a in enumerate(boxes) for b in boxes[:i])
+
+
 def test_least_lanes_of_main_roads():
     for kind in (SceneKind.FIVE_LEGS, SceneKind.T_JUNCTION, SceneKind.TWO_JUNCTIONS):
         for net in networks(kind, 3, least_junction_lanes=2, bike=0.0, one_way=0.0):
@@ -233,6 +273,7 @@ def test_least_lanes_of_main_roads():
         ({"junction_distance": (40.0, 80.0)}, "junction_distance"),
         ({"wide_turns": 1.5}, "wide_turns"),
         ({"driveways": -1.0}, "driveways"),
+        ({"car_parks": -1.0}, "car_parks"),
         ({"stagger": (30.0, 20.0)}, "stagger"),
     ],
 )

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 
 from tests.world.road_networks import CONFIG, WIDE, case_networks, changing_network, network, turn_between
 from tflane_jax.geometry.polylines import arc_length
@@ -117,6 +118,29 @@ def test_markings_are_drawn_for_each_street():
         assert outer in ({LineType.NONE}, {LineType.SOLID})
         bare += outer == {LineType.NONE}
     assert 4 <= bare <= 18
+
+
+@pytest.mark.parametrize(
+    ("kind", "parking"),
+    [(SceneKind.ROAD, 0.0), (SceneKind.ROAD, 1.0), (SceneKind.FOUR_WAY, 0.0), (SceneKind.EXIT_RAMP, 0.0)],
+)
+def test_lines_at_kerbs_and_medians_have_their_own_marking(kind, parking):
+    """Sides of lanes at the road's edge are unpainted; all others have their lines, but for tapers."""
+    at_edge, painted = [], []
+    for seed in range(6):
+        unpainted = ((LineType.NONE, 1.0),)
+        config = RoadConfig(
+            kinds=((kind, 1.0),), kerb_marking=unpainted, bike=0.0, parking=parking, gutter=(0.1, 0.2), median=1.0
+        )
+        found = build_road_network(np.random.default_rng([4, seed]), config).map
+        edges = shapely.union_all([shapely.LineString(line[:, :2]) for line in found.road_boundaries])
+        for lane in (s for s in found.segments.values() if not s.is_intersection):
+            for side, marking in ((lane.left, lane.left_type), (lane.right, lane.right_type)):
+                at_edge.append(np.median(shapely.distance(shapely.points(side[:, :2]), edges)) < 0.5)
+                painted.append(marking != LineType.NONE)
+    assert not np.any(np.array(at_edge) & painted)
+    assert np.mean(np.array(painted)[~np.array(at_edge)]) > (0.999 if kind is SceneKind.ROAD else 0.8)
+    assert np.sum(at_edge) > 6
 
 
 def _beside(lane, other) -> bool:

@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
-from tflane_jax.scene import AreaType, Example, LaneGraph, LineType
+from tflane_jax.geometry.polylines import resample_lines
+from tflane_jax.scene import Areas, AreaType, Example, LaneGraph, LineType
 
 FRAME_QUANTITIES = (
     "lanes",
@@ -27,14 +29,27 @@ Lanes beside the vehicle go its way, or against it, up to 45 degrees aside, wher
 The vehicle is on a connector (1, else 0) if that is the nearest lane. Oblique are pieces of lanes at 15 to 75 degrees
 from the vehicle's axis.
 """
-LANE_QUANTITIES = ("length, m", "width, m", "painted sides", "turn, degrees", "curvature, 1/100 m", "visible share")
-"""One value for each lane; the curvature is the largest along the lane.
+LANE_QUANTITIES = (
+    "length, m",
+    "width, m",
+    "painted sides",
+    "unpainted sides at the road's edge",
+    "turn, degrees",
+    "curvature, 1/100 m",
+    "visible share",
+)
+"""One value for each lane; the curvature is the largest along the lane, of lanes of a metre and more.
 
 Widths, and which fraction of the two sides has a marking: of lanes that are no connectors, if their boundaries are
-known.
+known. Unpainted sides of these, in frames with road boundaries: 1 where half of the points or more are within 1 m of
+one, else 0.
 """
 
 _ALONG, _OBLIQUE = np.cos(np.radians(45.0)), np.cos(np.radians((15.0, 75.0)))
+# Metres: a side nearer than this to a road boundary lies at it; the curvature of a shorter lane is rounding alone.
+_AT_EDGE, _SHORTEST = 1.0, 1.0
+# Half a metre apart on a road boundary along the whole of the largest box.
+_EDGE_SAMPLES = 401
 
 
 def frame_quantities(example: Example) -> dict[str, Float[np.ndarray, " 1"]]:
@@ -59,22 +74,34 @@ def lane_quantities(example: Example) -> dict[str, Float[np.ndarray, " n"]]:
     lanes, valid = example.lanes, np.asarray(example.lanes.valid)
     points = np.asarray(lanes.points, float)[valid][..., :2]
     between = valid & ~np.asarray(lanes.is_connector)
-    sides = (np.asarray(side, float)[between] for side in (lanes.left, lanes.right))
-    width = np.linalg.norm(np.subtract(*sides), axis=-1).mean(-1)
+    sides = np.stack([np.asarray(side, float)[between] for side in (lanes.left, lanes.right)])
+    width = np.linalg.norm(sides[0] - sides[1], axis=-1).mean(-1)
     types = np.stack([np.asarray(side)[between] for side in (lanes.left_type, lanes.right_type)])
     step = np.diff(points, axis=1)
     metres = np.linalg.norm(step, axis=-1)
     turn = np.diff(np.unwrap(np.arctan2(step[..., 1], step[..., 0])), axis=1)
     step_length = 0.5 * (metres[:, 1:] + metres[:, :-1])
     curvature = np.abs(turn) / np.maximum(step_length, 1e-6)
+    length, bare = metres.sum(-1), (types == LineType.NONE) & (width > 0.0)
     return {
-        "length, m": metres.sum(-1),
+        "length, m": length,
         "width, m": width[width > 0.0],
         "painted sides": (types != LineType.NONE).mean(0)[width > 0.0],
+        "unpainted sides at the road's edge": _at_edge(sides[bare], example.areas),
         "turn, degrees": np.degrees(np.abs(turn.sum(-1))),
-        "curvature, 1/100 m": 100.0 * curvature.max(-1, initial=0.0),
+        "curvature, 1/100 m": 100.0 * curvature.max(-1, initial=0.0)[length >= _SHORTEST],
         "visible share": np.asarray(lanes.visibility, float)[valid],
     }
+
+
+def _at_edge(sides: Float[np.ndarray, "n p d"], areas: Areas) -> Float[np.ndarray, " m"]:
+    """Return for each side whether it lies at a road boundary (1, else 0); nothing in a frame without boundaries."""
+    known = np.asarray(areas.valid) & (np.asarray(areas.category) == AreaType.ROAD_BOUNDARY)
+    if not known.any():
+        return np.zeros(0)
+    edges = resample_lines(list(np.asarray(areas.points, float)[known]), _EDGE_SAMPLES)[..., :2]
+    distance = np.asarray(KDTree(edges.reshape(-1, 2)).query(sides[..., :2])[0])
+    return (np.median(distance, axis=-1) < _AT_EDGE).astype(float)
 
 
 def _around_the_vehicle(lanes: LaneGraph) -> dict[str, float]:

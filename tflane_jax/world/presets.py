@@ -78,10 +78,11 @@ REAL_LIKE = replace(
         ),
         lane_width=(3.0, 4.2),
         single_lane_width=(3.2, 6.5),
-        # Recorded maps have few lines at kerbs and medians.
-        inner_marking=((LineType.SOLID, 0.4), (LineType.DASHED, 0.25), (LineType.NONE, 0.35)),
-        outer_marking=((LineType.NONE, 0.75), (LineType.SOLID, 0.2), (LineType.DASHED, 0.05)),
-        divider_marking=((LineType.DASHED, 0.85), (LineType.NONE, 0.1), (LineType.SOLID, 0.05)),
+        # Recorded maps have no lines at kerbs and medians, and nearly all others.
+        kerb_marking=((LineType.NONE, 0.96), (LineType.SOLID, 0.04)),
+        inner_marking=((LineType.SOLID, 0.6), (LineType.DASHED, 0.34), (LineType.NONE, 0.06)),
+        outer_marking=((LineType.SOLID, 0.6), (LineType.DASHED, 0.25), (LineType.NONE, 0.15)),
+        divider_marking=((LineType.DASHED, 0.85), (LineType.NONE, 0.07), (LineType.SOLID, 0.08)),
         solid_before_stop=10.0,
         corner_radius=(3.5, 7.0),
         junction_distance=(60.0, 70.0),
@@ -94,7 +95,10 @@ REAL_LIKE = replace(
         driveways=2.0,
         one_way=0.12,
         median=0.5,
-        bike=0.25,
+        bike=0.12,
+        parking=0.1,
+        gutter=(0.0, 0.25),
+        car_parks=0.9,
         crossings=0.3,
     ),
     traffic=replace(

@@ -60,6 +60,8 @@ class RoadConfig:
         inner_marking, outer_marking: markings of the leftmost and the rightmost line of a direction of travel, with
             their relative frequencies over streets.
         divider_marking: the same of the lines between lanes of one direction.
+        kerb_marking: instead of the first two, of lines with a kerb or a raised median beside them, not a bike lane, a
+            parking strip or oncoming traffic; None: no difference.
         solid_before_stop: length of the solid divider before a stop line, where dividers are painted.
         taper: length over which a lane opens or closes.
         fast_taper: the same on fast roads.
@@ -87,6 +89,7 @@ class RoadConfig:
         crossings: probability for an arm of an intersection.
         driveways: mean number on 100 m of kerb, where there is room for them.
         driveway_width, driveway_depth: of a driveway; the depth is counted from the kerb.
+        car_parks: mean number of rows of parked vehicles behind the sidewalk on 100 m of kerb, where there is room.
         turn_restriction: probability that an arm must not turn left.
         sidewalk: distance of the walking line behind the kerb.
         building_setback: distance of buildings behind the kerb.
@@ -125,6 +128,7 @@ class RoadConfig:
     inner_marking: Markings = ((LineType.SOLID, 1.0),)
     outer_marking: Markings = ((LineType.SOLID, 1.0),)
     divider_marking: Markings = ((LineType.DASHED, 1.0),)
+    kerb_marking: Markings | None = None
     solid_before_stop: PositiveOrZero = 25.0
     taper: Range = (18.0, 26.0)
     fast_taper: Range = (30.0, 45.0)
@@ -151,6 +155,7 @@ class RoadConfig:
     driveways: PositiveOrZero = 0.0
     driveway_width: Range = (3.0, 6.0)
     driveway_depth: Range = (8.5, 12.0)
+    car_parks: PositiveOrZero = 0.0
     turn_restriction: Fraction = 0.12
     sidewalk: PositiveOrZero = 1.8
     building_setback: Range = (4.0, 10.0)

@@ -150,6 +150,8 @@ def draw_style(
     parked = [chance(rng, strips * config.parking) for _ in range(2)]
     markings = (draw_marking(rng, m) for m in (config.inner_marking, config.outer_marking, config.divider_marking))
     inner_marking, outer_marking, divider_marking = markings
+    kerb_marking = None if config.kerb_marking is None else draw_marking(rng, config.kerb_marking)
+    inner_kerb = width > 0.0 or min(lanes) == 0
     sides = [
         SidePlan(
             lanes=n,
@@ -158,8 +160,8 @@ def draw_style(
             bike=bike if n else 0.0,
             parking=parking if n and p else 0.0,
             gutter=gutter,
-            inner_marking=inner_marking,
-            outer_marking=outer_marking,
+            inner_marking=inner_marking if kerb_marking is None or not inner_kerb else kerb_marking,
+            outer_marking=outer_marking if kerb_marking is None or bike or p else kerb_marking,
             divider_marking=divider_marking,
         )
         for n, p in zip(lanes, parked, strict=True)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads import roadside
+from tflane_jax.world.roads.car_parks import draw_car_parks
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
 from tflane_jax.world.roads.driveways import draw_driveways, interrupted, parking_beside
 from tflane_jax.world.roads.intersections import crossing_walk
@@ -70,7 +71,7 @@ class RoadNetwork:
         signal_phase: connector -> (intersection index, phase index); absent where there are no signals.
         sidewalks: (n, 2) lines on which pedestrians walk, metres.
         walk_across: (2, 2) start and end of the walk over each pedestrian crossing, behind the kerbs.
-        parking: (P, 3) x, y, yaw of places for parked vehicles: kerb-side slots and driveways.
+        parking: (P, 3) x, y, yaw of places for parked vehicles: at the kerb, in driveways and in car parks.
         ego_routes: sequences of segment ids that the ego vehicle may drive, each at least 120 m long; its perception
             range (+-51.2 m x +-25.6 m) stays inside the map all along.
         kind: the central feature; None on a recorded map.
@@ -111,6 +112,8 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         site = lay_out_road(plan_road(rng, kind, config), network, config)
     if config.driveways and site.urban:
         site.driveways = draw_driveways(rng, site, _stop_lines(network), config)
+    if config.car_parks and site.urban:
+        site.car_parks = draw_car_parks(rng, site, config)
     density = rng.uniform(0.55, 0.95) if site.urban else rng.uniform(0.0, 0.3)
     boxes = roadside.buildings(rng, site, config.building_setback, density)
     return RoadNetwork(
@@ -127,7 +130,7 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         signal_phase=dict(network.signal_phase),
         sidewalks=tuple(roadside.sidewalks(site.kerbs, config.sidewalk)) if site.urban else (),
         walk_across=tuple(crossing_walk(ring, config.sidewalk) for ring in site.crossings),
-        parking=parking_beside(roadside.parking_slots(site), site.driveways),
+        parking=np.concatenate([parking_beside(roadside.parking_slots(site), site.driveways), site.car_parks]),
         ego_routes=network.routes(_SHORTEST_ROUTE),
         kind=kind,
     )

@@ -52,7 +52,7 @@ def _side_slots(side: Side, site: Site) -> Float[np.ndarray, "p 3"]:
 
 
 def buildings(rng: np.random.Generator, site: Site, setback: Range, density: float) -> Float[np.ndarray, "b 5"]:
-    """Return x, y, length, width and yaw of buildings along the kerbs, clear of every road and driveway.
+    """Return x, y, length, width and yaw of buildings along the kerbs, clear of roads, driveways and car parks.
 
     Args:
         rng: stream.
@@ -62,6 +62,7 @@ def buildings(rng: np.random.Generator, site: Site, setback: Range, density: flo
     """
     used = [s.forward.line.xy[::2] for s in site.streets]
     used += [points_at(one.edge, np.arange(0.0, arc_length(one.edge)[-1], 2.0)) for one in site.driveways]
+    used.append(site.car_parks[:, :2])
     return buildings_along(rng, site.kerbs, used, setback, density)
 
 

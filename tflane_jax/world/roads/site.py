@@ -40,6 +40,7 @@ class Site:
         crossings: closed rings of pedestrian crossings.
         elements: traffic lights and signs.
         driveways: gaps in the kerbs that lead to a plot.
+        car_parks: (p, 3) x, y, yaw of places in rows on the plots.
         urban: pedestrians walk behind the kerbs, and buildings are close to the road.
     """
 
@@ -49,4 +50,5 @@ class Site:
     crossings: list[Float[np.ndarray, "5 2"]] = field(default_factory=list)
     elements: list[MapElement] = field(default_factory=list)
     driveways: list[Driveway] = field(default_factory=list)
+    car_parks: Float[np.ndarray, "p 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     urban: bool = True

@@ -10,6 +10,7 @@ from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.cli import main
 from tflane_jax.metrics import MapDetections, MapTruth
 from tflane_jax.metrics.map_matching import CLASSES, LINE_CLASSES
+from tflane_jax.scoring.maptr import read_predictions, write_predictions
 
 
 def vectors(lines, scores=None):
@@ -113,3 +114,28 @@ def test_damaged_results_are_named_to_the_sample(tmp_path, samples, capsys, dama
     assert run(tmp_path)[0] == 2
     said = capsys.readouterr().err
     assert re.search(message, said), said
+
+
+def test_written_predictions_are_read_back(tmp_path):
+    rng, path = np.random.default_rng(0), tmp_path / "nuscmap_results.json"
+    frames = {
+        f"token-{n}": MapDetections(rng.normal(size=(n, 20, 2)) * 20, rng.integers(0, 4, n), rng.uniform(size=n))
+        for n in (0, 1, 5)
+    }
+    write_predictions(path, frames.items())
+    found = read_predictions(path)
+    assert list(found) == list(frames)
+    for token, wanted in frames.items():
+        np.testing.assert_array_equal(np.reshape(found[token].points, wanted.points.shape), wanted.points)
+        np.testing.assert_array_equal(found[token].classes, wanted.classes)
+        np.testing.assert_array_equal(found[token].scores, wanted.scores)
+
+
+def test_predictions_that_end_early_leave_no_file(tmp_path):
+    def frames():
+        yield "token", MapDetections([], np.zeros(0, int), np.zeros(0))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_predictions(tmp_path / "nuscmap_results.json", frames())
+    assert not list(tmp_path.iterdir())

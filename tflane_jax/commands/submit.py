@@ -1,22 +1,28 @@
-"""`tflane submit`: the predictions for all frames of an OpenLane-V2 split, as its server takes them."""
+"""`tflane submit`: the predictions for all frames of a split in the file of the dataset's own evaluation."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import numpy as np
 
 from tflane_jax.commands.sources import chosen_source, opened
+from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesDataset
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.centerlines import detections_from_prediction
 from tflane_jax.evaluation.lane_segments import detections_of_segments
 from tflane_jax.evaluation.predict import predicted_batches
+from tflane_jax.evaluation.vector_maps import detections_of_lines
 from tflane_jax.files.atomic import check_writable
+from tflane_jax.metrics.map_matching import MapDetections
 from tflane_jax.progress import progress_bar
+from tflane_jax.runs import Run
 from tflane_jax.scene import Prediction
+from tflane_jax.scoring import maptr
 from tflane_jax.scoring.submission import Author, centerline_record, segment_record, write_submission
 from tflane_jax.startup import showing, stage
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -30,32 +36,57 @@ def run(options: argparse.Namespace) -> int:
     trained, rest = opened(options)
     if rest:
         raise UserError(f"tflane submit takes one run: leave {rest[0]} out")
+    task = trained.config.task
+    predicts = set(task.model.predicts) if isinstance(task, LaneGraphTask) else set()
     if options.data is None and options.root is not None:
-        options.data = "openlane-v2"
+        options.data = "nuscenes" if "lines" in predicts else "openlane-v2"
     source = chosen_source(trained.config, options)
-    if not isinstance(source, OpenLaneV2Config):
-        raise UserError("only frames of OpenLane-V2 can be submitted: add --root and the dataset's folder")
-    dataset, task = OpenLaneV2Dataset(source), trained.config.task
+    if isinstance(source, OpenLaneV2Config):
+        if not {"centerlines", "segments"} & predicts:
+            raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
+        dataset = OpenLaneV2Dataset(source)
+        found = {dataset.keys[i]: _record(dataset, answer) for i, answer in _answers(trained, source, len(dataset))}
+        author = Author(options.method, tuple(options.authors), options.email, options.institution, options.country)
+        write_submission(options.out, found, author)
+    elif isinstance(source, NuScenesConfig):
+        if "lines" not in predicts:
+            raise UserError("MapTR's file for nuScenes holds lines of a vector map, and this model predicts none")
+        dataset = NuScenesDataset(source)
+        maptr.write_predictions(options.out, _map_frames(dataset, _answers(trained, source, len(dataset))))
+    else:
+        raise UserError(
+            "frames of OpenLane-V2 and nuScenes alone can be submitted: add --root and the dataset's folder"
+        )
+    print(f"{len(dataset)} frames of {dataset.name} written to {options.out}")
+    return 0
+
+
+def _answers(trained: Run, source: OpenLaneV2Config | NuScenesConfig, frames: int) -> Iterator[tuple[int, Prediction]]:
+    """Yield number and prediction of every frame, in order."""
+    task = trained.config.task
     assert isinstance(task, LaneGraphTask)  # only it sees such frames
-    if not {"centerlines", "segments"} & set(task.model.predicts):
-        raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
-    records = {}
     with showing(True):
         with stage("reading the data"):
             arrays = task.load(source, progress=True)
         batches = predicted_batches(
             task, trained.params[0], arrays, trained.config.evaluation.batch_size, lambda batch: None
         )
-        with progress_bar(desc="predict", unit="frame", total=len(dataset)) as bar:
+        with progress_bar(desc="predict", unit="frame", total=frames) as bar:
             for indices, _, answers in batches:
                 for row, index in enumerate(indices):
-                    answer = jax.tree.map(lambda leaf, i=row: leaf[i], answers)
-                    records[dataset.keys[index]] = _record(dataset, answer)
+                    yield int(index), jax.tree.map(lambda leaf, i=row: leaf[i], answers)
                 bar.update(len(indices))
-    author = Author(options.method, tuple(options.authors), options.email, options.institution, options.country)
-    write_submission(options.out, records, author)
-    print(f"{len(records)} frames of {dataset.name} written to {options.out}")
-    return 0
+
+
+def _map_frames(
+    dataset: NuScenesDataset, answers: Iterator[tuple[int, Prediction]]
+) -> Iterator[tuple[str, MapDetections]]:
+    """Yield sample tokens with the lines in MapTR's axes."""
+    for index, answer in answers:
+        assert answer.lines is not None
+        found = detections_of_lines(answer.lines)
+        points = dataset.in_lidar_axes(index, np.asarray(found.points, float))
+        yield dataset.token(index), MapDetections(points, found.classes, found.scores)
 
 
 def _record(dataset: OpenLaneV2Dataset, answer: Prediction) -> dict[str, Any]:

@@ -9,26 +9,26 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
-from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
+from tflane_jax.datasets.data_source import Choice, DataSource
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.nuscenes_cameras import (
     CAMERAS,
     CameraPoses,
     CanBus,
     camera_fits,
-    missing_images,
     sample_cameras,
     vehicle_state,
 )
+from tflane_jax.datasets.nuscenes_check import check_nuscenes
 from tflane_jax.datasets.nuscenes_depth import with_depth
 from tflane_jax.datasets.nuscenes_log import (
     ReferenceFrame,
@@ -36,21 +36,20 @@ from tflane_jax.datasets.nuscenes_log import (
     Visibility,
     scene_frames,
     scene_log,
-    scene_tracks,
 )
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
 from tflane_jax.datasets.nuscenes_scenes import NUSCENES_SIZES
 from tflane_jax.datasets.nuscenes_splits import split_scenes
-from tflane_jax.datasets.nuscenes_tables import Tables, find_tables, read_tables
+from tflane_jax.datasets.nuscenes_tables import find_tables, read_tables
 from tflane_jax.datasets.openlane_example import camera_views
 from tflane_jax.datasets.openlane_frames import FrameCamera
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
-from tflane_jax.datasets.plausible import FAR, check_place
 from tflane_jax.datasets.prepared_map import prepare_map
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import TOPONET_SUBSET_B, ImageConfig, ImageFit
 from tflane_jax.errors import UserError
+from tflane_jax.geometry import relative_pose, transform_points
 from tflane_jax.limits import Count, Rules
 from tflane_jax.scene import CameraViews, Example
 from tflane_jax.scene.logs import Log
@@ -167,6 +166,24 @@ class NuScenesDataset:
         time, pose = int(frames.timestamps_ns[number]), frames.global_from_frame[number]
         return FrameInfo("nuscenes", name, time, pose, self.tables.location(self.scenes[name]))
 
+    def token(self, index: int) -> str:
+        """Return the sample token of one key frame."""
+        name, number = self._place(index)
+        return self.frames(name).samples[number]["token"]
+
+    def in_lidar_axes(self, index: int, points: Float[np.ndarray, "*b d"]) -> Float[np.ndarray, "*b d"]:
+        """Return points (x, y or x, y, z) of an example as MapTR's files have them: level, around the lidar, x right.
+
+        Heights stay those above the ground.
+        """
+        name, number = self._place(index)
+        here, scene = self.frames(name).global_from_frame[number], self.scenes[name]
+        lidar = scene_frames(self.tables, scene, "lidar").global_from_frame[number]
+        lidar_from_here = relative_pose(lidar, here)
+        plane = lidar_from_here[np.ix_([0, 1, 3], [0, 1, 3])]
+        x, y = np.moveaxis(transform_points(plane, points[..., :2]), -1, 0)
+        return np.concatenate([np.stack([-y, x], -1), points[..., 2:]], -1)
+
     def log(self, name: str) -> Log:
         """Return a scene as a log with the part of the city's map around it."""
         with self._lock:
@@ -174,7 +191,7 @@ class NuScenesDataset:
                 frames = self._scene_frames(name)
                 location, scene = self.tables.location(self.scenes[name]), self.scenes[name]
                 if location not in self._maps:
-                    self._maps[location] = read_expansion(map_path(self.tables, location))
+                    self._maps[location] = read_expansion(self.tables.map_path(location))
                 area = self._maps[location].around(frames.global_from_frame[:, :2, 3], _reach(self.config.example))
                 log = scene_log(self.tables, scene, frames, area, least_visibility=self.config.least_visibility)
                 prepare_map(log.map, bike_lanes=self.config.example.bike_lanes == "include")
@@ -200,11 +217,6 @@ class NuScenesDataset:
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} examples, no number {index}")
         return self._places[index]
-
-
-def map_path(tables: Tables, location: str) -> Path:
-    """Return the map expansion's file of a city."""
-    return tables.root / "maps" / "expansion" / f"{location}.json"
 
 
 def _reach(config: ExampleConfig) -> float:
@@ -249,60 +261,6 @@ class NuScenesData:
         own = {"split": getattr(self, split), "depth_cell": self.depth_cell if split == "train" else None}
         shared = {field.name: getattr(self, field.name) for field in fields(NuScenesConfig) if field.name not in own}
         return NuScenesConfig(**shared, **own)
-
-
-def check_nuscenes(root: Path) -> FolderCheck:
-    """Read every table, every scene and the map of every city; images are only looked for.
-
-    Raises UserError where there are no tables or they cannot be joined.
-    """
-    tables = read_tables(find_tables(root))
-    faults: list[str] = []
-    maps: dict[str, MapExpansion | None] = {}
-    counts: dict[str, Counter[str]] = {}
-    for name, scene in sorted(tables.scenes().items()):
-        location = tables.location(scene)
-        if location not in maps:
-            maps[location] = _checked_map(map_path(tables, location), faults)
-        count = counts.setdefault(location, Counter())
-        count["scenes"] += 1
-        try:
-            frames = scene_frames(tables, scene)
-            tracks = scene_tracks(tables, frames)
-            _check_scene_place(maps[location], frames, f"{name} on the map of {location}")
-        except UserError as error:
-            faults.append(f"{name}: {error}")
-            continue
-        absent = missing_images(tables, frames.samples)
-        if absent:
-            faults.append(f"{name}: {len(absent)} images are missing (first {absent[0]})")
-        count.update({"key frames": tracks.frames, "road users": len(tracks.uuid)})
-        count.update({"boxes": int(tracks.valid.sum()), "missing images": len(absent)})
-    rows = [_row(location, counts[location], maps[location]) for location in counts]
-    return FolderCheck(f"nuScenes, {tables.folder.name}", rows, faults)
-
-
-def _checked_map(path: Path, faults: list[str]) -> MapExpansion | None:
-    try:
-        return read_expansion(path)
-    except UserError as error:
-        faults.append(str(error))
-        return None
-
-
-def _check_scene_place(expansion: MapExpansion | None, frames: SceneFrames, where: str) -> None:
-    if expansion is not None:
-        path = frames.global_from_frame[:, :2, 3]
-        check_place([lane.centerline for lane in expansion.lanes_near(path, FAR).values()], path, where)
-
-
-def _row(location: str, count: Counter[str], expansion: MapExpansion | None) -> dict[str, int | str]:
-    names = ("scenes", "key frames", "road users", "boxes", "missing images")
-    found: dict[str, int | str] = {"location": location, **{name: count[name] for name in names}}
-    if expansion is None:
-        return found | dict.fromkeys(("lanes", "without arcline", "dividers", "crossings"), 0)
-    found |= {"lanes": len(expansion.lanes), "without arcline": len(expansion.without_line)}
-    return found | {"dividers": len(expansion.dividers), "crossings": len(expansion.crossings)}
 
 
 def _choose(choice: Choice) -> NuScenesConfig:

@@ -112,6 +112,10 @@ class Tables:
             found[row["name"]] = row
         return found
 
+    def map_path(self, location: str) -> Path:
+        """Return the map expansion's file of a city."""
+        return self.root / "maps" / "expansion" / f"{location}.json"
+
     def location(self, scene: Row) -> str:
         """Return the place where a scene was recorded, which names its map."""
         return self.rows["log"][scene["log_token"]]["location"]

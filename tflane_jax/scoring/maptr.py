@@ -7,18 +7,23 @@ variant for Argoverse 2. For groups by occlusion, the truth has a field of ours,
 
 from __future__ import annotations
 
+import json
 import reprlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import replacing
 from tflane_jax.files.fields import items, load_file, member, numbers, scores
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
 _FARTHEST = 1e5
+# What the official files say about the inputs; the evaluation does not read it.
+_META = {"use_lidar": False, "use_camera": True, "use_radar": False, "use_map": False, "use_external": True}
 
 
 def read_predictions(path: Path, dims: Dims = 2) -> dict[str, MapDetections]:
@@ -46,6 +51,29 @@ def read_truth(path: Path, dims: Dims = 2) -> dict[str, MapTruth]:
         token: MapTruth(*_lines(vectors, where, 2, dims), visibility=_visibility(vectors, where))
         for token, vectors, where in _samples(path, "GTs")
     }
+
+
+def write_predictions(path: Path, frames: Iterable[tuple[str, MapDetections]]) -> Path:
+    """Write `nuscmap_results.json`, frame by frame: sample tokens with their lines in the lidar's axes.
+
+    Raises UserError if the file cannot be written.
+    """
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(f'{{"meta": {json.dumps(_META)}, "results": [')
+        for number, (token, found) in enumerate(frames):
+            vectors = [
+                {
+                    "pts": np.asarray(points, float).tolist(),
+                    "pts_num": len(points),
+                    "cls_name": LINE_CLASSES[kind],
+                    "type": int(kind),
+                    "confidence_level": float(score),
+                }
+                for points, kind, score in zip(found.points, found.classes, found.scores, strict=True)
+            ]
+            file.write(("," if number else "") + "\n" + json.dumps({"sample_token": token, "vectors": vectors}))
+        file.write("]}\n")
+    return path
 
 
 def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.files.atomic import write_bytes
+from tflane_jax.files.atomic import replacing
 from tflane_jax.files.openlane import CENTERLINE, SEGMENT, FieldNames, FrameKey
 from tflane_jax.geometry.polylines import resample
 from tflane_jax.metrics.frames import ElementDetections, LaneDetections, Lines
@@ -77,7 +77,9 @@ def write_submission(path: Path, records: Mapping[FrameKey, Mapping[str, Any]], 
         "country / region": author.country,
         "results": {tuple(key): {"predictions": record} for key, record in records.items()},
     }
-    return write_bytes(path, pickle.dumps(content, protocol=4))
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        pickle.dump(content, file, protocol=4)
+    return path
 
 
 def _record(found: LaneDetections, names: FieldNames, count: int, further: Sequence[dict[str, Any]]) -> dict[str, Any]:

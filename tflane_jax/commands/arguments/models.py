@@ -103,12 +103,18 @@ def predict(commands) -> None:
 def submit(commands) -> None:
     """Add `tflane submit`."""
     parser = command(
-        commands, "submit", "write OpenLane-V2's submission for a whole split", module="submit", function="run"
+        commands,
+        "submit",
+        "write OpenLane-V2's submission for a whole split, or MapTR's file for nuScenes",
+        module="submit",
+        function="run",
     )
     model_arguments(parser)
     split_arguments(parser, "test")
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="the submission, a pickle")
-    about = parser.add_argument_group("what the server asks for; not needed to score the file yourself")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, required=True, help="a pickle, or MapTR's nuscmap_results.json"
+    )
+    about = parser.add_argument_group("what OpenLane-V2's server asks for; not needed to score the file yourself")
     about.add_argument("--method", default="", help="its name")
     about.add_argument("--authors", nargs="+", default=[], metavar="NAME")
     about.add_argument("--email", default="")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -199,6 +200,32 @@ def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
         assert tmp_path / "runs" in [*(tmp_path / "runs" / "x").parents]
         assert next(host for host in hosts if str(host) == start)
         assert json.loads((type(tmp_path)(start) / "config.json").read_text())["training"]["seeds"] == seeds
+
+
+def test_no_row_starts_from_a_host_that_failed(tiny, tmp_path, monkeypatch, capsys):
+    host = TableRow("host", f"{tiny}:baseline", ("--optim.lr", "0.1"))
+    rows = (host, TableRow("base", f"{tiny}:baseline", start="host"), TableRow("alone", f"{tiny}:baseline"))
+    table = small(tiny, rows=rows, claims=(Claim("base", "alone"),), hosts=(host,))
+    train_run, trained = workers.train_run, []
+
+    def interrupted(config, folder, **options):
+        result = train_run(config, folder, **options)
+        trained.append(config.optim.lr)
+        if config.optim.lr == 0.1 and config.training.seeds == (0,):
+            shutil.rmtree(folder / "checkpoints" / "step_00000004")  # one of an earlier step is left
+            raise UserError("the disk is full")
+        return result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "train_run", interrupted)
+        with pytest.raises(UserError, match="2 of 6 trainings failed") as failed:
+            run_table(table, range(2), tmp_path)
+    assert len(trained) == 5
+    assert "host, seed 0, the run that it starts from, is not complete" in str(failed.value)
+    table_rows = json.loads((tmp_path / "paper.9" / "table.json").read_text())["rows"]
+    counts = {row["model"]: row["seeds"] for row in table_rows if row["checkpoint"] == "last"}
+    assert counts == {"host": 1, "base": 1, "alone": 2}
+    run_table(table, range(2), tmp_path)  # the same command goes on
 
 
 def test_a_table_with_more_steps_has_another_name_and_slower_schedules():

@@ -132,6 +132,13 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert [(line[1], line[3]) for line in lines] == [("a", "last"), ("b", "last"), ("b", "best")]
     assert "Best checkpoints that score as the last are left out.\n" in written
     assert "1 seed, 1 updates a run" in written
+    assert "Interim" not in written  # of a table of another version, whose seeds are not known
+    assert "\ntflane tables x --seeds 1 --jobs 2 --cores 1\n" in written
+    two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
+    (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two | {"findings": [], "quoted": {"rows": []}}))
+    written = page(tmp_path)
+    assert "**Interim**: 2 of 5 declared seeds." in written
+    assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
 
 
 def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
@@ -263,9 +270,21 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
         (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),
         (["tf_lane.1", "--jobs", "0"], "at least one training"),
         (["tf_lane.1", "--cores", "0"], "--cores 0: at least one"),
+        (["tf_lane.1", "--quick", "--record", "docs"], "--quick runs are no results and never recorded"),
+        (["gtn_lane.1", "--search", "--seeds", "3"], "--search trains other runs than the table's"),
+        (["--quick"], "--quick is about a table: name one"),
+        (["--record", "nowhere"], "--record nowhere is no folder of results"),
     ):
         assert main(["tables", *arguments]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_the_page_is_written_anew_without_a_table(tmp_path, capsys):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    assert main(["tables", "--record", str(folder)]) == 0
+    assert (tmp_path / "results.md").read_text() == page(folder)
+    assert f"written: {tmp_path / 'results.md'}" in capsys.readouterr().out
 
 
 def test_runs_that_tables_share_cost_once():

@@ -170,6 +170,8 @@ def test_fewer_logs_are_an_interim_look(folder, capsys):
     for name in names:
         assert "**Interim**: 1 of 2 declared logs (scene-3)." in (out / name).read_text()
     assert "3 runs, 3 complete" in capsys.readouterr().out
+    tests = json.loads((out / "effects.json").read_text())["rows"]
+    assert {test["verdict"] for test in tests} == {"not tested"}
     carry_over(settings(folder), out)
     assert [(out / name).read_bytes() for name in names] == before
 

@@ -328,9 +328,9 @@ def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[s
             | {"std": test.std, "logs better": f"{test.better} of {test.seeds}", "p": test.p_value}
         )
     for row, corrected in zip(rows, holm(chances), strict=True):
-        decided = corrected < declaration.alpha  # False for NaN, a single log
-        verdict = ("shown" if row["difference"] > 0.0 else "contradicted") if decided else "not shown"
-        row |= {"p (Holm)": corrected, "verdict": verdict}
+        decided = "shown" if row["difference"] > 0.0 else "contradicted"
+        other = "not tested" if np.isnan(corrected) else "not shown"  # NaN: a single log
+        row |= {"p (Holm)": corrected, "verdict": decided if corrected < declaration.alpha else other}
     return rows
 
 

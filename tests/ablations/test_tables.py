@@ -259,6 +259,9 @@ def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch, capsys):
     with pytest.raises(UserError, match="smoke test and no result"):
         record([path.with_name("summary.json")], tmp_path / "results")
     assert not (tmp_path / "results").exists()
+    # So another declaration may follow: a smoke test is for tables that change.
+    run_table(replace(small(tiny), alpha=0.01), range(2), tmp_path, quick=True)
+    assert "level 0.01" in (path.parent / "effects.md").read_text()
 
 
 def test_the_command_lists_tables_and_names_mistakes(capsys):

@@ -22,7 +22,8 @@ folder, scenes = Path({folder!r}), 2
 settings = "--task.model.decoder.layers 1 --task.model.encoder.levels 32"
 
 
-def train_run(config, folder):
+def train_run(config, folder, start):
+    assert start == "new"
     save_weights(config, random_params(config.task.init, config.task.shapes(config.data)), folder)
 """,
     "masking": """
@@ -73,6 +74,24 @@ def test_functions_that_notebooks_call_exist_and_take_their_arguments(notebook):
         function = eval(ast.unparse(call.func), imported)
         if inspect.isfunction(function):
             inspect.signature(function).bind_partial(**{each.arg: None for each in call.keywords if each.arg})
+
+
+def test_trainings_of_notebooks_go_on_after_a_stop_and_refuse_other_settings(notebook, tmp_path):
+    """A run that is taken because its folder exists may be a part of one, or one with other settings."""
+    started = []
+    for cell in notebook[1].cells:
+        for node in ast.walk(ast.parse(cell.source if cell.cell_type == "code" else "")):
+            if isinstance(node, ast.For) and "train_run" in names(node):
+                runs = {name: name for name in ("begun", "fresh")}
+                given = {"folder": tmp_path, "runs": runs, "settings": "", "load_config": str, "reference": ""}
+                given["apply_overrides"] = lambda config, _: config
+                given["train_run"] = lambda config, run, start: started.append((run.name, start))
+                (tmp_path / "begun").mkdir()
+                (tmp_path / "begun" / "config.json").touch()
+                training = [part for part in node.body if not names(part) & {"records", "open_run"}]
+                node.iter, node.body = ast.parse("list(runs.items())").body[0].value, training
+                exec(compile(ast.fix_missing_locations(ast.Module([node], [])), "cell", "exec"), given)
+    assert started == [("begun", "resume"), ("fresh", "new")]
 
 
 def names(expression: ast.AST) -> set[str]:

@@ -12,8 +12,10 @@ from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself
 from tflane_jax.ablations import carry_over as subject
 from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, ROWS, Settings, carry_over
 from tflane_jax.ablations.declaration import Declaration, check
+from tflane_jax.ablations.jobs import Failure, Job
+from tflane_jax.ablations.recorded import Measured
 from tflane_jax.cli import main
-from tflane_jax.config import RealMapData, load_config
+from tflane_jax.config import RealMapData, RunConfig, load_config
 from tflane_jax.errors import UserError
 from tflane_jax.world.presets import CITY, REAL_LIKE
 
@@ -168,6 +170,8 @@ def test_fewer_logs_are_an_interim_look(folder, capsys):
     for name in names:
         assert "**Interim**: 1 of 2 declared logs (scene-3)." in (out / name).read_text()
     assert "3 runs, 3 complete" in capsys.readouterr().out
+    tests = json.loads((out / "effects.json").read_text())["rows"]
+    assert {test["verdict"] for test in tests} == {"not tested"}
     carry_over(settings(folder), out)
     assert [(out / name).read_bytes() for name in names] == before
 
@@ -215,3 +219,23 @@ def test_the_shipped_models_are_measured_by_the_scores_of_the_tables():
     assert configs["generated, right-hand traffic"] == replace(configs["generated"], data=right_hand)
     city = replace(configs["generated"].data, generated_world=CITY)
     assert configs["generated on city"] == replace(configs["generated"], data=city)
+
+
+def test_models_are_compared_on_the_seeds_that_all_of_them_have(tmp_path, monkeypatch):
+    config = RunConfig(data=RealMapData(generated=1.0))
+
+    def jobs(row):
+        of_seed = (replace(config, training=replace(config.training, seeds=(seed,))) for seed in range(3))
+        return {"": [Job(each, tmp_path / row / str(each.training.seeds[0]), threads={}) for each in of_seed]}
+
+    def measured(job, config, which):
+        return Measured(4, "a protocol", {"": {PRIMARY: float(job.config.training.seeds[0])}}, {"": {}})
+
+    monkeypatch.setattr(subject, "measure", measured)
+    plan = subject._Plan(("a", "b"), ("a", "b"), {}, {"mixed": jobs("mixed"), "maps": jobs("maps")})
+    means, seeds, _ = subject._evaluated(plan, [Failure(plan.of("maps", "a")[2], "it diverged")])
+    assert seeds == {"a": {0, 1}, "b": {0, 1}}
+    assert {row: [means[row][log][PRIMARY] for log in "ab"] for row in means} == {
+        "mixed": [0.5, 0.5],
+        "maps": [0.5, 0.5],
+    }

@@ -80,6 +80,7 @@ def test_a_late_declaration_says_so_and_holds_for_these_configurations(tiny, tmp
         ([*PRIMARY, "--alpha", "1"], "--alpha 1 is no significance level"),
         (["--treatment", "tfm"], "--treatment belongs to a declared comparison: add --primary"),
         (["--negative-control", "all/recall"], "--negative-control belongs to a declared comparison"),
+        (["--test", "rain='--data.test 3"], "--test rain='--data.test 3: no closing quotation"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_trained(tiny, tmp_path, capsys, arguments, message):

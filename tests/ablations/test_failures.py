@@ -10,6 +10,9 @@ from tests.ablations.test_identity import QUICK
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import scores, workers
 from tflane_jax.ablations.jobs import check_rows, plan_jobs
+from tflane_jax.ablations.recorded import Measured
+from tflane_jax.ablations.report import save_report
+from tflane_jax.ablations.results import Results
 from tflane_jax.cli import main
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
@@ -109,6 +112,20 @@ def test_without_a_control_there_is_a_table_and_no_test(tiny, tmp_path, monkeypa
     interventions = ["tfm, no traffic flow at inference", "tfm, traffic of another scene"]
     assert {row["model"] for row in rows(tmp_path / "table.md")} == {"tfm", *interventions}
     assert not (tmp_path / "paired.md").exists()
+
+
+def test_paired_tests_name_the_seeds_of_each_checkpoint(tmp_path, capsys):
+    """A run has no best checkpoint where no evaluation gave a finite score."""
+    results = Results(("base", "tfm"), (0, 1, 2), {}, "a protocol")
+    for model in results.models:
+        for seed in results.seeds:
+            measured = Measured(4, "a protocol", {"": {"all/recall": 0.1 * seed + len(model)}}, {"": {}})
+            results.add("", "last", model, seed, measured)
+            if (model, seed) != ("tfm", 1):
+                results.add("", "best", model, seed, measured)
+    save_report(results, RunConfig().task, {}, tmp_path)
+    title = (tmp_path / "paired.md").read_text().splitlines()[0]
+    assert "over the seeds that all models have (0, 1, 2 at the last checkpoint; 0, 2 at the best checkpoint)" in title
 
 
 def test_an_evaluation_that_fails_is_listed_too(tiny, tmp_path, monkeypatch, capsys):

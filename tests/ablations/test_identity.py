@@ -7,10 +7,11 @@ import shutil
 import pytest
 
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
+from tflane_jax.ablations import workers
 from tflane_jax.ablations.jobs import Job, file_names
-from tflane_jax.ablations.scores import measure, with_test_set
+from tflane_jax.ablations.scores import code_digest, measure, with_test_set
 from tflane_jax.cli import main
-from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.errors import UserError
 from tflane_jax.training.records import read_records
 
@@ -175,3 +176,24 @@ def test_only_settings_of_the_data_make_a_test_set(tiny):
     job = job_of(tiny, None)
     with pytest.raises(UserError, match=r"--optim\.lr is none"):
         with_test_set(job.config, ["--optim.lr", "1"])
+
+
+def test_scores_are_those_of_the_code_that_runs_though_its_files_change(tmp_path, monkeypatch):
+    """A package that is edited while it trains: what the old code measures must not count as the new code's."""
+    module = tmp_path / "package" / "__init__.py"
+    module.parent.mkdir()
+    module.write_text("old = True")
+
+    def train(config, folder, **options):
+        module.write_text("old = False")
+        raise UserError("enough")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tflane_jax.__file__", str(module))
+        patch.setattr(workers, "train_run", train)
+        code_digest.cache_clear()
+        old = code_digest()
+        code_digest.cache_clear()
+        assert len(workers.train_all([Job(RunConfig(), tmp_path / "run")], 1)) == 1
+        assert code_digest() == old
+    code_digest.cache_clear()

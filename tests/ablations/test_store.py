@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from tflane_jax.ablations.facts import facts
 from tflane_jax.ablations.jobs import Job, check_rows
 from tflane_jax.ablations.store import remaining_seconds, run_key, runs_elsewhere, stored_jobs
 from tflane_jax.config import RunConfig
 from tflane_jax.config_io import to_json
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import write_json
 from tflane_jax.training import provenance
 from tflane_jax.training.loop import TrainingConfig
 
@@ -150,3 +152,14 @@ def test_a_run_of_an_accelerator_is_no_run_of_a_cpu(tmp_path, monkeypatch):
     (other,) = stored_jobs({"row": CONFIG}, [0], tmp_path, threads=setting)["row"]
     assert other.folder != job.folder
     assert Job(CONFIG, job.folder, {"cores": 1, "device": gpu}).difference() == ""
+
+
+def test_a_run_of_changed_code_is_not_told_as_one_of_its_commit(tmp_path):
+    job = Job(RunConfig(), tmp_path / "run", threads={"cores": 1})
+    commits = [("a" * 40, False), ("b" * 40, True)]
+    starts = [
+        {"git": {"commit": commit, "uncommitted_changes": changed}, "device": "cpu: cpu x 1", "threads": {"cores": 1}}
+        for commit, changed in commits
+    ]
+    write_json(job.folder / "provenance.json", [*starts, starts[0] | {"git": None}])
+    assert facts(job).commits == ("aaaaaaaaa", "bbbbbbbbb with uncommitted changes")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -131,6 +132,13 @@ def test_the_page_leaves_out_best_checkpoints_that_repeat_the_last(tmp_path):
     assert [(line[1], line[3]) for line in lines] == [("a", "last"), ("b", "last"), ("b", "best")]
     assert "Best checkpoints that score as the last are left out.\n" in written
     assert "1 seed, 1 updates a run" in written
+    assert "Interim" not in written  # of a table of another version, whose seeds are not known
+    assert "\ntflane tables x --seeds 1 --jobs 2 --cores 1\n" in written
+    two = {"table": "tf_lane.5", "cores of a run": [1, 2], "seeds": [0, 1]}
+    (tmp_path / "tf_lane.5.json").write_text(json.dumps(summary | two | {"findings": [], "quoted": {"rows": []}}))
+    written = page(tmp_path)
+    assert "**Interim**: 2 of 5 declared seeds." in written
+    assert "\ntflane tables tf_lane.5 --seeds 2 --jobs 2\n" in written
 
 
 def test_all_tables_are_checked_before_the_first_is_trained(tiny, tmp_path, monkeypatch, capsys):
@@ -201,6 +209,32 @@ def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
         assert json.loads((type(tmp_path)(start) / "config.json").read_text())["training"]["seeds"] == seeds
 
 
+def test_no_row_starts_from_a_host_that_failed(tiny, tmp_path, monkeypatch, capsys):
+    host = TableRow("host", f"{tiny}:baseline", ("--optim.lr", "0.1"))
+    rows = (host, TableRow("base", f"{tiny}:baseline", start="host"), TableRow("alone", f"{tiny}:baseline"))
+    table = small(tiny, rows=rows, claims=(Claim("base", "alone"),), hosts=(host,))
+    train_run, trained = workers.train_run, []
+
+    def interrupted(config, folder, **options):
+        result = train_run(config, folder, **options)
+        trained.append(config.optim.lr)
+        if config.optim.lr == 0.1 and config.training.seeds == (0,):
+            shutil.rmtree(folder / "checkpoints" / "step_00000004")  # one of an earlier step is left
+            raise UserError("the disk is full")
+        return result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(workers, "train_run", interrupted)
+        with pytest.raises(UserError, match="2 of 6 trainings failed") as failed:
+            run_table(table, range(2), tmp_path)
+    assert len(trained) == 5
+    assert "host, seed 0, the run that it starts from, is not complete" in str(failed.value)
+    table_rows = json.loads((tmp_path / "paper.9" / "table.json").read_text())["rows"]
+    counts = {row["model"]: row["seeds"] for row in table_rows if row["checkpoint"] == "last"}
+    assert counts == {"host": 1, "base": 1, "alone": 2}
+    run_table(table, range(2), tmp_path)  # the same command goes on
+
+
 def test_a_table_with_more_steps_has_another_name_and_slower_schedules():
     table = TABLES["tf_lane.2"]
     assert table.lengthened(1) is table
@@ -225,6 +259,9 @@ def test_a_quick_table_is_no_result(tiny, tmp_path, monkeypatch, capsys):
     with pytest.raises(UserError, match="smoke test and no result"):
         record([path.with_name("summary.json")], tmp_path / "results")
     assert not (tmp_path / "results").exists()
+    # So another declaration may follow: a smoke test is for tables that change.
+    run_table(replace(small(tiny), alpha=0.01), range(2), tmp_path, quick=True)
+    assert "level 0.01" in (path.parent / "effects.md").read_text()
 
 
 def test_the_command_lists_tables_and_names_mistakes(capsys):
@@ -236,9 +273,21 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
         (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),
         (["tf_lane.1", "--jobs", "0"], "at least one training"),
         (["tf_lane.1", "--cores", "0"], "--cores 0: at least one"),
+        (["tf_lane.1", "--quick", "--record", "docs"], "--quick runs are no results and never recorded"),
+        (["gtn_lane.1", "--search", "--seeds", "3"], "--search trains other runs than the table's"),
+        (["--quick"], "--quick is about a table: name one"),
+        (["--record", "nowhere"], "--record nowhere is no folder of results"),
     ):
         assert main(["tables", *arguments]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_the_page_is_written_anew_without_a_table(tmp_path, capsys):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    assert main(["tables", "--record", str(folder)]) == 0
+    assert (tmp_path / "results.md").read_text() == page(folder)
+    assert f"written: {tmp_path / 'results.md'}" in capsys.readouterr().out
 
 
 def test_runs_that_tables_share_cost_once():

@@ -238,7 +238,8 @@ def _tested(config: RunConfig, log: str, traffic: str = "") -> RunConfig:
 def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, set[int]], str]:
     """Return the scores of all finished runs on the logs that they have not seen, seeds by log, and the protocol.
 
-    The seeds of a log are those of which every model was tested on it.
+    The seeds of a log are those of which every model was tested on it. Means are over these alone, so that models are
+    compared on the same seeds where trainings failed.
     """
     found: dict[str, dict[str, dict[int, Scores]]] = {}
     protocol, failed = "", {failure.job.folder for failure in failures}
@@ -258,12 +259,19 @@ def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, s
                 for name, scores in ways.items():
                     of_log = found.setdefault(name, {}).setdefault(log, {})
                     of_log[job.config.training.seeds[0]] = scores
-    means = {name: {log: _mean(list(each.values())) for log, each in by_log.items()} for name, by_log in found.items()}
     seeds = {
         log: {job.config.training.seeds[0] for row in plan.jobs for job in plan.of(row, log)}.intersection(
             *(by_log.get(log, {}) for by_log in found.values())
         )
         for log in plan.logs
+    }
+    means = {
+        name: {
+            log: _mean([each[seed] for seed in each if seed in seeds[log]])
+            for log, each in by_log.items()
+            if seeds[log]
+        }
+        for name, by_log in found.items()
     }
     return means, seeds, protocol
 
@@ -320,9 +328,9 @@ def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[s
             | {"std": test.std, "logs better": f"{test.better} of {test.seeds}", "p": test.p_value}
         )
     for row, corrected in zip(rows, holm(chances), strict=True):
-        decided = corrected < declaration.alpha  # False for NaN, a single log
-        verdict = ("shown" if row["difference"] > 0.0 else "contradicted") if decided else "not shown"
-        row |= {"p (Holm)": corrected, "verdict": verdict}
+        decided = "shown" if row["difference"] > 0.0 else "contradicted"
+        other = "not tested" if np.isnan(corrected) else "not shown"  # NaN: a single log
+        row |= {"p (Holm)": corrected, "verdict": decided if corrected < declaration.alpha else other}
     return rows
 
 

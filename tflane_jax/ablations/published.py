@@ -21,7 +21,7 @@ _WIDTH = 120
 
 
 def record(summaries: Sequence[Path], folder: Path) -> Path:
-    """Copy summaries (see `table_run`) into the folder of results, write its page anew, and return the page.
+    """Copy summaries (see `table_run`), if any, into the folder of results, write its page anew, and return the page.
 
     The page lies beside the folder: `docs/results` has `docs/results.md`. The runs of each table are added to those in
     `docs/results/scores`.
@@ -79,13 +79,14 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}) in "
         f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
-        f"{summary['declared']}"
+        f"{summary['declared']}{_interim(summary)}"
     )
     lines = [
         f"## {summary['table']}: {summary['title']}",
         "",
         "```",
-        f"tflane tables {summary['table']} --seeds {len(summary['seeds'])} --jobs 2",
+        # Numbers depend on the cores of a run, which --jobs alone takes from the machine.
+        f"tflane tables {summary['table']} --seeds {len(summary['seeds'])} --jobs 2{_cores_option(summary)}",
         "```",
         "",
         *_wrapped(facts),
@@ -107,6 +108,19 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
         lines += ["", *_wrapped(f"The paper's own numbers: {quoted['source']}."), ""]
         lines.append(format_table(quoted["rows"], digits=2))
     return lines
+
+
+def _interim(summary: Mapping[str, Any]) -> str:
+    """Return a sentence for a table with fewer seeds than it declares; "" for one with all."""
+    table, count = TABLES.get(summary["table"]), len(summary["seeds"])
+    if table is None or count >= table.seeds:
+        return ""
+    return f" **Interim**: {count} of {table.seeds} declared seeds."
+
+
+def _cores_option(summary: Mapping[str, Any]) -> str:
+    cores = summary["cores of a run"]
+    return f" --cores {cores[0]}" if len(cores) == 1 else ""
 
 
 def _without_repeated(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

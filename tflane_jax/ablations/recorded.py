@@ -40,7 +40,7 @@ class Facts:
     """What a table tells of a run beside its scores.
 
     Attributes:
-        commits: of the code that trained it, nine digits each, in order.
+        commits: of the code that trained it, nine digits each, in order; one whose code was changed says so.
         devices: that trained it, in order.
         seconds: of training; None if the run has no record of it.
         validation: records of the validation split, see `training.records`.

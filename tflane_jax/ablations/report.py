@@ -74,7 +74,7 @@ def _save_table(
 def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task, stem: Path) -> list[Path]:
     """Print and save the paired tests over the seeds that all rows have; nothing without two of them or a control."""
     rows: list[dict[str, Any]] = []
-    control, over, seeds = results.models[0], "", {}
+    control, seeds = results.models[0], {}
     for which in CHECKPOINTS:
         table = results.rows(test, which)
         shared = [seed for seed in results.seeds if table and all(seed in by_seed for by_seed in table.values())]
@@ -85,10 +85,13 @@ def _save_paired(results: Results, test: str, metrics: Sequence[str], task: Task
         variants = [Variant(row, tuple(by_seed[seed] for seed in shared)) for row, by_seed in table.items()]
         rows += [{"checkpoint": which} | row for row in summarise(variants, metrics, task.errors)]
         seeds[which] = shared
-        whole = len(shared) == len(results.seeds)
-        over = over or (_count(shared) if whole else f"the seeds that all models have ({listed(shared)})")
     if not rows:
         return []
+    whole = all(len(shared) == len(results.seeds) for shared in seeds.values())
+    lists = [f"{listed(shared)} at the {which} checkpoint" for which, shared in seeds.items()]
+    if len(set(map(tuple, seeds.values()))) == 1:  # of both checkpoints
+        lists = [listed(next(iter(seeds.values())))]
+    over = _count(results.seeds) if whole else f"the seeds that all models have ({'; '.join(lists)})"
     title = f"{results.protocol}, {results.title(test)}: paired differences to {control}, two-sided t-test over {over}"
     title += "; p (Holm) is corrected for all tests of one checkpoint"
     print("\n" + format_table(rows, title=title, digits=4))

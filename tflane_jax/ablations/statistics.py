@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+_ROUNDING = 1e-12  # of scores: 0.5 - 0.4 and 0.8 - 0.7 differ by 1e-16
+
 
 @dataclass(frozen=True)
 class PairedDifference:
@@ -43,12 +45,12 @@ def paired_difference(treatment: Float[np.ndarray, " s"], control: Float[np.ndar
     n, mean = len(difference), float(difference.mean())
     if n == 1:
         std = p_value = math.nan
-    elif np.ptp(difference) == 0.0:
+    elif np.ptp(difference) <= _ROUNDING:
         # The t statistic is 0 / 0 for equal numbers and infinite for a constant shift.
-        std, p_value = 0.0, 1.0 if mean == 0.0 else 0.0
+        std, p_value = 0.0, 1.0 if abs(mean) <= _ROUNDING else 0.0
     else:
         std, p_value = float(difference.std(ddof=1)), float(ttest_rel(treatment, control).pvalue)
-    return PairedDifference(mean, std, p_value, int((difference > 0).sum()), n)
+    return PairedDifference(mean, std, p_value, int((difference > _ROUNDING).sum()), n)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

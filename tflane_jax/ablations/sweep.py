@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from tflane_jax.ablations.comparison import Variant, compact
-from tflane_jax.config import apply_overrides
+from tflane_jax.config import RunConfig, apply_overrides
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
@@ -41,11 +43,18 @@ def sweep(
         The Markdown file.
 
     Raises:
-        UserError: no run, a setting that is not of the data, or an unknown metric.
+        UserError: no run, a setting that is not of the data, a value or override that cannot be set, or an unknown
+            metric; before anything is evaluated.
     """
     if not setting.startswith("data."):
         raise UserError(f"--setting {setting}: give a setting of the data (data...), the models are trained already")
     runs = {name: runs_below(folder, which) for name, folder in models.items()}
+    tested = {
+        value: {name: [_tested(run.config, f"--{setting}", value, *overrides) for run in runs[name]] for name in runs}
+        for value in values
+    }
+    for config in (config for by_name in tested.values() for each in by_name.values() for config in each):
+        _check_metrics(metrics or (), config.task.score_names(config.data, config.evaluation))
     scores: dict[str, list[list[dict[str, float]]]] = {name: [] for name in runs}
     protocol = ""
     total = len(values) * sum(map(len, runs.values()))
@@ -53,9 +62,8 @@ def sweep(
         for value in values:
             for name, trained in runs.items():
                 found = []
-                for run in trained:
+                for run, changed in zip(trained, tested[value][name], strict=True):
                     bar.set_description(f"{setting} = {value}: {name}")
-                    changed = apply_overrides(run.config, [f"--{setting}", value, *overrides])
                     task, data = run.config.task, load_test_data(changed)
                     for params in run.params:
                         evaluation = task.evaluate(params, data, changed.evaluation)
@@ -65,8 +73,7 @@ def sweep(
                 scores[name].append(found)
     every = [each for by_value in scores.values() for found in by_value for each in found]
     known = [name for name in every[0] if all(name in each for each in every)]
-    if unknown := set(metrics or ()) - set(known):
-        raise UserError(f"no metric {min(unknown)}, only {', '.join(known)}")
+    _check_metrics(metrics or (), known)
     metrics = metrics or [name for name in task.compared if name in known]
     rows = []
     for i, value in enumerate(values):
@@ -83,6 +90,31 @@ def sweep(
         written.append(save_sweep(out / "sweep.png", scores, setting, values, metrics))
     print("\nwritten:", *written, sep="\n  ")
     return written[0]
+
+
+def _tested(config: RunConfig, *arguments: str) -> RunConfig:
+    """Return a run's configuration with other settings of data and evaluation; raises UserError for others."""
+    common = replace(config, training=replace(config.training, seeds=(0,), init_from=None))
+    changed = _overridden(common, arguments)
+    if replace(changed, data=common.data, evaluation=common.evaluation) != common:
+        given = ", ".join(argument for argument in arguments if argument.startswith("--"))
+        raise UserError(
+            f"a sweep changes settings of the data and the evaluation (--data..., --evaluation...), the models are "
+            f"trained already: got {given}"
+        )
+    return replace(config, data=changed.data, evaluation=changed.evaluation)
+
+
+@functools.lru_cache(maxsize=256)
+def _overridden(config: RunConfig, arguments: tuple[str, ...]) -> RunConfig:
+    """Apply settings; cached, because this takes a second and is the same for all seeds."""
+    return apply_overrides(config, arguments)
+
+
+def _check_metrics(metrics: Collection[str], known: Collection[str]) -> None:
+    if unknown := set(metrics) - set(known):
+        listed = ", ".join(sorted(name for name in known if "@" not in name))
+        raise UserError(f"no metric {min(unknown)}, only {listed}")
 
 
 def runs_below(folder: Path, which: Literal["last", "best"] = "last") -> list[Run]:

@@ -34,14 +34,14 @@ from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects
 from tflane_jax.ablations.facts import facts, row_minutes
-from tflane_jax.ablations.jobs import Job, ScoredBy
+from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.reuse import FILE, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
-from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
-from tflane_jax.ablations.workers import train_all
+from tflane_jax.ablations.table_plan import TablePlan, plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.ablations.workers import noted, train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -97,18 +97,23 @@ def run_table(
         )
         for line in unused(plan, archive, table.declaration.scores):
             print(line)
-    declared = declare(table.declaration, plan, planned.declared(), every, folder)
+    try:
+        declared = declare(table.declaration, plan, planned.declared(), every, folder)
+    except UserError:
+        if not quick:
+            raise
+        (folder / DECLARATION).unlink()  # that of an earlier smoke test, which was no result
+        declared = declare(table.declaration, plan, planned.declared(), every, folder)
     tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
 
-    failures = train_all(seed_by_seed(planned.host_jobs), jobs, cores)
-    failures += train_all(seed_by_seed(plan), jobs, cores)
+    failures = _train(planned, jobs, cores)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
     trained = without_failures(plan, failures)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
     if not results.scores:
-        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
+        raise UserError(summary_of(failures, len(planned.every())))
     scores = archive_of(table.name, load_json(folder / DECLARATION), trained, table.declaration.scores, _curves(table))
     write_archive(folder / FILE, scores)
     first = next(iter(configs.values()))
@@ -122,8 +127,25 @@ def run_table(
     _save_summary(table, declared, results, trained, first, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
     if failures:
-        raise UserError(summary_of(failures, len(seed_by_seed(plan))))
+        raise UserError(summary_of(failures, len(planned.every())))
     return path
+
+
+def _train(planned: TablePlan, parallel: int, cores: int | None) -> list[Failure]:
+    """Train the hosts, then the rows; return what failed.
+
+    A row whose host is not complete counts as failed: it would start from whichever checkpoint the host has.
+    """
+    failures = train_all(seed_by_seed(planned.host_jobs), parallel, cores)
+    incomplete = {str(job.folder): job for job in seed_by_seed(planned.host_jobs) if not job.is_complete()}
+    ready = []
+    for job in seed_by_seed(planned.jobs):
+        if (host := incomplete.get(str(job.config.training.init_from))) is not None:
+            with noted(job, failures):
+                raise UserError(f"{host.label}, the run that it starts from, is not complete")
+        elif str(job.folder) not in incomplete:  # a host may be a row too, and has been tried
+            ready.append(job)
+    return failures + train_all(ready, parallel, cores)
 
 
 def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path], Declared]) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 from tflane_jax import accelerators
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.reservations import Reservations
-from tflane_jax.ablations.scores import is_measured, measure_all
+from tflane_jax.ablations.scores import code_digest, is_measured, measure_all
 from tflane_jax.ablations.training_queue import Queue
 from tflane_jax.child_processes import end_with_parent
 from tflane_jax.errors import Interrupted, UserError
@@ -42,6 +42,7 @@ def train_all(jobs: Sequence[Job], parallel: int, cores: int | None = None) -> l
     Several processes, also of several machines that share a folder, may train the same jobs: each takes those that no
     other has reserved, and returns when all are complete.
     """
+    code_digest()  # of the code that is running: its files may change while it trains
     with Reservations() as reservations:
         if parallel == 1 and cores is None:
             return _train_here(Queue(jobs, reservations, lambda job: job.is_complete()))
@@ -243,6 +244,7 @@ def _train_jobs(pipe: Any, cores: list[int], accelerator: Mapping[str, str]) -> 
     """
     keep_freed_memory()
     end_with_parent()
+    code_digest()  # as in `train_all`
     if cores:
         os.sched_setaffinity(0, cores)  # XLA takes the size of its thread pool from this
     os.environ.update(accelerator)

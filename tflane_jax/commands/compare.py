@@ -52,7 +52,7 @@ def _test_sets(arguments: Sequence[str]) -> dict[str, list[str]]:
             raise UserError(f"--test {argument}: write --test NAME='--data.setting value ...'")
         if name in tests:
             raise UserError(f"two test sets have the name {name}")
-        tests[name] = shlex.split(settings)
+        tests[name] = _split(settings, f"--test {argument}")
     return tests
 
 
@@ -80,4 +80,12 @@ def _named(argument: str) -> tuple[str, str, list[str]]:
     if not separator:
         path, ablation = split_reference(row)
         name, reference = ablation or Path(path).stem, row
-    return name, reference.strip(), shlex.split(dashes + settings)
+    return name, reference.strip(), _split(dashes + settings, argument)
+
+
+def _split(settings: str, argument: str) -> list[str]:
+    """Return settings one by one, as a shell splits them; raises UserError, with the argument, for an open quote."""
+    try:
+        return shlex.split(settings)
+    except ValueError as error:
+        raise UserError(f"{argument}: {str(error).lower()}") from error

@@ -15,7 +15,8 @@ from tflane_jax.training.runtime import configure_jax
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the named tables, or list all."""
+    """Run the named tables, or list all; without names, --record writes the page of results anew."""
+    _check_together(options)
     if options.steps_factor < 1:
         raise UserError(f"--steps-factor {options.steps_factor}: at least 1")
     if options.steps_factor > 1 and options.record is not None:
@@ -26,10 +27,13 @@ def run(options: argparse.Namespace) -> int:
     jobs = (2 if options.quick else 1) if options.jobs is None else options.jobs
     if jobs < 1:
         raise UserError(f"--jobs {jobs}: at least one training runs at a time")
-    if options.quick and options.source is not None:
-        raise UserError("--quick runs are no results and never recorded: leave out --from or --quick")
     if options.cores is not None and options.cores < 1:
         raise UserError(f"--cores {options.cores}: at least one")
+    if not chosen and options.record is not None:
+        if not options.record.is_dir():
+            raise UserError(f"--record {options.record} is no folder of results, such as docs/results")
+        print("written:", record([], options.record))
+        return 0
     if not chosen:
         print(format_table([_listed(name) for name in TABLES], digits=0))
         print(f"\n{_totals()}")
@@ -56,6 +60,29 @@ def run(options: argparse.Namespace) -> int:
     if options.record is not None:
         print("written:", record([path.with_name("summary.json") for path in written], options.record))
     return 0
+
+
+def _check_together(options: argparse.Namespace) -> None:
+    """Raise UserError for options that do nothing together, or without the name of a table."""
+    given = {
+        "--seeds": options.seeds is not None,
+        "--record": options.record is not None,
+        "--from": options.source is not None,
+        "--earlier-scores": options.earlier_scores,
+        "--jobs": options.jobs is not None,
+        "--cores": options.cores is not None,
+        "--steps-factor": options.steps_factor != 1,
+        "--quick": options.quick,
+        "--search": options.search,
+    }
+    names = [name for name, is_given in given.items() if is_given]
+    if not options.names and (idle := [name for name in names if name != "--record"]):
+        raise UserError(f"{idle[0]} is about a table: name one (tflane tables lists all)")
+    if options.quick and (idle := [name for name in names if name in ("--record", "--from")]):
+        raise UserError(f"--quick runs are no results and never recorded: leave out {idle[0]} or --quick")
+    of_runs = ("--seeds", "--record", "--from", "--earlier-scores")
+    if options.search and (idle := [name for name in names if name in of_runs]):
+        raise UserError(f"--search trains other runs than the table's, with its own seed: leave out {idle[0]}")
 
 
 def _listed(name: str) -> dict[str, str | int | float]:

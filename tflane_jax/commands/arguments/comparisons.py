@@ -115,8 +115,8 @@ def tables(commands) -> None:
         "--record",
         metavar="DIR",
         type=Path,
-        help="copy the summaries and the scores of all runs to DIR and write DIR.md anew; the repository keeps "
-        "docs/results",
+        help="copy the summaries and the scores of all runs to DIR and write DIR.md anew; without a table, only write "
+        "DIR.md; the repository keeps docs/results",
     )
     parser.add_argument(
         "--from",

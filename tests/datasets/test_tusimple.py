@@ -20,9 +20,9 @@ from tflane_jax.datasets.tusimple import TuSimpleConfig, TuSimpleData, TuSimpleD
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
-from tflane_jax.metrics.tusimple import TuSimpleMetrics
+from tflane_jax.metrics.tusimple import TuSimpleMetrics, score_image
 from tflane_jax.scene import CurvePrediction, Prediction
-from tflane_jax.tasks.lane_shape import LaneShapeTask
+from tflane_jax.tasks.lane_shape import LaneShapeTask, found_lanes
 
 ROWS_48 = ROWS[8:]
 
@@ -112,7 +112,7 @@ class Straight(LaneShapeTask):
     def predict(self, params, example):
         logits, curves = (
             jnp.array([[0.0, 3.0], [3.0, 0.0]]),
-            jnp.tile(jnp.array([0.9, 0.4, 0, 0, 0, 0.5, 0, 0.1]), (2, 1)),
+            jnp.tile(jnp.array([0.4, 0.9, 0, 0, 0, 0.5, 0, 0.1]), (2, 1)),
         )
         return Prediction(curves=CurvePrediction(logits, curves + 0 * jnp.mean(example.image)))
 
@@ -132,6 +132,30 @@ def test_truth_is_what_the_file_says(root):
     np.testing.assert_array_equal(truth.rows, ROWS_48)
     assert truth.x.shape == (3, 48)
     assert (truth.x[2] == -2).all()
+
+
+@pytest.mark.parametrize("read_first", [False, True])
+def test_images_of_another_size_are_measured_in_their_own_pixels(tmp_path, read_first):
+    """A lane u = 0.2 + v / 2, predicted as labelled, in an image of 1640 x 590; the other one is TuSimple's."""
+    records, sizes = [], {"wide.png": (590, 1640), "own.png": (720, 1280)}
+    for name, (height, width) in sizes.items():
+        assert cv2.imwrite(str(tmp_path / name), np.zeros((height, width, 3), np.uint8))
+        rows = np.arange(240, height, 10)
+        lane = width * (0.2 + 0.5 * rows / height)
+        records.append({"raw_file": name, "lanes": [lane.tolist()], "h_samples": rows.tolist()})
+    (tmp_path / "label_data_mine.json").write_text("".join(json.dumps(record) + "\n" for record in records))
+    dataset = dataset_of(tmp_path)
+    logits, curves = np.array([[0.0, 1.0]]), np.array([[0.0, 1.0, 0, -1, 0, 0.2, 0.5, 0]])
+    for index, size in enumerate(sizes.values()):
+        if read_first:
+            dataset.example(index)
+        truth = dataset.truth(index)
+        assert truth.size == size
+        found = found_lanes(CurvePrediction(logits, curves), truth)
+        np.testing.assert_allclose(found.x, truth.x, rtol=1e-5)
+        assert score_image(found, truth) == (1.0, 0.0, 0.0)
+    labels = loaded(tmp_path, "disk").truth
+    assert [truth.size for truth in labels] == list(sizes.values())
 
 
 def test_splits_name_their_files(root):

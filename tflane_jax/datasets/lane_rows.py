@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +28,11 @@ class LabelledImages:
 
     Attributes:
         images: stacked along a new first axis, or read by workers while they are used.
-        truth: labels of each image for TuSimple's metric.
+        truth: labels of each image for TuSimple's metric, with the size of the image.
     """
 
     images: RoadImage | Streamed
-    truth: tuple[RowLanes, ...]
+    truth: Sequence[RowLanes]
 
 
 def lane_lines(truth: RowLanes, height: int, width: int, *, capacity: int = 8) -> LaneLines:
@@ -75,7 +76,8 @@ def row_lanes(lines: LaneLines, height: float = ROWS_HEIGHT, width: float = 1280
     u, v = points[..., 0], points[..., 1]
     if valid.shape[1] != len(ROWS) or (valid & ~(np.abs(v * ROWS_HEIGHT - ROWS) < 0.01)).any():
         raise ValueError("the lines' points do not stand at TuSimple's rows: give lines that were not augmented")
-    return RowLanes(np.where(valid & (u >= 0.0), u * width, NO_POINT), ROWS * (height / ROWS_HEIGHT))
+    x = np.where(valid & (u >= 0.0), u * width, NO_POINT)
+    return RowLanes(x, ROWS * (height / ROWS_HEIGHT), size=(height, width))
 
 
 def _at_rows(

@@ -2,7 +2,8 @@
 
 A label file has one JSON record a line: `raw_file`, `h_samples` (48 or 56 image rows) and `lanes`, one x per row and
 lane, -2 where the lane has no point. Examples always have the 56 rows of the test set (`datasets.lane_rows`); rows
-that a file does not label are absent. Source: https://github.com/TuSimple/tusimple-benchmark.
+that a file does not label are absent. Source: https://github.com/TuSimple/tusimple-benchmark. Images of other cameras
+may have other sizes; rows and x are pixels of the image.
 
 The folder may hold label files and `clips` itself, in `LaneDetection` (LSTR's layout), or in `train_set` and
 `test_set`, as the archives are often unpacked.
@@ -11,9 +12,9 @@ The folder may hold label files and `clips` itself, in `LaneDetection` (LSTR's l
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -97,6 +98,7 @@ class TuSimpleDataset:
             folder = _image_folder(root, file, list(read))
             labels |= {name: (lanes, folder) for name, lanes in read.items()}
         self._labels = [(name, lanes, folder) for name, (lanes, folder) in labels.items()]
+        self._sizes: dict[str, tuple[int, int]] = {}  # of the images read so far
         if not labels:
             raise UserError(f"{', '.join(map(str, self.label_files))}: no labelled frames")
         missing = [name for name, _, folder in self._labels if not (folder / name).is_file()]
@@ -120,14 +122,20 @@ class TuSimpleDataset:
         """Return one frame; raises UserError where its image cannot be read."""
         name, truth, folder = self._labels[self._checked(index)]
         image = read_image(folder / name)
-        height, width = image.shape[:2]
+        height, width = self._sizes[name] = image.shape[:2]
         image = resize(image, self.config.height, self.config.width)
         lines = lane_lines(truth, height, width, capacity=self.config.capacity)
         return RoadImage(image, np.ones(image.shape[:2], bool), lines)
 
     def truth(self, index: int) -> RowLanes:
-        """Return the labels for TuSimple's metric: pixels of the original image, lanes without a point included."""
-        return self._labels[self._checked(index)][1]
+        """Return the labels for TuSimple's metric: pixels of the original image, lanes without a point included.
+
+        Reads the image for its size if `example` has not; raises UserError where it cannot be read.
+        """
+        name, truth, folder = self._labels[self._checked(index)]
+        if name not in self._sizes:
+            self._sizes[name] = read_image(folder / name).shape[:2]
+        return replace(truth, size=self._sizes[name])
 
     def raw_file(self, index: int) -> str:
         """Return the name that label and prediction files give a frame."""
@@ -229,7 +237,20 @@ def _load(dataset: TuSimpleDataset, progress: bool, parts: Collection[str], load
     large = len(dataset) * dataset.config.height * dataset.config.width * 3 > IN_MEMORY
     streams = loading.where == "disk" or (loading.where == "auto" and large)
     images = Streamed(dataset, loading) if streams else load_road_images(dataset, progress=progress)
-    return LabelledImages(images, tuple(dataset.truth(index) for index in range(len(dataset))))
+    return LabelledImages(images, _Labels(dataset))
+
+
+@dataclass(frozen=True)
+class _Labels(Sequence[RowLanes]):
+    """Labels that are asked for one by one, because those of an image that was not read yet need it."""
+
+    dataset: TuSimpleDataset
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index):
+        return self.dataset.truth(index)
 
 
 def _choose(choice: Choice) -> TuSimpleConfig:

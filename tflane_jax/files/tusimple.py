@@ -18,6 +18,8 @@ from tflane_jax.files.fields import items, member, numbers, parse_json, read_tex
 
 NO_POINT = -2.0
 """x of a row in which a lane has no point."""
+SIZE = (720, 1280)
+"""Height and width of TuSimple's images, pixels."""
 _WIDEST = 1e6  # pixels
 
 
@@ -30,12 +32,14 @@ class RowLanes:
         rows: (H,) the image rows, pixels (`h_samples`); None for predictions, which use those of the truth.
         run_time: duration of the prediction, milliseconds.
         place: file, line and image, for messages.
+        size: height and width of the image, pixels; files do not tell it.
     """
 
     x: Float[np.ndarray, "l h"]
     rows: Float[np.ndarray, " h"] | None = None
     run_time: float = 0.0
     place: str = ""
+    size: tuple[float, float] = SIZE
 
 
 def read_predictions(path: Path) -> dict[str, RowLanes]:

@@ -41,8 +41,6 @@ from tflane_jax.tasks.base import Draw, Model, Task, Terms, spread
 from tflane_jax.tasks.edge_types import save_edge_types
 from tflane_jax.world.front_view.lines import CAPACITY, ROWS
 
-# Image size of TuSimple's metric: rows and columns.
-HEIGHT, WIDTH = 720, 1280
 _COMPARED_EXAMPLES = 6
 _TIMED_FRAMES = 30
 
@@ -201,7 +199,8 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
 def found_lanes(prediction: CurvePrediction, truth: RowLanes, threshold: float | None = None) -> RowLanes:
     """Return the lanes of one prediction at the rows of the truth; `threshold` as of `lane_shapes.detected`."""
     assert truth.rows is not None, "labels have rows"
-    return lane_shapes.row_lanes(prediction, truth.rows, height=HEIGHT, width=WIDTH, threshold=threshold)
+    height, width = truth.size
+    return lane_shapes.row_lanes(prediction, truth.rows, height=height, width=width, threshold=threshold)
 
 
 def predict_curves(

@@ -80,7 +80,7 @@ def score_image(
     what = detections.place or "detections"
     true, found = _checked(truth.x, len(rows), truth.place or "truth"), _checked(detections.x, len(rows), what)
     if detections.rows is not None and not np.array_equal(detections.rows, rows):
-        own, right = (f"{r[0]:g} to {r[-1]:g}" for r in (detections.rows, rows))
+        own, right = (_range(r) for r in (detections.rows, rows))
         raise UserError(f"{what}: h_samples are {own}, those of the truth {right}: predict at the rows of the truth")
     g, p = len(true), len(found)
     if detections.run_time > time_limit or p > g + 2:
@@ -117,6 +117,10 @@ def line_accuracy(
     true, found = (np.where(x < 0, _ABSENT, x) for x in (true, found))
     near = np.abs(true[:, None] - found[None]) < thresholds[:, None, None]
     return near.mean(-1) if near.shape[-1] else np.zeros(near.shape[:2])
+
+
+def _range(rows: Float[np.ndarray, " h"]) -> str:
+    return f"{rows[0]:g} to {rows[-1]:g}" if len(rows) else "empty"
 
 
 def _checked(x: Float[np.ndarray, "l h"], rows: int, what: str) -> Float[np.ndarray, "l h"]:

@@ -87,6 +87,12 @@ def _tusimple():
         yield Case("tusimple", "truth", f"rows are {name}", f"truth.json, line 2 .*{message}", damage)
     shifted = r"line 2 .*: h_samples are 250 to 280, those of the truth 240 to 270"
     yield Case("tusimple", "predictions", "shifted rows", shifted, put(1, "h_samples", [250, 260, 270, 280]))
+    none = r"line 2 .*: h_samples are empty, those of the truth 240 to 270"
+    yield Case("tusimple", "predictions", "no rows, no lanes", none, _without_rows)
+
+
+def _without_rows(records):
+    records[1] |= {"h_samples": [], "lanes": []}
 
 
 def _normalised(records):

@@ -74,6 +74,15 @@ def test_centerlines_are_a_fourth_class(tmp_path):
     assert row["mAP"] == pytest.approx((1 + 2 / 3) / 4)
 
 
+def test_the_title_names_centerlines_that_the_first_sample_lacks(tmp_path, capsys):
+    line = [np.array([[0.0, 0.0], [0.0, 9.0]])]
+    samples = [(MapDetections(line, np.array([c]), np.array([0.9])), MapTruth(line, np.array([c]))) for c in (0, 3)]
+    write(tmp_path, samples)
+    code, row = run(tmp_path)
+    assert (code, row["AP_divider"], row["AP_centerline"]) == (0, 1.0, 1.0)
+    assert "MapTR Chamfer AP v1, with centerlines" in capsys.readouterr().out
+
+
 def test_heights_count_in_the_protocol_of_argoverse_2(tmp_path, capsys):
     """A line 0.7 m above the true one, at thresholds of 0.5, 1 and 1.5 m."""
     line = np.array([[0.0, 0.0, 0.0], [0.0, 9.0, 0.0]])

@@ -68,7 +68,7 @@ def change(record, **fields):
 
 DAMAGE = {
     "missing": (GUESS[:2], r"1 of 3 frames are missing from the predictions: clips/0313/2/20.jpg"),
-    "extra": ([*GUESS, GUESS[0] | {"raw_file": "x.jpg"}], r"1 of 3 frames are predicted, but not .*: x.jpg"),
+    "extra": ([*GUESS, GUESS[0] | {"raw_file": "x.jpg"}], r"1 of 4 frames are predicted, but not .*: x.jpg"),
     "twice": ([*GUESS, GUESS[1]], r"line 4: clips/0313/1/20.jpg is there twice, first in line 2"),
     "no lanes": (change(GUESS[1], lanes=...), r"line 2 \(clips/0313/1/20.jpg\) lacks the entry 'lanes'"),
     "ragged": (

@@ -46,8 +46,8 @@ class Scored:
 
     @property
     def protocol(self) -> str:
-        """Name and version, the title of every table."""
-        return next(iter(self.scenes.values())).protocol
+        """Name and version, the title of every table; those of all scenes, because it names classes that occur."""
+        return _merged(list(self.scenes.values())).protocol
 
     def total(self) -> dict[str, Any]:
         """Return the numbers over all frames."""
@@ -110,22 +110,25 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
     if not truth:
         raise UserError("the ground truth has no frames")
     problems = []
-    for what, remedy, lost in (
+    for what, remedy, ours, other in (
         (
             "missing from the predictions",
             "predict every frame; a frame without lanes is an empty list",
-            truth.keys() - predictions.keys(),
+            truth,
+            predictions,
         ),
         (
             "predicted, but not in the ground truth",
             "score against the split that was predicted",
-            predictions.keys() - truth.keys(),
+            predictions,
+            truth,
         ),
     ):
+        lost = ours.keys() - other.keys()
         if lost:
             shown = ", ".join(sorted(map(str, lost))[:3])
             more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
-            problems.append(f"{len(lost)} of {len(truth)} frames are {what}: {shown}{more} ({remedy})")
+            problems.append(f"{len(lost)} of {len(ours)} frames are {what}: {shown}{more} ({remedy})")
     if problems:
         raise UserError("; ".join(problems))
 

@@ -10,6 +10,8 @@ import pytest
 from tests.metrics.fixtures import expected_cases, load_segments
 from tests.scoring.files import centerline_annotation, centerline_prediction
 from tflane_jax.cli import main
+from tflane_jax.geometry.polylines import resample
+from tflane_jax.scoring.openlane_v2 import read_segment_truth
 
 NAMES = {"lane_centerline": "lane_segment", "topology_lclc": "topology_lsls", "topology_lcte": "topology_lste"}
 
@@ -98,6 +100,15 @@ def test_laneseg_net_measures_the_long_sides_of_a_crossing(tmp_path):
     assert own["crossing@0.5"] == 1.0
     # The devkit spreads 20 points around the whole outline instead, also along its short sides.
     assert devkit["crossing@0.5"] == 0.0
+
+
+def test_a_dense_centerline_of_a_segment_is_resampled_along_all_of_its_points(tmp_path):
+    """Not along every 20th, as one of the centerline task."""
+    record, angle = segment_record(np.eye(3)), np.linspace(0, np.pi, 201)
+    record["lane_segment"][0]["centerline"] = arc = np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], -1) * 5
+    (tmp_path / "annotations.pkl").write_bytes(pickle.dumps({("val", "1", "1"): {"annotation": record}}))
+    (truth,) = read_segment_truth(tmp_path / "annotations.pkl").values()
+    np.testing.assert_array_equal(truth.lanes.points[0], resample(arc, 10))
 
 
 def typed(record, types, visibility=None):

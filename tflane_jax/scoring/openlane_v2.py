@@ -129,8 +129,10 @@ def _truth(record: Any, where: str, names: FieldNames) -> LaneTruth:
         choices(member(record, field, where), (len(points), count), f"{where}: {field}")
         for field, count in ((names.lane_lane, len(points)), (names.lane_element, len(boxes)))
     )
+    if names is CENTERLINE:  # those of segments are resampled
+        points = [line[::_STRIDE] if len(line) == DENSE_POINTS else line for line in points]
     return LaneTruth(
-        points=[line[::_STRIDE] if len(line) == DENSE_POINTS else line for line in points],
+        points=points,
         successor=lane_lane,
         visibility=_visibility(record, names.lanes, where),
         elements=ElementTruth(boxes, attributes, lane_element),

@@ -8,9 +8,11 @@ import pytest
 
 from tests.metrics.cases import hand_frame, random_frame
 from tflane_jax.cli import main
+from tflane_jax.errors import UserError
 from tflane_jax.metrics import CenterlineMetrics
 from tflane_jax.metrics.groups import ByDistance
 from tflane_jax.metrics.openlane_v2 import GroupedCenterlineMetrics
+from tflane_jax.scoring.plain import read_predictions
 
 PROTOCOL = "openlane-v2.1-centerline"
 SCENES = [("a", 1), ("a", 2), ("b", 1)]
@@ -106,6 +108,22 @@ def test_arrays_with_empty_slots_give_the_hand_made_numbers(tmp_path):
     single.update(*hand_frame())
     assert rows[0]["TOP_ll"] == pytest.approx(single.compute()["TOP_ll"])
     assert [row["lanes"] for row in rows] == [9, 6, 3]
+
+
+def test_crossings_among_segments_are_no_lanes(tmp_path):
+    write_npz(tmp_path)
+    detections, _ = hand_frame()
+    every = read_predictions(tmp_path / "p.npz")
+    crossing = np.arange(len(detections.scores)) == 1
+    write_npz(tmp_path, category=np.stack([crossing.astype(int)] * 3))
+    found = read_predictions(tmp_path / "p.npz")
+    for name, lanes in found.items():
+        np.testing.assert_array_equal(lanes.points, np.asarray(every[name].points)[~crossing])
+        np.testing.assert_array_equal(lanes.scores, every[name].scores[~crossing])
+        np.testing.assert_array_equal(lanes.successor, every[name].successor[np.ix_(~crossing, ~crossing)])
+    write_npz(tmp_path, category=np.full((3, len(crossing)), 2))
+    with pytest.raises(UserError, match="category holds 2"):
+        read_predictions(tmp_path / "p.npz")
 
 
 def test_every_lane_is_in_one_distance_group(tmp_path):

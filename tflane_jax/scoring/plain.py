@@ -3,7 +3,8 @@
 .npz, F frames of L lanes: `scene` (F,) and `timestamp_ns` (F,), which together name a frame; `points` (F, L, n, 3),
 metres, ego frame, in driving direction; `successor` (F, L, L), [f, i, j] lane j continues lane i; `scores` (F, L), 0 to
 1 (predictions); optional `valid` (F, L), false where a slot is empty, and `visibility` (F, L), 0 to 1 (ground truth).
-`tflane predict` writes both sides.
+`tflane predict` writes both sides. Its predictions of lane segments have `category` (F, L), 0 lane segment, 1 crossing:
+crossings are no lanes and are left out.
 
 .json: {"frames": [{"scene", "timestamp_ns", "points", "successor", "scores" or "visibility"}]}, the same by frame,
 where lines may have different numbers of points.
@@ -99,11 +100,13 @@ def _npz_records(path: Path) -> Iterator[dict[str, Any]]:
         raise UserError(f"{path}: points has shape {points.shape}, expected (frames, lanes, points, 3)")
     frames, lanes = points.shape[:2]
     shapes = {"scene": (frames,), "timestamp_ns": (frames,), "successor": (frames, lanes, lanes)}
-    shapes |= dict.fromkeys(("scores", "visibility", "valid"), (frames, lanes))
+    shapes |= dict.fromkeys(("scores", "visibility", "valid", "category"), (frames, lanes))
     for name, shape in shapes.items():
         if name in arrays and arrays[name].shape != shape:
             raise UserError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape}")
     valid = choices(arrays.pop("valid", np.ones((frames, lanes), bool)), (frames, lanes), f"{path}: valid")
+    if "category" in arrays:
+        valid &= ~choices(arrays.pop("category"), (frames, lanes), f"{path}: category")
     known = {name: array for name, array in arrays.items() if name in (*shapes, "points")}
     for f in range(frames):
         record: dict[str, Any] = {name: array[f] for name, array in known.items()}

@@ -83,10 +83,13 @@ def test_resume_is_bit_identical(trained, config, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, again, whole)
 
 
-def test_predictions_are_written_in_tusimple_format(trained, tmp_path):
+def test_predictions_are_written_in_tusimple_format(trained, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("tflane_jax.plots.images.draw_lanes", lambda ax, lanes: drawn.append(len(lanes)))
     out = tmp_path / "predictions"
-    assert main(["predict", str(trained), "--count", "2", "--out", str(out)]) == 0
+    assert main(["predict", str(trained), "--count", "2", "--threshold", "0", "--out", str(out)]) == 0
     truth, found = read_truth(out / "truth.json"), read_predictions(out / "predictions.json")
+    assert drawn == [len(lanes.x) for lanes in found.values()] == [7, 7]
     assert truth.keys() == found.keys()
     metrics = TuSimpleMetrics()
     for name, lanes in truth.items():

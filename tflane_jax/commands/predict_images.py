@@ -47,7 +47,8 @@ def predict_split(trained: Run, options: argparse.Namespace) -> int:
     title, rows = f"{Path(trained.name).name}, step {trained.step}", spread(len(indices), MOST_DRAWN)
     examples, answers = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], (examples, answers))
     names = [dataset.info(indices[row]).scene for row in rows]
-    save_road_images(options.out / "pictures.png", examples, {title: answers}, titles=names)
+    pictures = options.out / "pictures.png"
+    save_road_images(pictures, examples, {title: answers}, titles=names, threshold=options.threshold)
     print(f"{len(indices)} images written to {options.out}: predictions.json, truth.json, pictures.png")
     return 0
 

@@ -27,9 +27,9 @@ def detected(prediction: CurvePrediction, threshold: float | None = None) -> Boo
     return logits[..., 1] > logits[..., 0]
 
 
-def left_to_right(prediction: CurvePrediction) -> Int[np.ndarray, " l"]:
-    """Return the indices of detected queries, ordered by the column of their lower end."""
-    queries = np.flatnonzero(detected(prediction))
+def left_to_right(prediction: CurvePrediction, threshold: float | None = None) -> Int[np.ndarray, " l"]:
+    """Return the indices of detected queries (see `detected`), ordered by the column of their lower end."""
+    queries = np.flatnonzero(detected(prediction, threshold))
     curves = np.asarray(prediction.curves, np.float64)[queries]
     ends = curve_columns(curves[:, 2:], curves[:, 1:2])[:, 0]
     return queries[np.argsort(ends, kind="stable")]

@@ -32,6 +32,7 @@ def save_road_images(
     predictions: Mapping[str, CurvePrediction] | None = None,
     *,
     titles: Sequence[str] = (),
+    threshold: float | None = None,
 ) -> Path:
     """Write one row per image: truth, then one column per model with the truth as thin dashes; return the path.
 
@@ -40,6 +41,7 @@ def save_road_images(
         examples: B of them, stacked along a leading axis.
         predictions: by the name of the model, stacked in the same way.
         titles: one per row; default their numbers.
+        threshold: least score of a lane; None: where lane exceeds background.
 
     Raises:
         ValueError: the numbers of examples, predictions and titles differ.
@@ -58,7 +60,7 @@ def save_road_images(
         for ax, (name, stacked) in zip(columns, predictions.items(), strict=True):
             draw_image(ax, example.image, name)
             draw_lines(ax, example.lines, (height, width), width=0.9, style="--")
-            draw_lanes(ax, predicted_lines(_pick(stacked, row)) * [width, height])
+            draw_lanes(ax, predicted_lines(_pick(stacked, row), threshold) * [width, height])
     return save_figure(figure, path)
 
 
@@ -85,15 +87,15 @@ def lanes_drawn(
     return drawn
 
 
-def predicted_lines(prediction: CurvePrediction, count: int = _POINTS) -> Float[np.ndarray, "l p 2"]:
+def predicted_lines(prediction: CurvePrediction, threshold: float | None = None) -> Float[np.ndarray, "l p 2"]:
     """Return (u, v) of the detected lanes, left to right at their lower ends, as fractions of the image.
 
     Args:
         prediction: one example, one layer.
-        count: rows of each lane's extent.
+        threshold: see `lane_shapes.detected`.
     """
-    curves = np.asarray(prediction.curves, np.float64)[left_to_right(prediction)]
-    rows = np.linspace(curves[:, 0], curves[:, 1], count, axis=-1)
+    curves = np.asarray(prediction.curves, np.float64)[left_to_right(prediction, threshold)]
+    rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
     return np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
 
 

@@ -114,8 +114,8 @@ class CurvePrediction:
 
     Attributes:
         logits: (Q, 2) class logits (softmax), index 1 is a lane.
-        curves: (Q, 8) lower and upper end (alpha, beta: rows v), k'', f'', m'', n', b'', b''' in fractions of the
-            image.
+        curves: (Q, 8) rows v of the upper and the lower end (alpha, beta; LSTR calls these numbers lower and upper),
+            k'', f'', m'', n', b'', b''' in fractions of the image.
     """
 
     logits: Float[Array, "*layers q 2"]

@@ -122,6 +122,12 @@ def test_the_threshold_chooses_the_lanes(network):
     assert sorted(reader(0.65).read(photo(), known).scores) == pytest.approx([0.7, 0.95])
 
 
+def test_a_lane_that_ends_above_its_beginning_is_none(network):
+    network["upper"] = 1.1  # of lanes that end at row 1
+    found = reader().read(photo(), PhotoCamera(horizon=449))
+    assert (found.lanes, found.warning) == ((), "")
+
+
 def test_what_lies_above_the_horizon_is_cut(network):
     network["upper"] = 0.0
     found = reader().read(photo(), PhotoCamera(horizon=449))

@@ -139,8 +139,10 @@ class PhotoReader:
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
         answer = jax.tree.map(lambda leaf: leaf[0], predict_curves(self.task, self.params, stacked))
         scores = lane_scores(answer)
-        chosen = np.flatnonzero(scores >= self.threshold)
-        curves = np.asarray(answer.curves, np.float64)[chosen]
+        curves = np.asarray(answer.curves, np.float64)
+        # A lane that would end above its beginning has no points, as in TuSimple's metric.
+        chosen = np.flatnonzero((scores >= self.threshold) & (curves[:, 1] > curves[:, 0]))
+        curves = curves[chosen]
         rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
         lanes = np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
         order = np.argsort(lanes[:, -1, 0], kind="stable")

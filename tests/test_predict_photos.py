@@ -1,6 +1,7 @@
 """`tflane predict` on many photos: one that cannot be read, and a run that is stopped, lose nothing else."""
 
 import json
+import sys
 from argparse import Namespace
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import pytest
 
 from tflane_jax.commands import predict_photos
 from tflane_jax.datasets.photos import fit_photo
+from tflane_jax.errors import UserError
 from tflane_jax.tasks.photo_lanes import PhotoLanes
 
 cv2 = pytest.importorskip("cv2")
@@ -68,6 +70,38 @@ def test_files_that_cannot_be_read_are_recorded_and_the_others_predicted(predict
         assert told.err.count(str(tmp_path / name)) == 1
     assert predict("a.png") == 0
     assert report(tmp_path)["faults"] == []
+
+
+def test_every_photo_has_a_picture_of_its_own(predict, tmp_path):
+    (tmp_path / "more").mkdir()
+    for name in ("a.png", "more/a.png", "more/a-2.png", "more/A.jpg"):
+        photo(tmp_path / name)
+    assert predict("a.png", "more", "a.png") == 0
+    records = report(tmp_path)["photos"]
+    assert len(records) == 4  # the one given twice has one answer
+    pictures = [record["picture"] for record in records]
+    assert len({picture.lower() for picture in pictures}) == 4
+    assert all((tmp_path / "out" / picture).is_file() for picture in pictures)
+
+
+def test_no_photo_is_replaced_by_a_picture(predict, tmp_path):
+    (tmp_path / "out").mkdir()
+    for name in ("road.png", "road-lanes.png"):
+        photo(tmp_path / "out" / name)
+    before = (tmp_path / "out" / "road-lanes.png").read_bytes()
+    with pytest.raises(UserError, match=r"road-lanes.png is one of the photos .* for .*road.png would replace it"):
+        predict("out")
+    assert (tmp_path / "out" / "road-lanes.png").read_bytes() == before
+    assert not (tmp_path / "out" / "predictions.json").exists()
+    assert predict("out/road.png") == 0  # its earlier picture may be replaced
+
+
+def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypatch):
+    photo(tmp_path / "a.png")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(UserError, match="pictures need matplotlib"):
+        predict("a.png")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_that_is_stopped_keeps_its_answers(predict, tmp_path):

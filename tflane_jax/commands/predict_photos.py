@@ -14,6 +14,7 @@ predictions.json, and one picture or video (MP4) for each input:
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json
 from tflane_jax.files.images import PHOTO_SUFFIXES, list_photos, opencv, read_image
 from tflane_jax.files.videos import VIDEO_SUFFIXES, read_frames, sample_frames, video_info, writing_video
+from tflane_jax.plots.figure import new_figure
 from tflane_jax.plots.images import lanes_drawn, save_photo
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import Run
@@ -44,14 +46,17 @@ def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int
 
     A file that cannot be read is recorded and told, the others are predicted, and the result is 2.
     """
-    opencv()  # without it every file would be a fault
-    inputs = list_photos(paths, (*PHOTO_SUFFIXES, *VIDEO_SUFFIXES))
+    inputs = list(dict.fromkeys(list_photos(paths, (*PHOTO_SUFFIXES, *VIDEO_SUFFIXES))))
     videos = [path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES]
     photos = [path for path in inputs if path not in videos]
+    opencv()  # without it, or matplotlib, every file would be a fault
+    if photos:
+        new_figure()
+    names = dict(zip(inputs, _names(inputs), strict=True))
+    _check_outputs({path: options.out / name for path, name in names.items()})
     camera = None if options.focal is None and options.horizon is None else PhotoCamera(options.focal, options.horizon)
     reader = PhotoReader(trained.config.task, trained.params[0], options.threshold)
     make_folder(options.out)
-    names = dict(zip(inputs, _names(inputs), strict=True))
     head = {"model": trained.name, "step": trained.step, "threshold": options.threshold}
     report = _Report(options.out / "predictions.json", head)
     try:
@@ -145,11 +150,24 @@ def _plain_view(view: Placement) -> dict[str, int]:
 
 
 def _names(inputs: list[Path]) -> list[str]:
-    """Return a file name for each input's picture; inputs with equal names in different folders get numbers."""
-    seen: dict[str, int] = {}
+    """Return a file name for each input's picture; of equal names, all but the first get numbers."""
+    taken: set[str] = set()
     names = []
     for path in inputs:
-        count = seen[path.stem] = seen.get(path.stem, 0) + 1
         suffix = ".mp4" if path.suffix.lower() in VIDEO_SUFFIXES else ".png"
-        names.append(f"{path.stem}-lanes{suffix}" if count == 1 else f"{path.stem}-{count}-lanes{suffix}")
+        stems = itertools.chain([path.stem], (f"{path.stem}-{count}" for count in itertools.count(2)))
+        stem = next(stem for stem in stems if stem.lower() not in taken)  # some file systems ignore case
+        taken.add(stem.lower())
+        names.append(f"{stem}-lanes{suffix}")
     return names
+
+
+def _check_outputs(outputs: dict[Path, Path]) -> None:
+    """Raise UserError if the picture of one input would replace another input."""
+    inputs = {path.resolve() for path in outputs}
+    for path, out in outputs.items():
+        if out.resolve() in inputs:
+            raise UserError(
+                f"{out} is one of the photos and videos to read, and the answer for {path} would replace it: choose "
+                "another folder as --out, or leave that file out"
+            )

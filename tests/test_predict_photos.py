@@ -3,14 +3,17 @@
 import json
 import sys
 from argparse import Namespace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tflane_jax.commands import predict_photos
+from tflane_jax.commands import predict as predict_command
+from tflane_jax.commands import predict_photos, sources
 from tflane_jax.datasets.photos import fit_photo
 from tflane_jax.errors import UserError
+from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.photo_lanes import PhotoLanes
 
 cv2 = pytest.importorskip("cv2")
@@ -102,6 +105,31 @@ def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypa
     with pytest.raises(UserError, match="pictures need matplotlib"):
         predict("a.png")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "setting", "said"),
+    [
+        (["a.png"], {"root": "TUSIMPLE"}, "--root selects labelled examples, and a.png is given too: leave one out"),
+        (["a.png"], {"split": "test"}, "--split selects"),
+        ([], {"horizon": 300.0}, "--horizon is of photos: name some, or leave it out"),
+        ([], {"focal": 0.0}, "--focal is of photos"),
+    ],
+)
+def test_options_without_effect_are_refused(monkeypatch, inputs, setting, said):
+    trained = SimpleNamespace(config=SimpleNamespace(task=LaneShapeTask()), name="model")
+    monkeypatch.setattr(predict_command, "opened", lambda options: (trained, [Path(name) for name in inputs]))
+    options = dict.fromkeys(("threshold", "split", "data", "root", "openlane", "focal", "horizon")) | setting
+    with pytest.raises(UserError, match=said):
+        predict_command.run(Namespace(**options))
+
+
+@pytest.mark.parametrize(("name", "what"), [("a.png", "is a file"), ("b.png", "does not exist")])
+def test_a_photo_in_place_of_the_model_is_told(tmp_path, name, what):
+    photo(tmp_path / "a.png")
+    options = Namespace(config=None, weights=None, checkpoint=None, inputs=[tmp_path / name])
+    with pytest.raises(UserError, match=f"{name} {what}: the first argument is a run folder, unless --config"):
+        sources.opened(options)
 
 
 def test_a_run_that_is_stopped_keeps_its_answers(predict, tmp_path):

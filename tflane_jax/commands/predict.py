@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from tflane_jax.commands import predict_images, predict_lanes, predict_photos
 from tflane_jax.commands.sources import opened
@@ -12,6 +13,7 @@ from tflane_jax.training.runtime import configure_jax
 
 # A lane line of LSTR is a query that is more probably a lane than not.
 _OF_LANES, _OF_LANE_LINES = 0.3, 0.5
+_OF_PHOTOS = "is of photos: name some, or leave it out"
 
 
 def run(options: argparse.Namespace) -> int:
@@ -21,6 +23,7 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
     trained, photos = opened(options)
     of_images = isinstance(trained.config.task, LaneShapeTask)
+    _check_inputs(options, photos)
     if options.threshold is None:
         options.threshold = _OF_LANE_LINES if of_images else _OF_LANES
     if not of_images:
@@ -34,3 +37,11 @@ def run(options: argparse.Namespace) -> int:
     if photos:
         return predict_photos.predict(trained, photos, options)
     return predict_images.predict_split(trained, options)
+
+
+def _check_inputs(options: argparse.Namespace, photos: list[Path]) -> None:
+    """Raise UserError for options that would have no effect on photos, or without them."""
+    for name in ("split", "data", "root", "openlane") if photos else ("focal", "horizon"):
+        if getattr(options, name) is not None:
+            said = f"selects labelled examples, and {photos[0]} is given too: leave one out" if photos else _OF_PHOTOS
+            raise UserError(f"--{name} {said}")

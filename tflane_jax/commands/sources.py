@@ -32,6 +32,12 @@ def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
         raise UserError("--weights are those of a configuration: add --config FILE")
     if not options.inputs:
         raise UserError("no model: give a run folder, or --config FILE with published weights")
+    if not options.inputs[0].is_dir():
+        what = "is a file" if options.inputs[0].exists() else "does not exist"
+        raise UserError(
+            f"{options.inputs[0]} {what}: the first argument is a run folder, unless --config FILE names a model with "
+            "published weights"
+        )
     return open_run(options.inputs[0], options.checkpoint), options.inputs[1:]
 
 

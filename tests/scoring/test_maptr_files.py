@@ -1,6 +1,7 @@
 """`tflane score maptr` on MapTR's own files: official numbers, and errors for damaged files."""
 
 import json
+import pickle
 import re
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 
 from tests.metrics.fixtures import expected_cases, load_maps
 from tflane_jax.cli import main
+from tflane_jax.errors import UserError
 from tflane_jax.metrics import MapDetections, MapTruth
 from tflane_jax.metrics.map_matching import CLASSES, LINE_CLASSES
-from tflane_jax.scoring.maptr import read_predictions, write_predictions
+from tflane_jax.scoring.maptr import read_predictions, read_truth, write_predictions
 
 
 def vectors(lines, scores=None):
@@ -72,6 +74,17 @@ def test_centerlines_are_a_fourth_class(tmp_path):
     assert code == 0
     assert (row["AP_divider"], row["AP_centerline"]) == (1.0, pytest.approx(2 / 3))
     assert row["mAP"] == pytest.approx((1 + 2 / 3) / 4)
+
+
+def test_a_count_of_points_that_is_an_array_is_named(tmp_path):
+    vector = {"pts": np.zeros((2, 2)), "cls_name": "divider"}
+    for count in (2, np.int64(2), np.array([2, 2])):
+        content = {"GTs": [{"sample_token": "s0", "vectors": [vector | {"pts_num": count}]}]}
+        (tmp_path / "anns.pkl").write_bytes(pickle.dumps(content))
+        if np.ndim(count) == 0:
+            assert len(read_truth(tmp_path / "anns.pkl")["s0"].points) == 1
+    with pytest.raises(UserError, match=r"vectors\[0\].pts_num is array\(\[2, 2\]\), but pts has 2 points"):
+        read_truth(tmp_path / "anns.pkl")
 
 
 def test_the_title_names_centerlines_that_the_first_sample_lacks(tmp_path, capsys):

@@ -102,8 +102,9 @@ def _lines(vectors: Any, where: str, least: int, dims: Dims) -> tuple[list[np.nd
         if line.shape[1] != dims:
             other = "maptr or maptrv2" if dims == 3 else "maptrv2-3d"
             raise UserError(f"{at}.pts has shape {line.shape}, expected (n, {dims}): such files are scored by {other}")
-        if "pts_num" in vector and vector["pts_num"] != len(line):
-            told = reprlib.repr(vector["pts_num"])
+        count = vector.get("pts_num", len(line))
+        if not isinstance(count, (int, float, np.number)) or count != len(line):
+            told = reprlib.repr(count)
             raise UserError(f"{at}.pts_num is {told}, but pts has {len(line)} points: is the line cut off?")
         name = member(vector, "cls_name", at)
         if not isinstance(name, str) or name not in LINE_CLASSES:

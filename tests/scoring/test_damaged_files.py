@@ -125,6 +125,20 @@ def test_what_is_unusual_is_said_beside_the_score(name, folder, capsys):
     assert [f"tflane: {remark}" for remark in written] == said
 
 
+@pytest.mark.parametrize(
+    ("settings", "message", "most"),
+    [({"bootstrap": 5}, "there is only 1: leave --bootstrap out", 0), ({"by": "occlusion"}, "no visibility", 1)],
+)
+def test_what_cannot_be_reported_is_said_before_all_is_scored(folder, tmp_path, monkeypatch, settings, message, most):
+    scenes, begun = tmp_path / "scenes.json", []
+    scenes.write_text(json.dumps(dict.fromkeys(["s0", "s1", "s2"], "a")))
+    counted = score.score
+    monkeypatch.setattr(score, "score", lambda *arguments: begun.append(1) or counted(*arguments))
+    with pytest.raises(UserError, match=message):
+        run(valid(folder), folder, scenes=scenes, **settings)
+    assert len(begun) == most
+
+
 def valid(folder, form="maptr"):
     return Case(form, "truth", "", "").write(folder)
 

@@ -13,7 +13,7 @@ from tflane_jax.files.atomic import check_writable
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
 from tflane_jax.scoring.scenes import read_scenes, scene_names
-from tflane_jax.scoring.score import Scored, score
+from tflane_jax.scoring.score import Scored, check_bootstrap, score
 
 
 def run(options: argparse.Namespace) -> int:
@@ -25,6 +25,11 @@ def run(options: argparse.Namespace) -> int:
     predictions, truth = protocol.read(options.predictions, options.truth)
     scene_of = protocol.scene_of if named is None or scenes is None else scene_names(scenes, truth, named)
     files = f"{options.predictions} against {options.truth}"
+    if options.bootstrap and truth:
+        check_bootstrap(len(set(map(scene_of, truth))))
+    # Groups first: they ask for more than the total, and may fail at the first frame.
+    grouping = protocol.groups.get(options.by or "")
+    groups = None if grouping is None else _scored(files, lambda: score(predictions, truth, grouping, scene_of)).total()
     scored = _scored(files, lambda: score(predictions, truth, protocol.metrics, scene_of))
     remarks = protocol.remarks(predictions, truth)
     if options.bootstrap and protocol.no_scenes and named is None:
@@ -32,9 +37,7 @@ def run(options: argparse.Namespace) -> int:
     for remark in remarks:
         print(f"tflane: {remark}", file=sys.stderr)
     rows = _rows(scored, options.by, options.bootstrap)
-    if (grouping := protocol.groups.get(options.by or "")) is not None:
-        grouped = _scored(files, lambda: score(predictions, truth, grouping, scene_of)).total()
-        rows += [{"part": group, **values} for group, values in grouped.items() if group != "all"]
+    rows += [{"part": group, **values} for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
     shown = [name for name in ("part", *protocol.columns, "frames") if any(name in row for row in rows)]

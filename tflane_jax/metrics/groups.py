@@ -121,7 +121,7 @@ class ByOcclusion:
     def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
         """Return which of the true lanes belong to a group; raise UserError if their visibility is not known."""
         if truth.visibility is None:
-            raise UserError("the truth has no visibility of its lanes: report the group 'all' only")
+            raise UserError("the truth has no visibility of its lanes: leave out the groups by occlusion")
         visibility = np.asarray(truth.visibility)
         if visibility.shape != (len(truth.points),):
             raise UserError(f"truth: visibility has shape {visibility.shape}, expected {(len(truth.points),)}")

@@ -65,8 +65,7 @@ class Scored:
         Raises UserError for fewer than two scenes.
         """
         scenes = list(self.scenes.values())
-        if len(scenes) < 2:
-            raise UserError("a bootstrap draws whole scenes, and there is only one: no interval can be given")
+        check_bootstrap(len(scenes))
         rng = np.random.default_rng(seed)
         drawn: dict[str, list[float]] = {}
         for _ in progress_bar(range(samples), desc="bootstrap", unit="sample", disable=not progress):
@@ -104,6 +103,12 @@ def score(
         except UserError as error:
             raise UserError(f"frame {key}: {error}") from None
     return Scored(dict(sorted(scenes.items())))
+
+
+def check_bootstrap(scenes: int) -> None:
+    """Raise UserError if there are too few scenes for a bootstrap."""
+    if scenes < 2:
+        raise UserError(f"a bootstrap draws whole scenes, and there is only {scenes}: leave --bootstrap out")
 
 
 def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, Any]) -> None:

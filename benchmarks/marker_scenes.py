@@ -51,7 +51,7 @@ from tflane_jax.markers.observe import observe
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore
-from tflane_jax.models.marker_fusion import MarkerPrior
+from tflane_jax.models.marker_fusion import MarkerPrior, as_fused
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.run_checks import shapes_of_params
@@ -171,6 +171,7 @@ class Parts:
             has_previous=np.asarray(before is not None),
         )
         guidance, self._bank = self._observe(example, self._bank)
+        guidance = as_fused(guidance, self._prior.config)
         self._before = moment, detected
         return replace(example, cameras=fitted_views(frame.views, self.model.source)), jax.device_get(guidance)
 

@@ -23,11 +23,14 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.marker_fusion import uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.scene import CameraViews
+from tflane_jax.tasks import marker_drive
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.marker_drive import (
+    SHOWN,
     DriveModel,
     FrameRateWarning,
     MarkerDrive,
@@ -100,6 +103,26 @@ def test_a_pause_longer_than_the_memory_is_a_new_start():
         )
         assert seen.guidance.valid.any()
         assert (gap.remembered, bool(gap.guidance.valid.any())) == (remembered, remembered)
+
+
+@pytest.mark.parametrize(
+    ("fusion", "trust", "gate"),
+    [
+        (SHOWN, np.exp(-6.0), np.exp(-6.0)),
+        (uniform_fusion(SHOWN), 1.0, 1.0),
+        (replace(SHOWN, fusion="hard"), np.exp(-6.0), 0.0),  # ignored, as by the model
+    ],
+)
+def test_a_distrusted_board_is_shown_as_the_model_takes_it(monkeypatch, fusion, trust, gate):
+    """A board with a residual of 60 m, in the first frame: no lanes are remembered."""
+    monkeypatch.setattr(marker_drive, "SHOWN", fusion)
+    board = {3: BOARDS[3]}
+    frame = MarkerDrive(MarkerReader(STORE, ReaderConfig(first_residual=60.0))).step(seen_from(0.0, board), 0, ego(0.0))
+    far = np.exp(-np.hypot(20.0, 5.0) / 40.0) if trust < 1.0 else 1.0
+    assert frame.confidence.tolist() == [pytest.approx(trust * far, rel=0.01), 0.0]
+    assert float(frame.guidance.gate) == pytest.approx(gate * far, rel=0.01)
+    assert frame.guidance.valid.any() == (gate > 0.0)
+    assert not frame.remembered
 
 
 def test_another_drive_starts_without_the_memory_of_the_last_one():

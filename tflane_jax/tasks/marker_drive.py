@@ -22,12 +22,12 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.image_search import ImageMarkers
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig, Reading
-from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior
+from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior, as_fused
 from tflane_jax.models.parameters import Params
 from tflane_jax.models.prior import HostSpec
-from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemoryConfig
-from tflane_jax.priors.markers import confidence
-from tflane_jax.scene import CameraViews, Prediction
+from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemory, MarkerMemoryConfig, reads_bank
+from tflane_jax.priors.markers import marker_confidence, select_marker_lanes
+from tflane_jax.scene import CameraViews, MarkerObservations, Prediction
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 # Gate and memory that are shown without a model, and the paper's distance of frames, seconds.
@@ -65,9 +65,9 @@ class DriveStep(NamedTuple):
 
     Attributes:
         reading: detections, and the prior.
-        confidence: (M,) Eq. (2) of each marker of the prior, 0 where not valid.
-        guidance: prior tokens after gate and memory: the frame's lanes, or remembered ones.
-        remembered: the lanes come from earlier frames.
+        confidence: (M,) of each marker of the prior as the model computes it, Eq. (2) by default; 0 where not valid.
+        guidance: prior tokens after gate and memory, as they enter Eq. (3): the frame's lanes, or remembered ones.
+        remembered: lanes of earlier frames are among them.
         prediction: of the model; None without one.
     """
 
@@ -88,7 +88,7 @@ class MarkerDrive:
         reader: of the store.
         model: with or without a marker prior; None shows the prior alone.
 
-    Raises UserError for a model that cannot run on images.
+    `step` raises UserError for a model that cannot run on these images.
     """
 
     def __init__(self, reader: MarkerReader, model: DriveModel | None = None):
@@ -131,20 +131,22 @@ class MarkerDrive:
         )
         self._last = timestamp_ns, np.asarray(global_from_ego, np.float64)
         guidance, self._bank = self._observe(example, self._bank)
-        guidance = jax.device_get(guidance)
+        guidance = jax.device_get(as_fused(guidance, self._prior.config))
         prediction = None
         if self.model is not None and self._step is not None:
             example = replace(example, cameras=fitted_views(views, self.model.source))
             self._memory, prediction = self._step(self.model.params, self._memory, example)
             prediction = jax.device_get(prediction)
-        config = self._prior.config
-        trust = confidence(np.hypot(*markers.pose[:, :2, 3].T), markers.residual, config.prior)
-        trust = np.where(markers.valid, trust, 0.0)
-        # As `remember` decides; without a memory nothing is remembered.
-        threshold = 0.0 if config.memory is None else config.memory.threshold
-        seen = float(trust[markers.lane_valid.any(-1)].max(initial=0.0))
-        remembered = bool(guidance.valid.any()) and seen < threshold
+        trust = np.asarray(marker_confidence(markers, self._prior.config.prior))
+        remembered = bool(guidance.valid.any()) and _reads_memory(markers, self._bank, self._prior.config)
         return DriveStep(reading, trust, guidance, remembered, prediction)
+
+
+def _reads_memory(markers: MarkerObservations, bank: MarkerMemory | None, config: MarkerFusionConfig) -> bool:
+    """Return whether a frame uses lanes of earlier frames; `bank` is the memory for the next frame."""
+    if bank is None or config.memory is None or not np.asarray(bank.valid)[1:].any():
+        return False
+    return bool(reads_bank(select_marker_lanes(markers, config.prior), config.memory))
 
 
 def as_trained(config: ReaderConfig, model: DriveModel | None) -> ReaderConfig:

@@ -146,7 +146,7 @@ class Parts:
     def restart(self) -> None:
         """Begin another scene."""
         self._before: tuple[KeyFrame, DetectedMarkers] | None = None
-        self._bank = self._prior.start()
+        self._bank = self._prior.start() if self.model.task.streams else None
 
     def frame(self, frame: Frame, searched: Sequence[ImageMarkers]) -> tuple[Example, MarkerGuidance]:
         """Return what the model reads, and the lanes after gate and memory."""
@@ -177,7 +177,7 @@ class Parts:
 
 
 class Stream:
-    """A model with its memory, frame by frame."""
+    """A model with its memory, frame by frame; one that was trained on single frames has none."""
 
     def __init__(self, model: DriveModel, step: Any):
         self._model, self._step = model, step
@@ -185,11 +185,12 @@ class Stream:
 
     def restart(self) -> None:
         """Begin another scene."""
-        self._memory = self._model.task.start()
+        self._memory = self._model.task.start() if self._model.task.streams else None
 
     def answer(self, example: Example) -> Prediction:
         """Return the prediction for the next frame."""
-        self._memory, found = self._step(self._model.params, self._memory, example)
+        following, found = self._step(self._model.params, self._memory, example)
+        self._memory = following if self._model.task.streams else None
         return jax.device_get(found)
 
 

@@ -3,8 +3,10 @@
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -67,10 +69,10 @@ def test_a_model_of_photos_is_refused():
 @pytest.mark.slow
 def test_a_drive_with_a_model_is_the_composition_of_its_parts():
     model = replace(CAMERA_TOPONET, denoising=None, priors=PriorsConfig(markers=CONFIG))
-    task = LaneGraphTask(model)
+    task = LaneGraphTask(model, clip=2)
     rig = CameraRigConfig(cameras=(FRONT, replace(FRONT, name="again")), scale=0.1, multiple=32)
     source = ProceduralConfig(example=ExampleConfig(range=model.range, sensor=None, cameras=rig))
-    params = random_params(task.init, make_camera_example())
+    params = random_params(replace(task, clip=1).init, make_camera_example())
     config = ReaderConfig(range=model.range)
     drive, reader = (
         MarkerDrive(MarkerReader(STORE, config), DriveModel(task, params, source)),
@@ -91,6 +93,33 @@ def test_a_drive_with_a_model_is_the_composition_of_its_parts():
         np.testing.assert_allclose(found.prediction.centerlines.points, expected.centerlines.points, atol=1e-4)
         assert set(found.reading.observed.outcomes) == {3, 8}
         assert not found.remembered
+
+
+class Remembering:
+    """A task that predicts the number of frames in its memory, -1 without a memory."""
+
+    model = SimpleNamespace(priors=PriorsConfig(markers=SHOWN), spec=CAMERA_TOPONET.spec)
+
+    def __init__(self, streams):
+        self.streams = streams
+
+    def start(self):
+        return jnp.zeros((), int)
+
+    def step(self, params, memory, example):
+        return (jnp.zeros((), int), jnp.asarray(-1)) if memory is None else (memory + 1, memory)
+
+
+@pytest.mark.parametrize(("streams", "frames"), [(False, [-1, -1]), (True, [0, 1])])
+def test_a_model_of_single_frames_has_no_memory(monkeypatch, streams, frames):
+    """Its BEV features and markers of earlier frames are none that it has learned to use."""
+    monkeypatch.setattr(marker_drive, "fitted_views", lambda views, source: views)
+    model = DriveModel(Remembering(streams), {}, ProceduralConfig())  # pyright: ignore
+    drive = MarkerDrive(MarkerReader(STORE), model)
+    seen, gap = (drive.step(seen_from(x, boards), i, ego(x)) for i, (x, boards) in enumerate([(0.0, None), (4.0, {})]))
+    assert [int(frame.prediction) for frame in (seen, gap)] == frames  # pyright: ignore
+    assert seen.guidance.valid.any()
+    assert gap.guidance.valid.any() == gap.remembered == streams
 
 
 def test_a_pause_longer_than_the_memory_is_a_new_start():

@@ -82,7 +82,8 @@ class MarkerDrive:
     """The markers of a drive and a model's lanes, frame by frame.
 
     Memory counts frames: give them as far apart as in training (`interval`). A pause longer than the memory, T of those
-    intervals, is the start of another drive.
+    intervals, is the start of another drive. As in evaluation, a model that was trained on single frames has no memory,
+    neither of markers nor of BEV features.
 
     Args:
         reader: of the store.
@@ -99,6 +100,8 @@ class MarkerDrive:
         configured = None if model is None else model.task.model.priors.markers
         spec = HostSpec(1, sizes.range, sizes.range) if model is None else model.task.model.spec
         self._prior = MarkerPrior(configured or SHOWN, spec)
+        self._model_remembers = model is not None and model.task.streams
+        self._prior_remembers = configured is None or self._model_remembers
         self._observe = jax.jit(self._prior.observe)
         self._step = None if model is None else jax.jit(model.task.step)
         memory = self._prior.config.memory or MarkerMemoryConfig()
@@ -108,8 +111,9 @@ class MarkerDrive:
 
     def restart(self, reader: MarkerReader) -> None:
         """Begin another drive, with its own store, without compiling the model again."""
-        self.reader, self._last, self._bank = reader, None, self._prior.start()
-        self._memory = None if self.model is None else self.model.task.start()
+        self.reader, self._last = reader, None
+        self._bank = self._prior.start() if self._prior_remembers else None
+        self._memory = self.model.task.start() if self.model is not None and self._model_remembers else None
 
     def step(
         self,
@@ -135,7 +139,8 @@ class MarkerDrive:
         prediction = None
         if self.model is not None and self._step is not None:
             example = replace(example, cameras=fitted_views(views, self.model.source))
-            self._memory, prediction = self._step(self.model.params, self._memory, example)
+            following, prediction = self._step(self.model.params, self._memory, example)
+            self._memory = following if self._model_remembers else None
             prediction = jax.device_get(prediction)
         trust = np.asarray(marker_confidence(markers, self._prior.config.prior))
         remembered = bool(guidance.valid.any()) and _reads_memory(markers, self._bank, self._prior.config)

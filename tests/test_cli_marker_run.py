@@ -2,23 +2,26 @@
 
 import datetime
 import json
+import warnings
 
 import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, pose
 from tests.markers.test_reader import BOARDS, LANES, SECOND, ego, seen_from
+from tests.tasks.test_marker_drive import Remembering
 from tflane_jax.cli import main
 from tflane_jax.commands import marker_run
 from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, save_drive
 from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.markers.store import store_of
 from tflane_jax.markers.store_files import save_store
 from tflane_jax.priors.markers import MarkerPriorConfig, confidence
 from tflane_jax.scene.logs import PlacedMarkers
 from tflane_jax.tasks.lane_graph import LaneGraphTask
-from tflane_jax.tasks.marker_drive import DriveModel
+from tflane_jax.tasks.marker_drive import DriveModel, FrameRateWarning
 
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("matplotlib")
@@ -124,6 +127,23 @@ def test_a_model_that_cannot_read_the_images_is_refused_before_they_are_searched
     assert main(arguments(drive, tmp_path / "out", model="evidence")) == 2
     assert "BEV evidence" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("streams", [False, True])
+def test_the_rate_of_frames_counts_for_models_with_memory_alone(drive, tmp_path, monkeypatch, streams):
+    """Frames of training are 2 s apart, those of the drive half a second."""
+
+    def search(*_):
+        raise UserError("searched")
+
+    model = DriveModel(Remembering(streams), {}, ProceduralConfig())  # pyright: ignore
+    monkeypatch.setattr(marker_run, "_model", lambda folder: model)
+    monkeypatch.setattr(marker_run, "fitted_views", lambda views, source: views)
+    monkeypatch.setattr(marker_run, "search_views", search)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        assert main(arguments(drive, tmp_path / "out", model="any")) == 2
+    assert [each.category for each in found] == [FrameRateWarning] * streams
 
 
 @pytest.mark.parametrize(

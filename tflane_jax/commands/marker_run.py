@@ -67,7 +67,8 @@ def run(options: argparse.Namespace) -> int:
     if model is not None:
         # A model that cannot read these images is refused before they are searched, which takes seconds each.
         fitted_views(drive.views(drive.frames[0]), model.source)
-    check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
+    if steps.remembers:
+        check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
     make_folder(options.out)
     frames, outcomes = [], Counter()
     with warnings.catch_warnings():

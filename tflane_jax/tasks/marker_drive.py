@@ -109,6 +109,11 @@ class MarkerDrive:
         self._last: tuple[int, Float[np.ndarray, "4 4"]] | None
         self.restart(reader)
 
+    @property
+    def remembers(self) -> bool:
+        """Whether earlier frames count, so that the rate of frames does; always without a model."""
+        return self.model is None or self._model_remembers
+
     def restart(self, reader: MarkerReader) -> None:
         """Begin another drive, with its own store, without compiling the model again."""
         self.reader, self._last = reader, None

@@ -27,6 +27,8 @@ from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
 from tflane_jax.models.marker_fusion import uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.scene import CameraViews
 from tflane_jax.tasks import marker_drive
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -36,6 +38,7 @@ from tflane_jax.tasks.marker_drive import (
     DriveModel,
     FrameRateWarning,
     MarkerDrive,
+    MissingPriorWarning,
     as_trained,
     check_model,
     check_rate,
@@ -64,6 +67,18 @@ def two_views(x):
 def test_a_model_of_photos_is_refused():
     with pytest.raises(UserError, match="single photos"):
         check_model(LaneShapeTask())
+
+
+def test_priors_that_a_drive_lacks_are_warned_of():
+    def task(**priors):
+        return LaneGraphTask(replace(CAMERA_TOPONET, priors=PriorsConfig(**priors)))
+
+    check_model(task())
+    check_model(task(markers=CONFIG))
+    with pytest.warns(MissingPriorWarning, match="reads an SD map, and a drive has none"):
+        check_model(task(markers=CONFIG, sd_map=SMALL_SD_MAP))
+    with pytest.warns(MissingPriorWarning, match="reads an SD map and traffic flow"):
+        check_model(task(sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()))
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from tflane_jax.models.prior import HostSpec
 from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemory, MarkerMemoryConfig, reads_bank
 from tflane_jax.priors.markers import marker_confidence, select_marker_lanes
 from tflane_jax.scene import CameraViews, MarkerObservations, Prediction
+from tflane_jax.tasks.fit import reads_traffic
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 # Gate and memory that are shown without a model, and the paper's distance of frames, seconds.
@@ -35,6 +36,10 @@ SHOWN = MarkerFusionConfig(memory=MarkerMemoryConfig(lanes=32))
 INTERVAL = 0.5
 # A drive whose frames are more than this fraction nearer or farther apart than in training is warned of.
 _OFF = 0.5
+
+
+class MissingPriorWarning(UserWarning):
+    """A model reads a prior that a drive does not have."""
 
 
 class FrameRateWarning(UserWarning):
@@ -187,7 +192,17 @@ def check_rate(times_ns: Sequence[int], interval: float) -> None:
 
 
 def check_model(task: Any) -> LaneGraphTask:
-    """Return the task of a model for drives; raises UserError for one that predicts no lanes around the vehicle."""
+    """Return the task of a model for drives; raises UserError for one that predicts no lanes around the vehicle.
+
+    Warns (`MissingPriorWarning`) of a model with another prior than markers, which finds it empty in every frame.
+    """
     if not isinstance(task, LaneGraphTask):
         raise UserError("the model reads single photos: give --model a run of a host with cameras")
+    found = {"an SD map": task.model.priors.sd_map is not None, "traffic flow": reads_traffic(task.model)}
+    if absent := " and ".join(name for name, there in found.items() if there):
+        warnings.warn(
+            f"the model reads {absent}, and a drive has none: its lanes may be worse than in its evaluation",
+            MissingPriorWarning,
+            stacklevel=2,
+        )
     return task

@@ -3,6 +3,7 @@
 import datetime
 import json
 import warnings
+from argparse import Namespace
 
 import numpy as np
 import pytest
@@ -107,6 +108,14 @@ def test_errors_are_one_message(drive, tmp_path, capsys, change, words):
     assert words in error
     assert "Traceback" not in error
     assert not (tmp_path / "out").exists()
+
+
+def test_any_number_of_days_is_an_age():
+    day = datetime.date(2026, 2, 1)
+    old = store_of(LANES, PlacedMarkers(np.array([3]), BOARDS[3][None]), surveyed=datetime.date(1, 1, 1)).markers[3]
+    age = marker_run._age(Namespace(max_age_days=10**12))
+    assert not old.outdated(day, age)
+    assert marker_run._age(Namespace(max_age_days=None)) is None
 
 
 def test_a_store_of_another_family_is_refused(drive, tmp_path, capsys):

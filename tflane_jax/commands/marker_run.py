@@ -138,7 +138,8 @@ def _day(options: argparse.Namespace) -> datetime.date:
 def _age(options: argparse.Namespace) -> int | None:
     if options.max_age_days is not None and options.max_age_days < 0:
         raise UserError(f"--max-age-days is a number of days, not {options.max_age_days}")
-    return options.max_age_days
+    # Python counts no more days; no survey is older.
+    return None if options.max_age_days is None else min(options.max_age_days, datetime.timedelta.max.days)
 
 
 def _confidence(step: DriveStep) -> dict[int, float]:

@@ -51,7 +51,7 @@ from tflane_jax.markers.observe import observe
 from tflane_jax.markers.pixels import PixelConfig
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.store import MarkerStore
-from tflane_jax.models.marker_fusion import MarkerPrior
+from tflane_jax.models.marker_fusion import MarkerPrior, as_fused
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.priors.marker_memory import MarkerGuidance
 from tflane_jax.run_checks import shapes_of_params
@@ -146,7 +146,7 @@ class Parts:
     def restart(self) -> None:
         """Begin another scene."""
         self._before: tuple[KeyFrame, DetectedMarkers] | None = None
-        self._bank = self._prior.start()
+        self._bank = self._prior.start() if self.model.task.streams else None
 
     def frame(self, frame: Frame, searched: Sequence[ImageMarkers]) -> tuple[Example, MarkerGuidance]:
         """Return what the model reads, and the lanes after gate and memory."""
@@ -171,12 +171,13 @@ class Parts:
             has_previous=np.asarray(before is not None),
         )
         guidance, self._bank = self._observe(example, self._bank)
+        guidance = as_fused(guidance, self._prior.config)
         self._before = moment, detected
         return replace(example, cameras=fitted_views(frame.views, self.model.source)), jax.device_get(guidance)
 
 
 class Stream:
-    """A model with its memory, frame by frame."""
+    """A model with its memory, frame by frame; one that was trained on single frames has none."""
 
     def __init__(self, model: DriveModel, step: Any):
         self._model, self._step = model, step
@@ -184,11 +185,12 @@ class Stream:
 
     def restart(self) -> None:
         """Begin another scene."""
-        self._memory = self._model.task.start()
+        self._memory = self._model.task.start() if self._model.task.streams else None
 
     def answer(self, example: Example) -> Prediction:
         """Return the prediction for the next frame."""
-        self._memory, found = self._step(self._model.params, self._memory, example)
+        following, found = self._step(self._model.params, self._memory, example)
+        self._memory = following if self._model.task.streams else None
         return jax.device_get(found)
 
 

@@ -2,19 +2,27 @@
 
 import datetime
 import json
+import warnings
+from argparse import Namespace
 
 import numpy as np
 import pytest
 
 from tests.markers.test_detection import AHEAD, pose
 from tests.markers.test_reader import BOARDS, LANES, SECOND, ego, seen_from
+from tests.tasks.test_marker_drive import Remembering
 from tflane_jax.cli import main
+from tflane_jax.commands import marker_run
 from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, save_drive
+from tflane_jax.datasets.procedural import ProceduralConfig
+from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
 from tflane_jax.markers.store import store_of
 from tflane_jax.markers.store_files import save_store
 from tflane_jax.priors.markers import MarkerPriorConfig, confidence
 from tflane_jax.scene.logs import PlacedMarkers
+from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.marker_drive import DriveModel, FrameRateWarning
 
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("matplotlib")
@@ -99,4 +107,66 @@ def test_errors_are_one_message(drive, tmp_path, capsys, change, words):
     error = capsys.readouterr().err
     assert words in error
     assert "Traceback" not in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_any_number_of_days_is_an_age():
+    day = datetime.date(2026, 2, 1)
+    old = store_of(LANES, PlacedMarkers(np.array([3]), BOARDS[3][None]), surveyed=datetime.date(1, 1, 1)).markers[3]
+    age = marker_run._age(Namespace(max_age_days=10**12))
+    assert not old.outdated(day, age)
+    assert marker_run._age(Namespace(max_age_days=None)) is None
+
+
+def test_a_store_of_another_family_is_refused(drive, tmp_path, capsys):
+    """With the wrong family no board is ever found."""
+    record = json.loads((drive / "store.json").read_text())
+    record["markers"][0]["id"] = 40
+    (tmp_path / "store.json").write_text(json.dumps(record))
+    change = {"store": tmp_path / "store.json", "family": "APRILTAG_16H5"}
+    assert main(arguments(drive, tmp_path / "out", **change)) == 2
+    assert "store.json holds marker 40, and ids of APRILTAG_16H5 end at 29" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_cannot_read_the_images_is_refused_before_they_are_searched(drive, tmp_path, capsys, monkeypatch):
+    model = DriveModel(LaneGraphTask(), {}, ProceduralConfig())
+    monkeypatch.setattr(marker_run, "_model", lambda folder: model)
+    monkeypatch.setattr(marker_run, "search_views", lambda *_: pytest.fail("searched"))
+    assert main(arguments(drive, tmp_path / "out", model="evidence")) == 2
+    assert "BEV evidence" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("streams", [False, True])
+def test_the_rate_of_frames_counts_for_models_with_memory_alone(drive, tmp_path, monkeypatch, streams):
+    """Frames of training are 2 s apart, those of the drive half a second."""
+
+    def search(*_):
+        raise UserError("searched")
+
+    model = DriveModel(Remembering(streams), {}, ProceduralConfig())  # pyright: ignore
+    monkeypatch.setattr(marker_run, "_model", lambda folder: model)
+    monkeypatch.setattr(marker_run, "fitted_views", lambda views, source: views)
+    monkeypatch.setattr(marker_run, "search_views", search)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        assert main(arguments(drive, tmp_path / "out", model="any")) == 2
+    assert [each.category for each in found] == [FrameRateWarning] * streams
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (["--log", "-1"], "--log"),
+        (["--cameras", "0"], "--cameras is 1 to 7"),
+        (["--cameras", "-1"], "--cameras is 1 to 7"),
+        (["--cameras", "7", "--ring", "nuscenes"], "--cameras is 1 to 6, the cameras of --ring nuscenes"),
+        (["--frames", "0"], "--frames"),
+    ],
+)
+def test_render_refuses_what_it_cannot_draw(tmp_path, capsys, change, words):
+    arguments = ["markers", "render", "--log", "1", "--out", str(tmp_path / "out"), *change]
+    assert main(arguments) == 2
+    assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -75,6 +75,14 @@ def test_a_distrusted_frame_uses_the_bank_and_is_stored_in_it():
     np.testing.assert_allclose(out[2].weight.reshape(4, LANES)[1:3, 0], np.sqrt([0.05, 0.225]), rtol=1e-6)
 
 
+def test_with_a_threshold_of_zero_only_gaps_are_filled():
+    _, (_, weak, gap) = run([seen(0.9), seen(0.01, at=3.0), NOTHING], replace(CONFIG, threshold=0.0))
+    assert weak.gate == pytest.approx(0.01)
+    np.testing.assert_array_equal(np.flatnonzero(weak.valid), [0, 1])
+    assert gap.gate == pytest.approx(0.9 * 0.5**2)
+    assert gap.valid.sum() == 4
+
+
 def test_a_long_union_keeps_its_heaviest_lanes_with_their_connectivity():
     pair = seen(0.9)
     pair.successor[0, 1] = True

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tflane_jax.priors.markers import MarkerPriorConfig, confidence, select_marker_lanes, stride
+from tflane_jax.priors.markers import MarkerPriorConfig, confidence, marker_confidence, select_marker_lanes, stride
 from tflane_jax.scene import MarkerObservations
 
 CONFIG = MarkerPriorConfig(points=3, lanes=7)
@@ -123,6 +123,15 @@ def test_all_markers_can_be_trusted_alike():
     assert chosen.frame_confidence == 1.0
     first = markers.lanes[0, np.flatnonzero(markers.lane_valid[0])[0]]
     np.testing.assert_array_equal(chosen.points[0, [0, -1]], first[[0, -1], :2])
+
+
+@pytest.mark.parametrize("changed", [{}, {"use_score": True}, {"trust": "all"}])
+def test_the_confidence_of_a_marker_is_that_of_its_lanes(changed):
+    config = replace(CONFIG, **changed)
+    markers = observations(markers=3, valid=(True, True, False), garbage=np.nan).replace(lane_valid=np.eye(3) > 0)
+    trust, chosen = marker_confidence(markers, config), select_marker_lanes(markers, config)
+    assert trust[2] == 0.0
+    np.testing.assert_array_equal(chosen.confidence[:2], sorted(trust[:2], reverse=True))
 
 
 def test_too_few_points_are_refused():

@@ -19,10 +19,13 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
+from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.area_decoder import AreaDecoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
+from tflane_jax.models.marker_fusion import MarkerFusionConfig
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import Prediction, stack_examples
@@ -104,6 +107,13 @@ def test_a_model_of_traffic_flow_needs_data_with_it():
     limit_instances(task, 0).check(WorldData(), without)  # the matched control reads none
     with pytest.raises(UserError, match=r"reads 20 past frames .*hold 6 \(data\.example\.history\)"):
         task.check(WorldData(example=ExampleConfig(history=6)), EXAMPLES)
+
+
+def test_a_marker_prior_needs_as_many_points_as_it_reads():
+    task = LaneGraphTask(replace(TopoNetConfig(), priors=PriorsConfig(markers=MarkerFusionConfig())))
+    task.check(WorldData(example=ExampleConfig(markers=MarkerConfig(points=12))), EXAMPLES)
+    with pytest.raises(UserError, match=r"reads 11 points .*hold 7 \(data\.example\.markers\.points\)"):
+        task.check(WorldData(example=ExampleConfig(markers=MarkerConfig(points=7))), EXAMPLES)
 
 
 def test_truth_beyond_the_bev_features_is_named():

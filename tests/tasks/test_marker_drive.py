@@ -3,8 +3,10 @@
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -23,14 +25,20 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig
 from tflane_jax.markers.simulation import MarkerConfig, MarkerSimulationConfig
+from tflane_jax.models.marker_fusion import uniform_fusion
 from tflane_jax.models.priors import PriorsConfig
+from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.scene import CameraViews
+from tflane_jax.tasks import marker_drive
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.marker_drive import (
+    SHOWN,
     DriveModel,
     FrameRateWarning,
     MarkerDrive,
+    MissingPriorWarning,
     as_trained,
     check_model,
     check_rate,
@@ -61,13 +69,25 @@ def test_a_model_of_photos_is_refused():
         check_model(LaneShapeTask())
 
 
+def test_priors_that_a_drive_lacks_are_warned_of():
+    def task(**priors):
+        return LaneGraphTask(replace(CAMERA_TOPONET, priors=PriorsConfig(**priors)))
+
+    check_model(task())
+    check_model(task(markers=CONFIG))
+    with pytest.warns(MissingPriorWarning, match="reads an SD map, and a drive has none"):
+        check_model(task(markers=CONFIG, sd_map=SMALL_SD_MAP))
+    with pytest.warns(MissingPriorWarning, match="reads an SD map and traffic flow"):
+        check_model(task(sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()))
+
+
 @pytest.mark.slow
 def test_a_drive_with_a_model_is_the_composition_of_its_parts():
     model = replace(CAMERA_TOPONET, denoising=None, priors=PriorsConfig(markers=CONFIG))
-    task = LaneGraphTask(model)
+    task = LaneGraphTask(model, clip=2)
     rig = CameraRigConfig(cameras=(FRONT, replace(FRONT, name="again")), scale=0.1, multiple=32)
     source = ProceduralConfig(example=ExampleConfig(range=model.range, sensor=None, cameras=rig))
-    params = random_params(task.init, make_camera_example())
+    params = random_params(replace(task, clip=1).init, make_camera_example())
     config = ReaderConfig(range=model.range)
     drive, reader = (
         MarkerDrive(MarkerReader(STORE, config), DriveModel(task, params, source)),
@@ -90,6 +110,33 @@ def test_a_drive_with_a_model_is_the_composition_of_its_parts():
         assert not found.remembered
 
 
+class Remembering:
+    """A task that predicts the number of frames in its memory, -1 without a memory."""
+
+    model = SimpleNamespace(priors=PriorsConfig(markers=SHOWN), spec=CAMERA_TOPONET.spec)
+
+    def __init__(self, streams):
+        self.streams = streams
+
+    def start(self):
+        return jnp.zeros((), int)
+
+    def step(self, params, memory, example):
+        return (jnp.zeros((), int), jnp.asarray(-1)) if memory is None else (memory + 1, memory)
+
+
+@pytest.mark.parametrize(("streams", "frames"), [(False, [-1, -1]), (True, [0, 1])])
+def test_a_model_of_single_frames_has_no_memory(monkeypatch, streams, frames):
+    """Its BEV features and markers of earlier frames are none that it has learned to use."""
+    monkeypatch.setattr(marker_drive, "fitted_views", lambda views, source: views)
+    model = DriveModel(Remembering(streams), {}, ProceduralConfig())  # pyright: ignore
+    drive = MarkerDrive(MarkerReader(STORE), model)
+    seen, gap = (drive.step(seen_from(x, boards), i, ego(x)) for i, (x, boards) in enumerate([(0.0, None), (4.0, {})]))
+    assert [int(frame.prediction) for frame in (seen, gap)] == frames  # pyright: ignore
+    assert seen.guidance.valid.any()
+    assert gap.guidance.valid.any() == gap.remembered == streams
+
+
 def test_a_pause_longer_than_the_memory_is_a_new_start():
     """Six frames half a second apart fit into the memory: 3 s."""
     for pause, remembered in ((3.0, True), (3.5, False)):
@@ -100,6 +147,26 @@ def test_a_pause_longer_than_the_memory_is_a_new_start():
         )
         assert seen.guidance.valid.any()
         assert (gap.remembered, bool(gap.guidance.valid.any())) == (remembered, remembered)
+
+
+@pytest.mark.parametrize(
+    ("fusion", "trust", "gate"),
+    [
+        (SHOWN, np.exp(-6.0), np.exp(-6.0)),
+        (uniform_fusion(SHOWN), 1.0, 1.0),
+        (replace(SHOWN, fusion="hard"), np.exp(-6.0), 0.0),  # ignored, as by the model
+    ],
+)
+def test_a_distrusted_board_is_shown_as_the_model_takes_it(monkeypatch, fusion, trust, gate):
+    """A board with a residual of 60 m, in the first frame: no lanes are remembered."""
+    monkeypatch.setattr(marker_drive, "SHOWN", fusion)
+    board = {3: BOARDS[3]}
+    frame = MarkerDrive(MarkerReader(STORE, ReaderConfig(first_residual=60.0))).step(seen_from(0.0, board), 0, ego(0.0))
+    far = np.exp(-np.hypot(20.0, 5.0) / 40.0) if trust < 1.0 else 1.0
+    assert frame.confidence.tolist() == [pytest.approx(trust * far, rel=0.01), 0.0]
+    assert float(frame.guidance.gate) == pytest.approx(gate * far, rel=0.01)
+    assert frame.guidance.valid.any() == (gate > 0.0)
+    assert not frame.remembered
 
 
 def test_another_drive_starts_without_the_memory_of_the_last_one():

@@ -26,8 +26,9 @@ from tflane_jax.commands.sources import make_folder
 from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive, thinned
 from tflane_jax.datasets.marker_cache import search_views
 from tflane_jax.datasets.marker_observations import store_of_log
+from tflane_jax.datasets.native_views import fitted_views
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_json
+from tflane_jax.files.atomic import write_bytes, write_json
 from tflane_jax.files.images import opencv
 from tflane_jax.geometry import PerceptionRange, invert_pose
 from tflane_jax.markers.image_search import DetectorConfig
@@ -63,7 +64,11 @@ def run(options: argparse.Namespace) -> int:
     detector = _detector(options, store)
     config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
     steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
-    check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
+    if model is not None:
+        # A model that cannot read these images is refused before they are searched, which takes seconds each.
+        fitted_views(drive.views(drive.frames[0]), model.source)
+    if steps.remembers:
+        check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
     make_folder(options.out)
     frames, outcomes = [], Counter()
     with warnings.catch_warnings():
@@ -111,9 +116,14 @@ def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig
     if options.family not in MarkerFamily.__members__:
         raise UserError(f"there is no marker family {options.family}: one of {', '.join(MarkerFamily.__members__)}")
     family = MarkerFamily[options.family]
+    largest = marker_count(family) - 1
+    if (last := max(store.markers, default=0)) > largest:
+        raise UserError(
+            f"{store.source} holds marker {last}, and ids of {family.name} end at {largest}: give the family of these "
+            "boards with --family"
+        )
     # Of a partly hidden board only these ids can be told apart; whole ones are read whatever their id.
-    ids = tuple(number for number in sorted(store.markers) if number < marker_count(family))
-    return DetectorConfig(family, search=options.search, ids=ids)
+    return DetectorConfig(family, search=options.search, ids=tuple(sorted(store.markers)))
 
 
 def _day(options: argparse.Namespace) -> datetime.date:
@@ -128,7 +138,8 @@ def _day(options: argparse.Namespace) -> datetime.date:
 def _age(options: argparse.Namespace) -> int | None:
     if options.max_age_days is not None and options.max_age_days < 0:
         raise UserError(f"--max-age-days is a number of days, not {options.max_age_days}")
-    return options.max_age_days
+    # Python counts no more days; no survey is older.
+    return None if options.max_age_days is None else min(options.max_age_days, datetime.timedelta.max.days)
 
 
 def _confidence(step: DriveStep) -> dict[int, float]:
@@ -180,6 +191,11 @@ def render(options: argparse.Namespace) -> int:
     """Write a drive of the built-in world: images, poses.json and store.json."""
     if options.frames < 1 or not options.scale > 0.0:
         raise UserError("--frames must be at least 1 and --scale positive")
+    if options.log < 0:
+        raise UserError(f"--log is the number of a scene, 0 or more, not {options.log}")
+    ring = _RINGS[options.ring]
+    if not 1 <= options.cameras <= len(ring):
+        raise UserError(f"--cameras is 1 to {len(ring)}, the cameras of --ring {options.ring}, not {options.cameras}")
     boards = PlacementConfig(side="both", site="clear")
     # Two seconds of history come before the first frame.
     world = WorldConfig(duration_s=1.6 + 0.5 * options.frames, keyframes=options.frames, markers=boards)
@@ -187,7 +203,7 @@ def render(options: argparse.Namespace) -> int:
     store = store_of_log(log, radius=50.0, bike_lanes=True)
     if not store.markers:
         raise UserError(f"{log.name} has no junction, split or merge, and so no marker: take another --log")
-    mounts = _RINGS[options.ring][: options.cameras]
+    mounts = ring[: options.cameras]
     rig = CameraRigConfig(cameras=mounts, scale=options.scale, markers=True)
     cv2, images = opencv(), options.out / "images"
     make_folder(images)
@@ -198,7 +214,7 @@ def render(options: argparse.Namespace) -> int:
             width, height = views.size[place].tolist()
             files[mount.name] = images / f"{number:03d}-{mount.name}.png"
             picture = np.asarray(views.image)[place, :height, :width, ::-1]
-            files[mount.name].write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+            write_bytes(files[mount.name], cv2.imencode(".png", picture)[1].tobytes())
         frames.append(DriveFrame(moment.timestamp_ns, moment.global_from_ego, files))
     cameras = tuple(
         DriveCamera(mount.name, camera.intrinsics, invert_pose(camera.camera_from_ego))

@@ -21,7 +21,7 @@ from jaxtyping import Float, UInt8
 
 from tflane_jax.commands.sources import make_folder
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import write_json
+from tflane_jax.files.atomic import write_bytes, write_json
 from tflane_jax.files.images import list_photos, opencv, read_image, undistorted
 from tflane_jax.geometry.cameras import project
 from tflane_jax.limits import check_settings
@@ -177,4 +177,4 @@ def _write_picture(
         words = f"{found.marker_id[k]}: {np.linalg.norm(pose[:2, 3]):.1f} m, {found.score[k]:.2f}"
         place = (int(outline[:, 0].min()), int(low[1]) + 16 * width)
         cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * width, _OUTLINE, width, cv2.LINE_AA)
-    path.write_bytes(cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())

@@ -282,6 +282,12 @@ def fusion_gate(lanes: MarkerGuidance, config: MarkerFusionConfig) -> tuple[Floa
     return one, lanes.valid & (lanes.confidence >= config.hard_threshold)
 
 
+def as_fused(lanes: MarkerGuidance, config: MarkerFusionConfig) -> MarkerGuidance:
+    """Return the lanes that a variant of Table II attends to, with its c of Eq. (3): 0 without any."""
+    gate, valid = fusion_gate(lanes, config)
+    return replace(lanes, gate=jnp.where(valid.any(), gate, 0.0), valid=valid)
+
+
 def fusion_mask(
     lanes: MarkerGuidance, valid: Bool[Array, " n"], cells: Float[ArrayLike, "q 2"], config: MarkerFusionConfig
 ) -> Bool[Array, "#q n"]:

@@ -42,7 +42,7 @@ class MarkerMemoryConfig:
         frames: T, slots of the bank, including the present frame.
         decay: gamma, in (0, 1]; 1 is the ablation without decay.
         exponent: alpha of Eq. (4), in (0, 1].
-        threshold: epsilon; a frame with a lower confidence uses the bank.
+        threshold: epsilon; a frame with a lower confidence, or without lanes of markers, uses the bank.
         lanes: largest number of prior tokens, those with the largest weights; None is the whole union of Eq. (4), T L
             lanes. The encoder's time grows with this number.
         compensation: of the ego motion, for stored lanes.
@@ -150,7 +150,7 @@ def remember(
     age = jnp.arange(config.frames)
     decayed = bank.confidence * (config.decay**age)[:, None]  # c-hat of III-C
     alone = guidance(observed, config.exponent)
-    retrieve = alone.gate < config.threshold
+    retrieve = jnp.asarray(reads_bank(observed, config))
     strongest = decayed.max(initial=0.0)
     scale = jnp.where(strongest > 0, strongest, 1.0) if config.gate == "once" else 1.0
     weight = jnp.where(retrieve, _power(decayed / scale, config.exponent), 0.0)  # Eq. (4)
@@ -160,6 +160,11 @@ def remember(
     gate = jnp.where(retrieve, from_bank, alone.gate)
     weight, decayed = (jnp.where(used, each, 0.0) for each in (weight, decayed))
     return bank, _union(bank, weight, decayed, used, gate, config.lanes)
+
+
+def reads_bank(observed: MarkerLanes, config: MarkerMemoryConfig) -> Bool[Array, ""]:
+    """Return whether a frame uses the bank: it has no lanes of markers, or its confidence is below epsilon."""
+    return (observed.frame_confidence < config.threshold) | ~observed.valid.any()
 
 
 def _union(

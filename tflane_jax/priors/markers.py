@@ -71,6 +71,23 @@ def confidence(
     return xp.exp(-residual / config.residual_scale) * xp.exp(-distance / config.distance_scale)  # Eq. (2)
 
 
+def marker_confidence(markers: MarkerObservations, config: MarkerPriorConfig) -> Float[Array, " m"]:
+    """Return the confidence of one frame's markers under a configuration, 0 where not valid; padding may hold anything.
+
+    It is Eq. (2), times the score with `use_score`, or 1 with `trust` "all".
+    """
+    xp = namespace(markers.pose, markers.valid)
+    pose = xp.where(markers.valid[:, None, None], markers.pose, xp.eye(4, dtype=markers.pose.dtype)[None])
+    residual = xp.where(markers.valid, markers.residual, 0.0)
+    # The prior ignores the vertical coordinate (section III-A).
+    found = confidence(xp.sqrt((pose[:, :2, 3] ** 2).sum(-1)), residual, config)
+    if config.trust == "all":
+        found = xp.ones_like(found)
+    elif config.use_score:
+        found = found * xp.where(markers.valid, markers.score, 0.0)
+    return xp.where(markers.valid, found, 0.0)
+
+
 def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) -> MarkerLanes:
     """Return the lanes of one frame's markers by descending confidence; padding may hold anything.
 
@@ -80,20 +97,12 @@ def select_marker_lanes(markers: MarkerObservations, config: MarkerPriorConfig) 
     count, lanes, points = markers.lanes.shape[:3]
     if points < config.points:
         raise ValueError(f"the markers' lanes have {points} points, the prior asks for {config.points}")
-    pose = xp.where(markers.valid[:, None, None], markers.pose, xp.eye(4, dtype=markers.pose.dtype)[None])
-    residual = xp.where(markers.valid, markers.residual, 0.0)
-    # The prior ignores the vertical coordinate (section III-A).
-    trust = confidence(xp.sqrt((pose[:, :2, 3] ** 2).sum(-1)), residual, config)
-    if config.trust == "all":
-        trust = xp.ones_like(trust)
-    elif config.use_score:
-        trust = trust * xp.where(markers.valid, markers.score, 0.0)
     valid = (markers.lane_valid & markers.valid[:, None]).reshape(-1)
     flat = markers.lanes[..., :2].reshape(count * lanes, points, 2)[:, stride(points, config.points)]
     same = np.repeat(np.eye(count, dtype=bool), lanes, 0).repeat(lanes, 1)
     edges = xp.broadcast_to(markers.successor[:, :, None, :], (count, lanes, count, lanes))
     edges = edges.reshape(count * lanes, count * lanes) & same & valid[:, None] & valid[None, :]
-    trust = xp.where(valid, xp.repeat(trust, lanes), 0.0)
+    trust = xp.where(valid, xp.repeat(marker_confidence(markers, config), lanes), 0.0)
     # Stable: lanes of one marker keep their order; padding comes last.
     order = xp.argsort(xp.where(valid, -trust, xp.inf), stable=True)[: config.lanes]
     missing = config.lanes - len(order)

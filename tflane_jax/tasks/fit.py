@@ -21,7 +21,7 @@ def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale:
     """Raise UserError where data and model cannot fit together whatever the examples are.
 
     Ranges, points or forms of the truth differ, or the scale of the images, or the data lack the camera images, the
-    evidence, the past frames or the prior that the model reads, or the lines of a map that it learns.
+    evidence, the past frames, the prior or its points that the model reads, or the lines of a map that it learns.
 
     Args:
         model: the host.
@@ -32,6 +32,7 @@ def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale:
     _check_scale(model, image_scale)
     _check_ranges(model, config)
     _check_lines(model, config)
+    _check_marker_points(model, config)
     _check_points(model, config)
     _check_forms(model, config)
     _check_history(model, config)
@@ -142,6 +143,15 @@ def _learns_lines(model: HostConfig) -> bool:
 def _check_lines(model: HostConfig, config: ExampleConfig) -> None:
     if _learns_lines(model) and config.map_lines is None:
         raise UserError(_NO_LINES)
+
+
+def _check_marker_points(model: HostConfig, config: ExampleConfig) -> None:
+    prior, markers = model.priors.markers, config.markers
+    if prior is not None and markers is not None and markers.points < prior.prior.points:
+        raise UserError(
+            f"the model reads {prior.prior.points} points of a marker's lane (task.model.priors.markers.prior.points), "
+            f"and examples hold {markers.points} (data.example.markers.points): change either"
+        )
 
 
 def _check_points(model: HostConfig, config: ExampleConfig) -> None:

@@ -22,12 +22,13 @@ from tflane_jax.errors import UserError
 from tflane_jax.geometry import relative_pose
 from tflane_jax.markers.image_search import ImageMarkers
 from tflane_jax.markers.reader import MarkerReader, ReaderConfig, Reading
-from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior
+from tflane_jax.models.marker_fusion import MarkerFusionConfig, MarkerPrior, as_fused
 from tflane_jax.models.parameters import Params
 from tflane_jax.models.prior import HostSpec
-from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemoryConfig
-from tflane_jax.priors.markers import confidence
-from tflane_jax.scene import CameraViews, Prediction
+from tflane_jax.priors.marker_memory import MarkerGuidance, MarkerMemory, MarkerMemoryConfig, reads_bank
+from tflane_jax.priors.markers import marker_confidence, select_marker_lanes
+from tflane_jax.scene import CameraViews, MarkerObservations, Prediction
+from tflane_jax.tasks.fit import reads_traffic
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 # Gate and memory that are shown without a model, and the paper's distance of frames, seconds.
@@ -35,6 +36,10 @@ SHOWN = MarkerFusionConfig(memory=MarkerMemoryConfig(lanes=32))
 INTERVAL = 0.5
 # A drive whose frames are more than this fraction nearer or farther apart than in training is warned of.
 _OFF = 0.5
+
+
+class MissingPriorWarning(UserWarning):
+    """A model reads a prior that a drive does not have."""
 
 
 class FrameRateWarning(UserWarning):
@@ -65,9 +70,9 @@ class DriveStep(NamedTuple):
 
     Attributes:
         reading: detections, and the prior.
-        confidence: (M,) Eq. (2) of each marker of the prior, 0 where not valid.
-        guidance: prior tokens after gate and memory: the frame's lanes, or remembered ones.
-        remembered: the lanes come from earlier frames.
+        confidence: (M,) of each marker of the prior as the model computes it, Eq. (2) by default; 0 where not valid.
+        guidance: prior tokens after gate and memory, as they enter Eq. (3): the frame's lanes, or remembered ones.
+        remembered: lanes of earlier frames are among them.
         prediction: of the model; None without one.
     """
 
@@ -82,13 +87,14 @@ class MarkerDrive:
     """The markers of a drive and a model's lanes, frame by frame.
 
     Memory counts frames: give them as far apart as in training (`interval`). A pause longer than the memory, T of those
-    intervals, is the start of another drive.
+    intervals, is the start of another drive. As in evaluation, a model that was trained on single frames has no memory,
+    neither of markers nor of BEV features.
 
     Args:
         reader: of the store.
         model: with or without a marker prior; None shows the prior alone.
 
-    Raises UserError for a model that cannot run on images.
+    `step` raises UserError for a model that cannot run on these images.
     """
 
     def __init__(self, reader: MarkerReader, model: DriveModel | None = None):
@@ -99,6 +105,8 @@ class MarkerDrive:
         configured = None if model is None else model.task.model.priors.markers
         spec = HostSpec(1, sizes.range, sizes.range) if model is None else model.task.model.spec
         self._prior = MarkerPrior(configured or SHOWN, spec)
+        self._model_remembers = model is not None and model.task.streams
+        self._prior_remembers = configured is None or self._model_remembers
         self._observe = jax.jit(self._prior.observe)
         self._step = None if model is None else jax.jit(model.task.step)
         memory = self._prior.config.memory or MarkerMemoryConfig()
@@ -106,10 +114,16 @@ class MarkerDrive:
         self._last: tuple[int, Float[np.ndarray, "4 4"]] | None
         self.restart(reader)
 
+    @property
+    def remembers(self) -> bool:
+        """Whether earlier frames count, so that the rate of frames does; always without a model."""
+        return self.model is None or self._model_remembers
+
     def restart(self, reader: MarkerReader) -> None:
         """Begin another drive, with its own store, without compiling the model again."""
-        self.reader, self._last, self._bank = reader, None, self._prior.start()
-        self._memory = None if self.model is None else self.model.task.start()
+        self.reader, self._last = reader, None
+        self._bank = self._prior.start() if self._prior_remembers else None
+        self._memory = self.model.task.start() if self.model is not None and self._model_remembers else None
 
     def step(
         self,
@@ -131,20 +145,23 @@ class MarkerDrive:
         )
         self._last = timestamp_ns, np.asarray(global_from_ego, np.float64)
         guidance, self._bank = self._observe(example, self._bank)
-        guidance = jax.device_get(guidance)
+        guidance = jax.device_get(as_fused(guidance, self._prior.config))
         prediction = None
         if self.model is not None and self._step is not None:
             example = replace(example, cameras=fitted_views(views, self.model.source))
-            self._memory, prediction = self._step(self.model.params, self._memory, example)
+            following, prediction = self._step(self.model.params, self._memory, example)
+            self._memory = following if self._model_remembers else None
             prediction = jax.device_get(prediction)
-        config = self._prior.config
-        trust = confidence(np.hypot(*markers.pose[:, :2, 3].T), markers.residual, config.prior)
-        trust = np.where(markers.valid, trust, 0.0)
-        # As `remember` decides; without a memory nothing is remembered.
-        threshold = 0.0 if config.memory is None else config.memory.threshold
-        seen = float(trust[markers.lane_valid.any(-1)].max(initial=0.0))
-        remembered = bool(guidance.valid.any()) and seen < threshold
+        trust = np.asarray(marker_confidence(markers, self._prior.config.prior))
+        remembered = bool(guidance.valid.any()) and _reads_memory(markers, self._bank, self._prior.config)
         return DriveStep(reading, trust, guidance, remembered, prediction)
+
+
+def _reads_memory(markers: MarkerObservations, bank: MarkerMemory | None, config: MarkerFusionConfig) -> bool:
+    """Return whether a frame uses lanes of earlier frames; `bank` is the memory for the next frame."""
+    if bank is None or config.memory is None or not np.asarray(bank.valid)[1:].any():
+        return False
+    return bool(reads_bank(select_marker_lanes(markers, config.prior), config.memory))
 
 
 def as_trained(config: ReaderConfig, model: DriveModel | None) -> ReaderConfig:
@@ -175,7 +192,17 @@ def check_rate(times_ns: Sequence[int], interval: float) -> None:
 
 
 def check_model(task: Any) -> LaneGraphTask:
-    """Return the task of a model for drives; raises UserError for one that predicts no lanes around the vehicle."""
+    """Return the task of a model for drives; raises UserError for one that predicts no lanes around the vehicle.
+
+    Warns (`MissingPriorWarning`) of a model with another prior than markers, which finds it empty in every frame.
+    """
     if not isinstance(task, LaneGraphTask):
         raise UserError("the model reads single photos: give --model a run of a host with cameras")
+    found = {"an SD map": task.model.priors.sd_map is not None, "traffic flow": reads_traffic(task.model)}
+    if absent := " and ".join(name for name, there in found.items() if there):
+        warnings.warn(
+            f"the model reads {absent}, and a drive has none: its lanes may be worse than in its evaluation",
+            MissingPriorWarning,
+            stacklevel=2,
+        )
     return task

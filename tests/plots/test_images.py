@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tflane_jax.plots.images import lanes_drawn
+from tflane_jax.plots.images import lanes_drawn, predicted_lines
+from tflane_jax.scene import CurvePrediction
 
 
 def test_lanes_are_drawn_into_a_copy_of_a_frame():
@@ -17,3 +18,13 @@ def test_lanes_are_drawn_into_a_copy_of_a_frame():
     assert drawn[12, 49].any()
     assert not drawn[:, 20:35].any()
     np.testing.assert_array_equal(lanes_drawn(frame, []), frame)
+
+
+def test_a_lane_whose_ends_changed_places_is_not_drawn():
+    """The metric finds no point on it. Columns are constant: n' alone differs from 0."""
+    curves = np.zeros((3, 8))
+    curves[:, :2], curves[:, 5] = [[0.4, 0.9], [0.9, 0.4], [0.5, 0.8]], [0.7, 0.5, 0.2]
+    logits = np.tile([0.0, 1.0], (3, 1))
+    found = predicted_lines(CurvePrediction(logits=logits, curves=curves))
+    np.testing.assert_allclose(found[:, 0], [[0.2, 0.5], [0.7, 0.4]])
+    np.testing.assert_allclose(found[:, -1], [[0.2, 0.8], [0.7, 0.9]])

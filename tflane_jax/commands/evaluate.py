@@ -57,8 +57,9 @@ def run(options: argparse.Namespace) -> int:
         "source": to_json(source),
         "near_training": None if near is None else near.sentence(),
     }
-    folder = Path("runs" if options.config else trained.name) / "evaluations"
-    stem = options.out or folder / name
+    # Published weights have no run folder: theirs are told apart by name.
+    of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
+    stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
     paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
     print(f"\nwritten to {', '.join(map(str, paths[:-1]))} and {paths[-1]}")
     return 0

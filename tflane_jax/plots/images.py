@@ -90,11 +90,14 @@ def lanes_drawn(
 def predicted_lines(prediction: CurvePrediction, threshold: float | None = None) -> Float[np.ndarray, "l p 2"]:
     """Return (u, v) of the detected lanes, left to right at their lower ends, as fractions of the image.
 
+    A lane whose upper end is below its lower one is left out: the metric finds no point on it either.
+
     Args:
         prediction: one example, one layer.
         threshold: see `lane_shapes.detected`.
     """
     curves = np.asarray(prediction.curves, np.float64)[left_to_right(prediction, threshold)]
+    curves = curves[curves[:, 0] < curves[:, 1]]
     rows = np.linspace(curves[:, 0], curves[:, 1], _POINTS, axis=-1)
     return np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
 

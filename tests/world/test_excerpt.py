@@ -106,7 +106,7 @@ def test_a_longer_drive_is_seen_inside_junctions_more_often():
 
 
 def test_an_excerpt_is_a_scene_like_any_other():
-    log = simulate(2, LONGER, HISTORY)
+    log = simulate(6, LONGER, HISTORY)
     found = fractions_on_lanes(log)
     assert len(found) >= 3
     assert found.min() > 0.9

@@ -28,7 +28,7 @@ PRESETS = {"city": CITY, "street": STREET} | {
 }
 HAND_MADE = ["crossroads", "crossroads yield", "turn"]
 NETWORKS = [*HAND_MADE, 0, 4, 5, 9, ("city", 1), ("city", 4), ("street", 1), ("street", 2)]
-NETWORKS += [(SceneKind.FIVE_LEGS.value, 1), (SceneKind.STAGGERED.value, 2)]
+NETWORKS += [(SceneKind.FIVE_LEGS.value, 3), (SceneKind.STAGGERED.value, 3)]
 
 
 @functools.cache

@@ -108,7 +108,9 @@ def score(
 def check_bootstrap(scenes: int) -> None:
     """Raise UserError if there are too few scenes for a bootstrap."""
     if scenes < 2:
-        raise UserError(f"a bootstrap draws whole scenes, and there is only {scenes}: leave --bootstrap out")
+        raise UserError(
+            f"a bootstrap draws whole scenes, and there is {'only one' if scenes else 'none'}: leave --bootstrap out"
+        )
 
 
 def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, Any]) -> None:

@@ -159,7 +159,7 @@ TABLES = (
         _LINES,
         "lines/mAP",
         steps=2000,
-        minutes=8.0,
+        minutes=12.0,
         quoted=_quoted(
             _NUSCENES,
             ("mAP", "AP_divider", "AP_ped_crossing", "AP_boundary"),

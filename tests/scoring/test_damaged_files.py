@@ -127,7 +127,7 @@ def test_what_is_unusual_is_said_beside_the_score(name, folder, capsys):
 
 @pytest.mark.parametrize(
     ("settings", "message", "most"),
-    [({"bootstrap": 5}, "there is only 1: leave --bootstrap out", 0), ({"by": "occlusion"}, "no visibility", 1)],
+    [({"bootstrap": 5}, "there is only one: leave --bootstrap out", 0), ({"by": "occlusion"}, "no visibility", 1)],
 )
 def test_what_cannot_be_reported_is_said_before_all_is_scored(folder, tmp_path, monkeypatch, settings, message, most):
     scenes, begun = tmp_path / "scenes.json", []

@@ -34,6 +34,7 @@ from tflane_jax.datasets.nuscenes_log import (
     ReferenceFrame,
     SceneFrames,
     Visibility,
+    level_poses,
     scene_frames,
     scene_log,
 )
@@ -177,9 +178,10 @@ class NuScenesDataset:
         Heights stay those above the ground.
         """
         name, number = self._place(index)
-        here, scene = self.frames(name).global_from_frame[number], self.scenes[name]
-        lidar = scene_frames(self.tables, scene, "lidar").global_from_frame[number]
-        lidar_from_here = relative_pose(lidar, here)
+        frames = self.frames(name)
+        ego_from_lidar = self.tables.calibration(frames.samples[number])
+        (global_from_lidar,) = level_poses(frames.global_from_ego[[number]], ego_from_lidar[None])
+        lidar_from_here = relative_pose(global_from_lidar, frames.global_from_frame[number])
         plane = lidar_from_here[np.ix_([0, 1, 3], [0, 1, 3])]
         x, y = np.moveaxis(transform_points(plane, points[..., :2]), -1, 0)
         return np.concatenate([np.stack([-y, x], -1), points[..., 2:]], -1)

@@ -89,6 +89,12 @@ class RoadConfig:
         crossings: probability for an arm of an intersection.
         driveways: mean number on 100 m of kerb, where there is room for them.
         driveway_width, driveway_depth: of a driveway; the depth is counted from the kerb.
+        access_share: fraction of the driveways that are access roads, with a lane in and one out: the map cuts the
+            lanes of the street there as at a junction, though its traffic passes.
+        access_width: of an access road.
+        access_rounding: radius of the kerbs at its corners.
+        cut_setback: how far from a stop line, or from the rounded corner of an access road, the map cuts lanes: mean of
+            an exponential distribution, drawn for each direction of a street; of scenes, from 0 to twice this.
         car_parks: mean number of rows of parked vehicles behind the sidewalk on 100 m of kerb, where there is room.
         turn_restriction: probability that an arm must not turn left.
         sidewalk: distance of the walking line behind the kerb.
@@ -155,6 +161,10 @@ class RoadConfig:
     driveways: PositiveOrZero = 0.0
     driveway_width: Range = (3.0, 6.0)
     driveway_depth: Range = (8.5, 12.0)
+    access_share: Fraction = 0.0
+    access_width: Range = (5.0, 9.0)
+    access_rounding: Range = (1.5, 6.0)
+    cut_setback: PositiveOrZero = 0.0
     car_parks: PositiveOrZero = 0.0
     turn_restriction: Fraction = 0.12
     sidewalk: PositiveOrZero = 1.8

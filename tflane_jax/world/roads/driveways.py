@@ -1,7 +1,7 @@
 """Driveways: short ways from a street to the plots beside it, with a vehicle that stands in them.
 
-The drivable surface grows into the plot, so the road's edge is interrupted there. No lane leads into a driveway, as in
-the maps of recorded logs, and its vehicle does not move: it is parked, or waits to leave.
+The drivable surface grows into the plot, so the road's edge is interrupted there. Its vehicle does not move: it is
+parked, or waits to leave. No lane leads in, unless it is an access road (`access_roads`): wider, with rounded corners.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.world.roads.config import RoadConfig
-from tflane_jax.world.roads.curves import arc_length, direction, points_at, right_of, wrap
+from tflane_jax.world.roads.curves import arc_length, direction, fillet, points_at, right_of, wrap
 from tflane_jax.world.roads.layouts import chance, draw
 from tflane_jax.world.roads.site import Driveway, Site
 
@@ -39,7 +39,7 @@ def draw_driveways(
         rng: stream.
         site: with its kerbs and crossings.
         stop_lines: ends of the connectors of all junctions, metres.
-        config: its `driveways`, `driveway_width` and `driveway_depth` are used.
+        config: its settings of driveways and access roads are used.
     """
     found: list[Driveway] = []
     crossings = np.concatenate([np.zeros((0, 2)), *site.crossings])
@@ -48,9 +48,13 @@ def draw_driveways(
         others = [points_at(k, np.arange(0.0, arc_length(k)[-1], 1.0)) for k in (*site.kerbs, *site.islands)]
         last = -np.inf
         for middle in np.sort(rng.uniform(0.0, length, rng.poisson(config.driveways * length / 100.0))).tolist():
-            width, depth = draw(rng, config.driveway_width), draw(rng, config.driveway_depth)
-            leaves, out, near = chance(rng, _LEAVING), chance(rng, _NOSE_OUT), 0.5 * width + _FLARE
-            start, stop = middle - near, middle + near
+            # Nothing is drawn where there are none: other worlds stay what they were.
+            access = config.access_share > 0.0 and chance(rng, config.access_share)
+            width = draw(rng, config.access_width if access else config.driveway_width)
+            rounding = draw(rng, config.access_rounding) if access else _FLARE
+            depth = draw(rng, config.driveway_depth) + (rounding if access else 0.0)
+            leaves, out = chance(rng, _LEAVING), chance(rng, _NOSE_OUT)
+            start, stop = middle - 0.5 * width - rounding, middle + 0.5 * width + rounding
             if start < max(last + 1.0, 2.0) or stop > length - 2.0:
                 continue
             at = points_at(kerb, np.array([start, middle, stop]))
@@ -59,30 +63,34 @@ def draw_driveways(
             heading = float(np.arctan2(*(at[2] - at[0])[::-1]))
             ahead, outward = direction(heading), right_of(heading)
             half = 0.5 * width * ahead
-            edge = np.stack(
-                [
-                    at[0],
-                    at[1] - half + _FLARE * outward,
-                    at[1] - half + depth * outward,
-                    at[1] + half + depth * outward,
-                    at[1] + half + _FLARE * outward,
-                    at[2],
-                ]
-            )
+            corners = at[1] + np.stack([-half, half])
+            far = corners + depth * outward
+            if access:
+                ways = heading + np.pi, heading
+                around = [fillet(corners[k], ways[k], heading - np.pi / 2, rounding) for k in range(2)]
+                edge = np.concatenate([at[:1], around[0][1:], far, around[1][:0:-1], at[2:]])
+            else:
+                bent = corners + _FLARE * outward
+                edge = np.stack([at[0], bent[0], far[0], far[1], bent[1], at[2]])
             # Its own kerb is beside it, but must not come back behind it.
-            far = [k[_beyond(k, at[1], outward)] if i == number else k for i, k in enumerate(others)]
+            behind = [k[_beyond(k, at[1], outward)] if i == number else k for i, k in enumerate(others)]
             if (
                 abs(turn) < _STRAIGHT
                 and _clear(edge, stop_lines, _CLEAR_OF_JUNCTION)
                 and _clear(edge, crossings, _CLEAR_OF_CROSSING)
                 and _clear(
-                    points_at(edge, np.linspace(0.0, arc_length(edge)[-1], 24)), np.concatenate(far), _CLEAR_OF_KERB
+                    points_at(edge, np.linspace(0.0, arc_length(edge)[-1], 24)), np.concatenate(behind), _CLEAR_OF_KERB
                 )
                 and all(_clear(edge, one.edge, _CLEAR_OF_KERB) for one in found if one.kerb != number)
             ):
                 xy = at[1] + (_WAITS if leaves else depth - _PARKS) * outward
+                if access:
+                    # On the lane out, or the lane in.
+                    xy = xy + (0.5 if leaves or out else -0.5) * half
                 yaw = wrap(heading - np.pi / 2 + np.pi * (leaves or out))
-                found.append(Driveway(number, start, stop, edge, np.array([*xy, yaw])))
+                slot = np.array([*xy, yaw])
+                lanes = {"lanes": width, "rounding": rounding} if access else {}
+                found.append(Driveway(number, start, stop, edge, slot, **lanes))
                 last = stop
     return found
 

@@ -15,15 +15,19 @@ from jaxtyping import Bool, Float
 
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads import roadside
+from tflane_jax.world.roads.access_roads import with_access_roads
 from tflane_jax.world.roads.car_parks import draw_car_parks
 from tflane_jax.world.roads.config import RoadConfig, SceneKind
+from tflane_jax.world.roads.cuts import set_back
 from tflane_jax.world.roads.driveways import draw_driveways, interrupted, parking_beside
 from tflane_jax.world.roads.intersections import crossing_walk
 from tflane_jax.world.roads.junction_networks import lay_out_junctions
 from tflane_jax.world.roads.lane_network import LaneNetwork
 from tflane_jax.world.roads.layout_junctions import plan_junctions
 from tflane_jax.world.roads.layout_roads import plan_road
+from tflane_jax.world.roads.layouts import draw
 from tflane_jax.world.roads.lines import road_lines
+from tflane_jax.world.roads.site import Site
 from tflane_jax.world.roads.through_roads import lay_out_road
 
 __all__ = ["EgoDrive", "RoadConfig", "RoadNetwork", "SceneKind", "build_road_network"]
@@ -114,11 +118,13 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         site.driveways = draw_driveways(rng, site, _stop_lines(network), config)
     if config.car_parks and site.urban:
         site.car_parks = draw_car_parks(rng, site, config)
+    lanes = network.segments()
+    mapped = _as_mapped(rng, lanes, site, config)
     density = rng.uniform(0.55, 0.95) if site.urban else rng.uniform(0.0, 0.3)
     boxes = roadside.buildings(rng, site, config.building_setback, density)
     return RoadNetwork(
         map=VectorMap(
-            segments=network.segments(),
+            segments=mapped,
             crossings=_on_plane(site.crossings),
             road_boundaries=_on_plane([*interrupted(site.kerbs, site.driveways), *site.islands]),
             elements=tuple(site.elements),
@@ -133,7 +139,19 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         parking=np.concatenate([parking_beside(roadside.parking_slots(site), site.driveways), site.car_parks]),
         ego_routes=network.routes(_SHORTEST_ROUTE),
         kind=kind,
+        lanes=None if mapped is lanes else lanes,
     )
+
+
+def _as_mapped(
+    rng: np.random.Generator, lanes: dict[int, LaneSegment], site: Site, config: RoadConfig
+) -> dict[int, LaneSegment]:
+    """Return lanes as the map has them; the same ones, and nothing is drawn, if it has those that traffic drives on."""
+    setback = draw(rng, (0.0, 2.0 * config.cut_setback)) if config.cut_setback else 0.0
+    mapped = set_back(rng, lanes, setback) if setback else lanes
+    if any(one.lanes for one in site.driveways):
+        mapped = with_access_roads(rng, mapped, site, setback, config.turn_restriction)
+    return mapped
 
 
 def _stop_lines(network: LaneNetwork) -> Float[np.ndarray, "j 2"]:

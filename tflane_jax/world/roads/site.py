@@ -20,6 +20,8 @@ class Driveway:
         start, stop: distances along that kerb where its edge leaves and meets it, metres.
         edge: (n, 2) its edge, from the kerb around its far end and back to the kerb, metres.
         slot: x, y, yaw of the vehicle that stands in it.
+        lanes: width for one lane in and one out, 0 for a driveway without lanes, metres.
+        rounding: radius of its corners at the kerb, metres.
     """
 
     kerb: int
@@ -27,6 +29,8 @@ class Driveway:
     stop: float
     edge: Float[np.ndarray, "n 2"]
     slot: Float[np.ndarray, "3"]
+    lanes: float = 0.0
+    rounding: float = 0.0
 
 
 @dataclass

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
-from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence
+from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence, unmeasured
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.statistics import holm, paired_difference
@@ -252,7 +252,7 @@ def test_without_shared_seeds_nothing_is_written(tmp_path, capsys):
 
 
 def test_claims_about_pairs_are_corrected_together(results):
-    """Treatment and control may be interventions; a claim that lacks a row is left out."""
+    """Treatment and control may be interventions; a claim that lacks a row has no finding, but was declared."""
     claims = (
         Claim("+TFM", "baseline", "it helps"),
         Claim("+TFM, none", "matched"),
@@ -261,10 +261,22 @@ def test_claims_about_pairs_are_corrected_together(results):
     )
     found = effects(results, Declaration(PRIMARY, claims), "", "last")
     assert [(e.claim, e.row) for e in found] == [(claim, claim.control) for claim in claims[:3]]
-    assert [e.p_holm for e in found] == holm([e.p for e in found])
+    assert [e.p_holm for e in found] == holm([*(e.p for e in found), 1.0])[:3]
+    assert unmeasured(results, Declaration(PRIMARY, claims), "") == [claims[3]]
     assert [e.finding for e in found] == ["shown", "contradicted", "contradicted"]
     assert found[0].difference == pytest.approx(-found[2].difference)
     assert sentence(found[:1]).endswith("Claim: it helps")
+
+
+def test_the_page_names_claims_without_a_result(results, tmp_path):
+    """A model that failed does not make the tests of the others easier."""
+    claims = (Claim("+TFM", "baseline", "it helps"), Claim("failed", "baseline", "this too"))
+    whole, part = (effects(results, Declaration(PRIMARY, c), "", "last")[0].p_holm for c in (claims, claims[:1]))
+    assert whole == pytest.approx(2 * part)
+    declared = Declared(Declaration(PRIMARY, claims), SEEDS, "now", 0)
+    text = "".join(path.read_text() for path in save_effects(results, declared, "", (), tmp_path / "effects"))
+    assert "**no result**: failed is better than *baseline*" in text.replace("\n", " ")
+    assert "Claim: this too" in text.replace("\n", " ")
 
 
 def test_a_secondary_measure_is_corrected_apart(results):

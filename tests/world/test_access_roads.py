@@ -69,7 +69,9 @@ def test_vehicles_drive_on_the_lanes_that_they_had(kind):
         for i, lane in plain.map.segments.items():
             other = net.traffic_lanes[i]
             assert other.successors == lane.successors
-            assert [getattr(other, name).tobytes() for name in LINES] == [getattr(lane, name).tobytes() for name in LINES]
+            assert [getattr(other, name).tobytes() for name in LINES] == [
+                getattr(lane, name).tobytes() for name in LINES
+            ]
         assert net.ego_routes == plain.ego_routes
         assert net.speed_limit == plain.speed_limit
         assert len(net.map.segments) > len(plain.map.segments)

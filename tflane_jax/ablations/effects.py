@@ -106,7 +106,8 @@ def effects(
 ) -> list[Effect]:
     """Return the effects in every measure at one checkpoint, claim by claim.
 
-    Each claim is tested over the seeds that all of its rows have; one without such a seed has no effects.
+    Each claim is tested over the seeds that all of its rows have; one without such a seed has no effects, but counts in
+    Holm's correction (see `unmeasured`).
 
     Args:
         results: of the comparison.
@@ -116,13 +117,28 @@ def effects(
         errors: scores where lower is better.
     """
     found = []
+    missing = [1.0] * len(unmeasured(results, declaration, test))
     for measure in measures(declaration):
         sign = -1.0 if next(iter(measure.scores)) in errors else 1.0
         every = [e for claim in declaration.claims for e in _of_claim(results, claim, measure, test, which, sign)]
-        for effect, corrected in zip(every, holm([effect.p for effect in every]), strict=True):
+        holm_p = holm([*(effect.p for effect in every), *missing])
+        for effect, corrected in zip(every, holm_p[: len(every)], strict=True):
             judged = _finding(effect, corrected, declaration.alpha, sign)
             found.append(replace(effect, p_holm=corrected, finding=judged))
     return found
+
+
+def unmeasured(results: Results, declaration: Declaration, test: str) -> list[Claim]:
+    """Return the claims with a control of which no seed has both rows, such as those of a model that failed.
+
+    They were declared: leaving them out of Holm's correction would make every other test easier to pass.
+    """
+    table = results.rows(test, "last")
+    return [
+        claim
+        for claim in declaration.claims
+        if claim.control is not None and not set(table.get(claim.treatment, ())) & set(table.get(claim.control, ()))
+    ]
 
 
 def _of_claim(results: Results, claim: Claim, measure: Measure, test: str, which: Which, sign: float) -> list[Effect]:
@@ -247,7 +263,8 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     seeds = min((effect.seeds for effect in every), key=len)
     if set(seeds) != set(declared.seeds):
         lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
-    lines += ["", *(f"- {text}." for text in findings(every)), ""]
+    missing = unmeasured(results, declaration, test)
+    lines += ["", *(f"- {text}." for text in findings(every, missing)), ""]
     lines += [
         "Difference: the claim's model minus the row. From, to: 95 % interval over scenes (seeds averaged,",
         f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections). p: two-sided paired t-test",
@@ -259,13 +276,19 @@ def save_effects(results: Results, declared: Declared, test: str, errors: Collec
     return [save_table(stem, rows, meta, title=title, digits=4)[0]]
 
 
-def findings(every: Sequence[Effect]) -> list[str]:
-    """Return a sentence for each claim and row, about the last checkpoint."""
+def findings(every: Sequence[Effect], missing: Sequence[Claim] = ()) -> list[str]:
+    """Return a sentence for each claim and row, about the last checkpoint; then for each claim without a result."""
     by_row: dict[tuple[Claim, str], list[Effect]] = {}
     for effect in every:
         if effect.checkpoint == "last":
             by_row.setdefault((effect.claim, effect.row), []).append(effect)
-    return [sentence(of_row) for of_row in by_row.values()]
+    return [*map(sentence, by_row.values()), *map(_without_result, missing)]
+
+
+def _without_result(claim: Claim) -> str:
+    text = f"**no result**: {claim.treatment} is better than *{claim.control}*; no seed has both, "
+    text += "and the correction of the other tests counts it"
+    return f"{text}. Claim: {claim.text}" if claim.text else text
 
 
 def sentence(of_row: Sequence[Effect]) -> str:

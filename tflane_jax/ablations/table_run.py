@@ -32,7 +32,7 @@ from tflane_jax.ablations.compare import (
 from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
-from tflane_jax.ablations.effects import effects, findings, save_effects
+from tflane_jax.ablations.effects import effects, findings, save_effects, unmeasured
 from tflane_jax.ablations.facts import facts, row_minutes
 from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
@@ -262,7 +262,7 @@ def _save_summary(
             "devices": sorted({device for job in runs for device in facts(job).devices}),
             "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),
-            "findings": findings(every),
+            "findings": findings(every, unmeasured(results, declared.declaration, OWN_TEST)),
             "quoted": asdict(table.quoted),
         },
     )

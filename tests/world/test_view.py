@@ -61,3 +61,18 @@ def test_each_scene_has_its_own_angle_within_the_limit(scene):
         turns.append(np.degrees(np.arctan2(np.sin(turn[0]), np.cos(turn[0]))))
     assert np.abs(turns).max() <= 30.0
     assert np.ptp(turns) > 10.0
+
+
+def test_some_scenes_are_turned_as_all_would_be():
+    """A fraction leaves the others as they are without."""
+    world = replace(WORLD, duration_s=2.2, keyframes=1, traffic=replace(WORLD.traffic, warm_up_s=0.0))
+    kept = 0
+    for number in range(8):
+        straight, turned, some, none = (
+            pose_yaw(simulate(number, replace(world, view_turn=turn, view_turned=share)).global_from_ego)
+            for turn, share in ((0.0, 1.0), (30.0, 1.0), (30.0, 0.5), (30.0, 0.0))
+        )
+        np.testing.assert_array_equal(none, straight)
+        kept += np.array_equal(some, straight)
+        assert np.array_equal(some, straight) or np.array_equal(some, turned)
+    assert 1 <= kept <= 7

@@ -78,6 +78,7 @@ class WorldConfig:
         warp: how ground plans are stretched, sheared and bent, map, road users and drive alike; None: not at all.
         view_turn: largest angle between the frame in which a scene is perceived and the vehicle's heading, degrees;
             each scene has its own. Cameras turn with it.
+        view_turned: fraction of the scenes that are perceived so; in the others the angle is 0.
     """
 
     roads: RoadConfig = RoadConfig()
@@ -94,6 +95,7 @@ class WorldConfig:
     mirrored: Fraction = 0.0
     warp: WarpConfig | None = None
     view_turn: PositiveOrZero = 0.0
+    view_turned: Fraction = 1.0
 
     @property
     def frames(self) -> int:
@@ -212,8 +214,10 @@ def _shown(log: Log, scene_id: int, config: WorldConfig, warp: Warp | None, mirr
     log = log if warp is None else warped(log, warp)
     log = mirrored(log) if mirror else log
     if config.view_turn > 0.0:
-        degrees = _stream(scene_id, Stream.VIEW).uniform(-config.view_turn, config.view_turn)
-        log = turned_view(log, math.radians(degrees))
+        stream = _stream(scene_id, Stream.VIEW)
+        degrees = stream.uniform(-config.view_turn, config.view_turn)
+        if stream.random() < config.view_turned:
+            log = turned_view(log, math.radians(degrees))
     if config.terrain is not None:
         log = on_terrain(log, config.terrain.draw(_stream(scene_id, Stream.TERRAIN)))
     return log

@@ -154,6 +154,7 @@ def test_markers_must_be_in_the_image_and_clear_of_bodies():
     assert seen(wide, signed) == [False, True]
     assert seen(replace(wide, occlusion="bodies"), signed) == [False, False]
     assert seen(replace(wide, occlusion="bodies", least_seen=0.1), signed) == [False, True]
+    assert seen(replace(wide, occlusion="bodies", least_seen=0.0), signed) == [False, True]
     assert seen(replace(PERFECT, occlusion="bodies"), signed) == [True, False]
     # A real log, without boards, has no scenery.
     assert seen(replace(wide, occlusion="bodies"), replace(signed, markers=None)) == [False, True]

@@ -134,6 +134,7 @@ def test_entries_out_of_date_give_no_prior():
     assert [m is not None for m in aged.found] == [False, True, True]
     with pytest.warns(StaleMarkerWarning):
         assert look_up(store, [2], today=DAY + datetime.timedelta(6), max_age_days=5).stale == 1
+    assert look_up(store, [2], today=DAY, max_age_days=10**12).stale == 0
     assert look_up(store, [1, 2, 3, 4]).stale == 0
     with pytest.raises(ValueError, match="give today"):
         look_up(store, [1], max_age_days=5)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.datasets.small_logs import lane_map, segment
 from tflane_jax.geometry import invert_pose, transform_points
-from tflane_jax.scene.logs import VectorMap
+from tflane_jax.scene.logs import MapElement, VectorMap
 from tflane_jax.world import simulate as simulate_module
 from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.mirror import mirrored
@@ -95,6 +95,17 @@ def test_surveyed_boards_are_seen_better(scene):
     assert len(before) == len(after)
     assert before.min() < 0.8 < after.mean()
     assert after.mean() > before.mean()
+
+
+def test_less_of_a_large_board_is_hidden_by_a_thin_post():
+    """A lamp post hides most of a board of 20 cm behind it, and little of one of 3 m."""
+    pytest.importorskip("cv2")
+    post = MapElement(np.array([20.0, 0.0, 3.0]), np.pi, 1, 0, ())
+    road = replace(lane_map(segment(2, [(-50, -1.75), (60, -1.75)])), elements=(post,))
+    place = np.array([20.6, 0.0, 3.0])
+    small, usual, large = (visible_places(road, 0, size)(place, 0.0) for size in (0.2, 1.0, 3.0))
+    assert small < usual < large
+    assert visible_places(road, 0)(place, 0.0) == usual
 
 
 @pytest.mark.parametrize(

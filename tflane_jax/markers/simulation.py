@@ -158,7 +158,8 @@ def simulate_detections(
         mounts = config.cameras or ARGOVERSE2_RING
         bodies = static_boxes(log) if config.occlusion == "bodies" else None
         shown = seen_fraction(log, moment, true[seen], markers.size, mounts, bodies, framed=config.cameras is not None)
-        seen[seen] = shown >= (config.least_seen if config.occlusion == "bodies" else 1.0)
+        # A square outside all images is not seen, whatever fraction is enough.
+        seen[seen] = (shown > 0.0) & (shown >= (config.least_seen if config.occlusion == "bodies" else 1.0))
     if config.occlusion == "line_of_sight":
         seen[seen] = ~_hidden(log, moment, true[seen])
     count = len(seen)

@@ -54,7 +54,7 @@ class StoredMarker:
         if self.expires is not None and today >= self.expires:
             return True
         return max_age_days is not None and (
-            self.surveyed is None or today - self.surveyed > datetime.timedelta(max_age_days)
+            self.surveyed is None or (today - self.surveyed).days > max_age_days
         )
 
 

@@ -123,7 +123,7 @@ def _chosen_by_sight(
     if config.markers.site != "clear":
         return ()
     shown = vector_map if warp is None else warped_map(vector_map, warp)
-    seen = visible_places(mirrored_map(shown) if mirror else shown, scene_id, on_left=mirror)
+    seen = visible_places(mirrored_map(shown) if mirror else shown, scene_id, config.markers.size, on_left=mirror)
 
     def visible(place: Float[np.ndarray, "3"], heading: float) -> float:
         if warp is not None:

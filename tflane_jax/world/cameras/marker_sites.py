@@ -13,11 +13,11 @@ from tflane_jax.world.roads.markers import Visible
 # Where drivers look from: distances before the board, and to its side towards the road, metres; height of a camera.
 VIEWS = tuple((ahead, aside) for ahead in (8.0, 14.0, 22.0, 35.0, 50.0) for aside in (3.0, 6.0))
 _EYE = 1.45
-# Points of a board of 1 m that are looked at, from its middle, metres.
+# Points of a board that are looked at, from its middle, as fractions of the side of its black square.
 _ACROSS = np.linspace(-0.6, 0.6, 7)
 
 
-def visible_places(vector_map: VectorMap, seed: int, *, on_left: bool = False) -> Visible:
+def visible_places(vector_map: VectorMap, seed: int, size: float = 1.0, *, on_left: bool = False) -> Visible:
     """Return the function that says which fraction of a board drivers see, in the scene of this map and seed.
 
     The mean over `VIEWS` of the fraction of the board that no static body hides; a surveyor knows no road users.
@@ -25,6 +25,7 @@ def visible_places(vector_map: VectorMap, seed: int, *, on_left: bool = False) -
     Args:
         vector_map: as it is shown.
         seed: of the scene.
+        size: side of the black square, metres.
         on_left: traffic keeps to the left, so that drivers are to the right of a board.
     """
     boxes, towards_road = map_boxes(vector_map, seed), -1.0 if on_left else 1.0
@@ -34,7 +35,7 @@ def visible_places(vector_map: VectorMap, seed: int, *, on_left: bool = False) -
         along, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
         near = boxes[np.hypot(*(boxes[:, :2] - place[:2]).T) < reach + 0.5 * np.hypot(boxes[:, 2], boxes[:, 3])]
         x, y, length, width, yaw, low, high = near.T
-        across, up = (axis.ravel() for axis in np.meshgrid(_ACROSS, _ACROSS))
+        across, up = (size * axis.ravel() for axis in np.meshgrid(_ACROSS, _ACROSS))
         points = place[:2] + across[:, None] * left
         hidden = []
         for ahead, aside in VIEWS:

@@ -8,6 +8,7 @@ import pytest
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.training_queue import LOOK_SECONDS, Queue, choose
 from tflane_jax.config import RunConfig
+from tflane_jax.errors import UserError
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.run_folder import claimed
@@ -81,6 +82,57 @@ def test_a_job_that_another_process_has_just_finished_is_not_trained_again():
     complete.append(jobs[0].folder)
     assert queue.take() is jobs[1]
     assert reservations.released == [jobs[0].folder]
+
+
+def starting_from(other, model, seed):
+    made = job(model, seed)
+    return replace(
+        made, config=replace(made.config, training=replace(made.config.training, init_from=str(other.folder)))
+    )
+
+
+def test_a_run_waits_for_the_one_that_it_starts_from():
+    """A row before its host, two workers: the second takes another job, then none until the host is done."""
+    host, other = job(0, 0), job(2, 0)
+    row = starting_from(host, 1, 0)
+    queue = Queue([row, host, other], Everything([]), lambda each: False)
+    assert [queue.take(), queue.take()] == [host, other]
+    queue.done(other)
+    assert queue.take() is None
+    assert len(queue) == 1
+    queue.done(host)
+    assert queue.take() is row
+
+
+def test_a_run_waits_for_one_that_another_process_trains(monkeypatch):
+    now, complete = [0.0], set()
+    monkeypatch.setattr("tflane_jax.ablations.training_queue.time.monotonic", lambda: now[0])
+    host = job(0, 0)
+    row = starting_from(host, 1, 0)
+    queue = Queue([row, host], Everything([host.folder]), lambda each: each.folder in complete)
+    assert queue.take() is None
+    complete.add(host.folder)
+    now[0] += 2 * LOOK_SECONDS
+    assert queue.take() is row
+
+
+def test_no_run_starts_from_one_that_failed():
+    """Nor do two runs that start from one another wait for ever."""
+    host = job(0, 0)
+    row = starting_from(host, 1, 0)
+    queue = Queue([host, row], Everything([]), lambda each: False)
+    queue.check_origins(queue.take())
+    queue.done(host)  # not complete
+    with pytest.raises(UserError, match="the run that it starts from, is not complete"):
+        queue.check_origins(queue.take())
+    circle = [starting_from(row, 0, 0), row]
+    queue = Queue(circle, Everything([]), lambda each: False)
+    for _ in circle:
+        taken = queue.take()
+        with pytest.raises(UserError, match="is not complete"):
+            queue.check_origins(taken)
+        queue.done(taken)
+    assert len(queue) == 0
 
 
 def test_a_run_that_a_process_still_trains_is_waited_for(tmp_path, monkeypatch):

@@ -34,14 +34,14 @@ from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
 from tflane_jax.ablations.effects import effects, findings, save_effects, unmeasured
 from tflane_jax.ablations.facts import facts, row_minutes
-from tflane_jax.ablations.jobs import Failure, Job, ScoredBy
+from tflane_jax.ablations.jobs import Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.reuse import FILE, archive_of, unused
 from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, evaluations, measure
 from tflane_jax.ablations.store import TOPOLOGY
-from tflane_jax.ablations.table_plan import TablePlan, plan_table, seed_by_seed, store_of, tell_work
-from tflane_jax.ablations.workers import noted, train_all
+from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
+from tflane_jax.ablations.workers import train_all
 from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
@@ -106,7 +106,7 @@ def run_table(
         declared = declare(table.declaration, plan, planned.declared(), every, folder)
     tell_work(planned, seeds, store_of(out, quick=quick), jobs, quick=quick)
 
-    failures = _train(planned, jobs, cores)
+    failures = train_all(seed_by_seed(planned.named()), jobs, cores)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
     trained = without_failures(plan, failures)
@@ -129,23 +129,6 @@ def run_table(
     if failures:
         raise UserError(summary_of(failures, len(planned.every())))
     return path
-
-
-def _train(planned: TablePlan, parallel: int, cores: int | None) -> list[Failure]:
-    """Train the hosts, then the rows; return what failed.
-
-    A row whose host is not complete counts as failed: it would start from whichever checkpoint the host has.
-    """
-    failures = train_all(seed_by_seed(planned.host_jobs), parallel, cores)
-    incomplete = {str(job.folder): job for job in seed_by_seed(planned.host_jobs) if not job.is_complete()}
-    ready = []
-    for job in seed_by_seed(planned.jobs):
-        if (host := incomplete.get(str(job.config.training.init_from))) is not None:
-            with noted(job, failures):
-                raise UserError(f"{host.label}, the run that it starts from, is not complete")
-        elif str(job.folder) not in incomplete:  # a host may be a row too, and has been tried
-            ready.append(job)
-    return failures + train_all(ready, parallel, cores)
 
 
 def _adopt_declaration(archive: Archive, folder: Path, check_in: Callable[[Path], Declared]) -> None:

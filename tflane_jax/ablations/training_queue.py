@@ -1,4 +1,7 @@
-"""The runs that a comparison still has to train or measure: those that wait, and those that other processes have."""
+"""The runs that a comparison still has to train or measure: those that wait, and those that other processes have.
+
+A run that starts from another one of them waits until that one is complete, or has failed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ from typing import Any
 
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.reservations import Reservations
+from tflane_jax.errors import UserError
+from tflane_jax.training.fine_tuning import origin_folders
 from tflane_jax.training.run_folder import is_locked
 
 LOOK_SECONDS = 10.0
@@ -23,6 +28,8 @@ class Queue:
         self._is_done = is_done
         self._waiting = [job for job in jobs if not is_done(job)]
         self._elsewhere: list[Job] = []
+        self._taken: list[Job] = []
+        self._every = {job.folder: job for job in jobs}
         self._reservations = reservations
         self._looked = time.monotonic()
 
@@ -36,14 +43,14 @@ class Queue:
         return self._elsewhere
 
     def take(self, mine: Collection[Any] = (), others: Collection[Any] = ()) -> Job | None:
-        """Reserve the next job and return it; None if other processes have all that are left.
+        """Reserve the next job and return it; None if others have all that are left, or those that they start from.
 
         Args:
             mine, others: see `choose`.
         """
         self._look_again()
-        while self._waiting:
-            job = choose(self._waiting, mine, others)
+        while ready := self._ready():
+            job = choose(ready, mine, others)
             self._waiting.remove(job)
             if not self._reservations.take(job.folder):
                 self._elsewhere.append(job)
@@ -53,12 +60,33 @@ class Queue:
                 self._reservations.release(job.folder)
                 self._elsewhere.append(job)
             else:
+                self._taken.append(job)
                 return job
         return None
 
+    def check_origins(self, job: Job) -> None:
+        """Raise UserError if a run that a job starts from has failed: it would start from any checkpoint of that."""
+        for origin in self._origins(job):
+            if not origin.is_complete() and job.start() != "resume":
+                raise UserError(f"{origin.label or origin.folder}, the run that it starts from, is not complete")
+
     def done(self, job: Job) -> None:
         """Release a job that is done, or failed."""
+        self._taken.remove(job)
         self._reservations.release(job.folder)
+
+    def _origins(self, job: Job) -> list[Job]:
+        """Return the jobs of this queue, done or not, that a job starts from."""
+        training = job.config.training
+        folders = origin_folders(training.init_from, training.seeds) if training.init_from else []
+        return [self._every[folder] for folder in folders if folder in self._every]
+
+    def _ready(self) -> list[Job]:
+        """Return the waiting jobs that start from none that is still to be done."""
+        pending = {job.folder for job in (*self._waiting, *self._elsewhere, *self._taken)}
+        ready = [job for job in self._waiting if not any(origin.folder in pending for origin in self._origins(job))]
+        # Runs that start from one another: the first one is refused.
+        return ready or ([] if self._elsewhere or self._taken else self._waiting)
 
     def _look_again(self) -> None:
         """Let jobs that are free again wait; forget those that other processes have finished."""

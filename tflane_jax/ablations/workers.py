@@ -102,6 +102,7 @@ def _train_here(queue: Queue) -> list[Failure]:
             time.sleep(_POLL_SECONDS)
             continue
         with noted(job, failures):
+            queue.check_origins(job)
             write(f"train {job.label or job.folder}")
             if (number := train_run(job.config, job.folder, start=job.start()).asked_by) is not None:
                 raise Interrupted(number)  # all of it; the same command resumes what was written
@@ -124,6 +125,7 @@ def _train_in_workers(queue: Queue, jobs: Sequence[Job], parallel: int, cores: i
                 others = {task for other in workers if other is not worker for task in other.tasks}
                 if worker.job is None and (chosen := queue.take(worker.tasks, others)) is not None:
                     with noted(chosen, failures):
+                        queue.check_origins(chosen)
                         _build(chosen, built)
                         worker.begin(chosen)
                     if worker.job is None:

@@ -53,9 +53,7 @@ class StoredMarker:
         """Return whether the entry has expired or is older than the limit; an unknown age exceeds any limit."""
         if self.expires is not None and today >= self.expires:
             return True
-        return max_age_days is not None and (
-            self.surveyed is None or (today - self.surveyed).days > max_age_days
-        )
+        return max_age_days is not None and (self.surveyed is None or (today - self.surveyed).days > max_age_days)
 
 
 @dataclass(frozen=True)

@@ -242,7 +242,7 @@ def test_a_part_of_a_bent_lane_ends_where_its_length_says():
 
 def test_scenes_of_real_like_have_them_and_their_mirror_images_too():
     found = 0
-    for scene in range(4):
+    for scene in range(8):
         plain = simulate(scene, replace(REAL_LIKE, mirrored=0.0)).map
         other = simulate(scene, replace(REAL_LIKE, mirrored=1.0)).map
         assert list(other.segments) == list(plain.segments)
@@ -254,7 +254,7 @@ def test_scenes_of_real_like_have_them_and_their_mirror_images_too():
             len(lane.successors) == 1 and plain.segments[lane.successors[0]].is_intersection and len(before[i]) == 0
             for i, lane in plain.segments.items()
         )
-    assert found > 4
+    assert found > 4, "a fifth of the driveways are access roads, each with a lane in and a lane out"
 
 
 @pytest.mark.parametrize(

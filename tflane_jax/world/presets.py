@@ -92,9 +92,9 @@ REAL_LIKE = replace(
         wide_turns=0.65,
         lane_changes=0.15,
         change_distance=(8.0, 45.0),
-        driveways=3.5,
-        access_share=0.6,
-        cut_setback=1.2,
+        driveways=3.0,
+        access_share=0.2,
+        cut_setback=0.4,
         one_way=0.12,
         median=0.5,
         bike=0.12,
@@ -117,6 +117,9 @@ REAL_LIKE = replace(
     longer_s=20.0,
     keyframe_spacing="distance",
     mirrored=0.5,
+    # In a fifth of recorded frames all roads are oblique: the vehicle turns, or changes lanes.
+    view_turn=45.0,
+    view_turned=0.2,
 )
 """Generated roads whose frames hold about as much as those of nine recorded logs: lanes and their widths, connectors,
 road users, and how often the vehicle is inside a junction. In every second scene traffic keeps to the left, as in five

@@ -13,11 +13,15 @@ from tflane_jax.datasets.overlap import Nearness
 from tflane_jax.datasets.sources import open_dataset, source_name
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.edge_types import weights_edge_types
+from tflane_jax.evaluation.interventions import with_traffic
+from tflane_jax.evaluation.lane_errors import lane_errors
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import Run, evaluate_run, training_nearness
 from tflane_jax.scene import stack_examples
+from tflane_jax.startup import showing, stage
 from tflane_jax.tasks.base import Model, spread
 from tflane_jax.tasks.edge_types import save_edge_types
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.training.runtime import configure_jax
 
@@ -31,10 +35,13 @@ def run(options: argparse.Namespace) -> int:
     if rest:
         raise UserError(f"tflane eval takes one run: leave {rest[0]} out")
     trained = with_chosen_topology(with_chosen_traffic(trained, options), options)
+    if options.errors and not _predicts_lanes(trained.config.task):
+        raise UserError("--errors needs a model that predicts centerlines or lane segments")
     source = chosen_source(trained.config, options)
     near = _nearness(trained, source, options.training_root)
     groups = [] if near is None else near.groups
-    protocol, rows = evaluate_run(trained, source, task=limited_task(trained, options), frame_groups=groups)
+    task = limited_task(trained, options)
+    protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
 
     name = f"{source_name(source)}-step{trained.step}"
     if options.max_instances is not None:
@@ -61,8 +68,30 @@ def run(options: argparse.Namespace) -> int:
     of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
     stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
     paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
+    if options.errors:
+        paths += _save_errors(trained, task or trained.config.task, source, stem, meta)
     print(f"\nwritten to {', '.join(map(str, paths[:-1]))} and {paths[-1]}")
     return 0
+
+
+def _predicts_lanes(task: Any) -> bool:
+    return isinstance(task, LaneGraphTask) and not {"centerlines", "segments"}.isdisjoint(task.model.predicts)
+
+
+def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, Any]) -> list[Path]:
+    """Print and write why lanes are not found, in percent of the true lanes and of the detections of each seed."""
+    arrays = with_traffic(task.load(source, progress=False), run.config.evaluation.traffic)
+    rows: list[dict[str, Any]] = []
+    for seed, params in zip(run.config.training.seeds, run.params, strict=True):
+        with showing(True), stage("counting errors of lanes"):
+            errors = lane_errors(task, params, arrays, run.config.evaluation.batch_size)
+        for name, counts in (("true lanes", errors.lanes), ("detections", errors.detections)):
+            every = sum(counts.values())
+            shares = {fate: 100.0 * number / every if every else 0.0 for fate, number in counts.items()}
+            rows.append({"of": name, "seed": seed, "number": every, "confidence": errors.threshold} | shares)
+    title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
+    print(f"\n{format_table(rows, title=title)}")
+    return save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title)
 
 
 def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:

@@ -54,7 +54,7 @@ def _line_confidences(truth: MapLines, found: LinePrediction) -> Float[np.ndarra
     matched = match_map(detections_of_lines(found), truth_of_lines(truth, found), dims=dims)
     confidences = np.full(len(kept), -np.inf)
     # Beyond the largest threshold the distance is inf.
-    confidences[kept] = _highest(matched.distance, matched.nearest, matched.scores, int(kept.sum()))
+    confidences[kept] = highest_confidences(matched.distance, matched.nearest, matched.scores, int(kept.sum()))
     return confidences
 
 
@@ -78,7 +78,7 @@ def lane_confidences(
         truth: valid lanes of one frame, metres.
         points, scores: all detections of the frame.
     """
-    return _highest(*nearest_lanes(np.asarray(truth), np.asarray(points)), scores, len(truth))
+    return highest_confidences(*nearest_lanes(np.asarray(truth), np.asarray(points)), scores, len(truth))
 
 
 def segment_confidences(
@@ -87,12 +87,13 @@ def segment_confidences(
     scores: Float[np.ndarray, " p"],
 ) -> Float[np.ndarray, " g"]:
     """Return the same for segments: centerlines, left and right lines of both sides."""
-    return _highest(*nearest_segments(list(truth), list(detected)), scores, len(truth[0]))
+    return highest_confidences(*nearest_segments(list(truth), list(detected)), scores, len(truth[0]))
 
 
-def _highest(
+def highest_confidences(
     distance: Float[np.ndarray, " p"], nearest: Int[np.ndarray, " p"], scores: Float[np.ndarray, " p"], lanes: int
 ) -> Float[np.ndarray, " g"]:
+    """Return the same from the distance of each detection to its nearest lane (metres), which of `lanes` that is."""
     found, near = np.full(lanes, -np.inf), distance < WITHIN
     np.maximum.at(found, nearest[near], np.asarray(scores)[near])
     return found

@@ -59,6 +59,11 @@ def evaluate(commands) -> None:
         "(default: the configuration's)",
     )
     parser.add_argument(
+        "--errors",
+        action="store_true",
+        help="also count lanes that are found with other ends, in part, or not at all, and detections likewise",
+    )
+    parser.add_argument(
         "--training-root",
         metavar="DIR",
         type=Path,

@@ -91,7 +91,7 @@ def _save_errors(run: Run, task: Any, source: Any, stem: Path, meta: dict[str, A
             rows.append({"of": name, "seed": seed, "number": every, "confidence": errors.threshold} | shares)
     title = "why lanes are not found, percent; detections with at least the confidence of the best F-score"
     print(f"\n{format_table(rows, title=title)}")
-    return save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title)
+    return [*save_table(stem.with_name(f"{stem.name}-errors"), rows, meta, title=title)]
 
 
 def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:

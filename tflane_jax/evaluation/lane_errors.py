@@ -36,7 +36,7 @@ from tflane_jax.metrics.segment_matching import nearest_segments
 from tflane_jax.models.parameters import Params
 from tflane_jax.scene import CenterlinePrediction, LaneGraph, Prediction, SegmentPrediction
 
-FATES = ("found", "again", "other ends", "in part", "missed")
+FATES: tuple[str, ...] = ("found", "again", "other ends", "in part", "missed")
 WHOLE = 0.9
 
 
@@ -103,12 +103,13 @@ def _compared(answer: Prediction, batch: Any) -> tuple[CenterlinePrediction | Se
 def frame_of(truth: LaneGraph, found: CenterlinePrediction | SegmentPrediction) -> Frame:
     """Return one frame; padding of the truth may hold anything, crossings among segments are left out."""
     valid, scores = np.asarray(truth.valid), lane_scores(found)
-    lanes = [np.asarray(line, np.float64)[valid] for line in (truth.points, truth.left, truth.right)]
+    center, left, right = (np.asarray(line)[valid] for line in (truth.points, truth.left, truth.right))
     if not isinstance(found, SegmentPrediction):
-        return Frame(lanes[0], found.points, scores, *nearest_lanes(lanes[0], np.asarray(found.points)))
+        points = np.asarray(found.points)
+        return Frame(center, points, scores, *nearest_lanes(center, points))
     kept = scores > 0.0
-    lines = [np.asarray(line)[kept] for line in (found.points, found.left, found.right)]
-    return Frame(lanes[0], lines[0], scores[kept], *nearest_segments(lanes, lines))
+    points, *sides = (np.asarray(line)[kept] for line in (found.points, found.left, found.right))
+    return Frame(center, points, scores[kept], *nearest_segments([center, left, right], [points, *sides]))
 
 
 def count_errors(frames: Sequence[Frame]) -> LaneErrors:

@@ -181,7 +181,7 @@ TABLES = (
         _LINES,
         "lines/mAP",
         steps=1500,
-        minutes=10.0,
+        minutes=4.5,
         quoted=_quoted(
             _NUSCENES,
             ("mAP", "AP_divider", "AP_ped_crossing", "AP_boundary"),

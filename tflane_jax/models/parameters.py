@@ -67,15 +67,21 @@ _PACKED = re.compile(r".*/(query|key|value)/kernel")
 def with_xavier_layers(variables: Any, key: PRNGKeyArray) -> Any:
     """Return initial variables in which the kernels of the decoders' transformer layers are Xavier-uniform.
 
-    PyTorch keeps the projections to queries, keys and values in one matrix, whose bound is smaller.
+    PyTorch keeps the projections to queries, keys and values in one matrix, whose bound is smaller. The matrices of
+    TopoNet's scene graph, one for each class of traffic elements, are one array (classes, inputs, outputs), which
+    PyTorch takes for a convolution's kernel: its bound is smaller, too.
     """
 
     def drawn(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         if not _LAYERS.fullmatch(name):
             return leaf
-        inputs, outputs = leaf.shape
-        limit = math.sqrt(6.0 / (inputs + (3 if _PACKED.fullmatch(name) else 1) * outputs))
+        *classes, inputs, outputs = leaf.shape
+        if classes:
+            fans = (inputs + math.prod(classes)) * outputs
+        else:
+            fans = inputs + (3 if _PACKED.fullmatch(name) else 1) * outputs
+        limit = math.sqrt(6.0 / fans)
         return jax.random.uniform(
             jax.random.fold_in(key, zlib.crc32(name.encode())), leaf.shape, leaf.dtype, -limit, limit
         )

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax.traverse_util import flatten_dict, unflatten_dict
 from jax import lax
 
 from tests.models.cases import CAMERA_DETR, CAMERA_TOPONET, make_camera_example, make_example
@@ -17,13 +16,12 @@ from tflane_jax.config import RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
-from tflane_jax.models.parameters import split_statistics, with_xavier_layers
+from tflane_jax.models.parameters import split_statistics
 from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import TrafficFlow, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
-_KEY = jax.random.key(0)
 TASKS = {
     "toponet": LaneGraphTask(CAMERA_TOPONET),
     "detr": LaneGraphTask(CAMERA_DETR, BevFormerDetrLossConfig()),
@@ -245,32 +243,6 @@ def without_memory():
     encoder = CAMERA_TOPONET.encoder
     off = dataclasses.replace(encoder, bev=dataclasses.replace(encoder.bev, memory="off"))
     return LaneGraphTask(dataclasses.replace(CAMERA_TOPONET, encoder=off))
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_published_hosts_have_initial_parameters(name):
-    """All modules of the paper's size, whose layers start Xavier-uniform: traffic elements in the scene graph, too."""
-    task = dataclasses.replace(TASKS[name], model=dataclasses.replace(TASKS[name].model, initial="xavier"))
-    shapes = [jax.eval_shape(one.init, jax.random.key(0), make_camera_example()) for one in (TASKS[name], task)]
-    assert jax.tree.map(lambda leaf: leaf.shape, shapes[1]) == jax.tree.map(lambda leaf: leaf.shape, shapes[0])
-
-
-@pytest.mark.parametrize(
-    ("path", "shape", "bound"),
-    [
-        ("layer_0/scene_graph/lane_lane/own/kernel", (40, 60), np.sqrt(6 / (40 + 60))),
-        ("layer_1/scene_graph/lane_element/kernel", (13, 40, 60), np.sqrt(6 / (40 * 60 + 13 * 60))),
-    ],
-)
-def test_the_scene_graph_starts_within_torchs_bounds(path, shape, bound):
-    """torch.nn.init.xavier_uniform_: inputs are size(1), outputs size(0), each times the product of the axes behind.
-
-    A matrix of TopoNet's graph is (inputs, outputs): for two axes the bound is the same either way.
-    """
-    params = with_xavier_layers({"params": unflatten_dict({path: np.zeros(shape, np.float32)}, sep="/")}, _KEY)
-    drawn = np.asarray(flatten_dict(params["params"], sep="/")[path])
-    assert 0.99 * bound < np.abs(drawn).max() <= bound
-    assert abs(drawn.mean()) < 0.05 * bound
 
 
 def test_bev_memory_can_be_switched_off():

@@ -3,9 +3,9 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from tests.models.cases import (
     CAMERA_DETR,
@@ -47,10 +47,21 @@ def test_every_host_starts_as_published(name):
     jax.tree.map(lambda a, b: np.testing.assert_equal((a.shape, a.dtype), (b.shape, b.dtype)), *variables)
 
 
-def test_matrices_of_classes_start_as_in_pytorch():
-    """torch.nn.init.xavier_uniform_ of (K, in, out): fan in is in x out, fan out is K x out."""
-    zeros = {"layer_0": {"scene_graph": {"lane_element": {"kernel": jnp.zeros((13, 24, 40))}}}}
-    drawn = with_xavier_layers({"params": zeros}, jax.random.key(0))["params"]
-    kernel = np.asarray(drawn["layer_0"]["scene_graph"]["lane_element"]["kernel"])
-    bound = np.sqrt(6.0 / (24 * 40 + 13 * 40))
-    assert 0.99 * bound < np.abs(kernel).max() <= bound
+@pytest.mark.parametrize(
+    ("path", "shape", "bound"),
+    [
+        ("layer_0/scene_graph/lane_lane/own/kernel", (40, 60), np.sqrt(6 / (40 + 60))),
+        ("layer_1/scene_graph/lane_element/kernel", (13, 40, 60), np.sqrt(6 / (40 * 60 + 13 * 60))),
+    ],
+)
+def test_the_scene_graph_starts_within_torchs_bounds(path, shape, bound):
+    """torch.nn.init.xavier_uniform_: inputs are size(1), outputs size(0), each times the product of the axes behind.
+
+    A matrix of TopoNet's graph is (inputs, outputs): for two axes the bound is the same either way.
+    """
+    params = with_xavier_layers(
+        {"params": unflatten_dict({path: np.zeros(shape, np.float32)}, sep="/")}, jax.random.key(0)
+    )
+    drawn = np.asarray(flatten_dict(params["params"], sep="/")[path])
+    assert 0.99 * bound < np.abs(drawn).max() <= bound
+    assert abs(drawn.mean()) < 0.05 * bound

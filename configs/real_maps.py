@@ -14,8 +14,12 @@ Generated roads are those of the preset `real-like`, which was fitted to mean st
 from dataclasses import replace
 
 from tflane_jax.config import RealMapData, RunConfig, load_config
+from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.presets import CITY, REAL_LIKE
 
+# Recorded frames hold twice as many lanes as those of `city`, for which the host has 48 queries and 36 proposals.
+QUERIES, PROPOSALS = 96, 72
 MAPS = RealMapData(generated_world=REAL_LIKE)
 
 
@@ -40,4 +44,10 @@ def ablations() -> dict[str, RunConfig]:
 
 
 def _on(data: RealMapData, host: str) -> RunConfig:
-    return replace(load_config(host), data=data)
+    config = load_config(host)
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.task.model, TopoNetConfig)
+    decoder = config.task.model.decoder
+    assert decoder.proposals is not None
+    decoder = replace(decoder, queries=QUERIES, proposals=replace(decoder.proposals, count=PROPOSALS))
+    return replace(config, data=data, task=replace(config.task, model=replace(config.task.model, decoder=decoder)))

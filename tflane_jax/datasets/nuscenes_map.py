@@ -1,9 +1,9 @@
 """The map expansion of nuScenes (`maps/expansion/<location>.json`, version 1.3 or later) -> `VectorMap`.
 
-The file holds a whole city in flat coordinates, which are nuScenes' global ones. Traps: a polygon may be null, a lane
-may lack its arcline, and `connectivity` names lanes that the file does not have. The rules of the lines are MapTR's:
-dividers are the records of `road_divider` and `lane_divider`, boundaries the border of the union of road segments and
-lanes.
+The file holds a whole city in flat coordinates, which are nuScenes' global ones. Traps: a polygon may be null, that of
+a lane connector is only a box around it (https://github.com/nutonomy/nuscenes-devkit/issues/915), a lane may lack its
+arcline, and `connectivity` names lanes that the file does not have. The rules of the lines are MapTR's: dividers are
+the records of `road_divider` and `lane_divider`, boundaries the border of the union of road segments and lanes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ExpansionLane:
     Attributes:
         token: of the record.
         centerline: (n, 2) at `RESOLUTION`.
-        polygon: None where the file has none.
+        polygon: None where the file has none, and of connectors, whose polygons are boxes around them.
         connector: through an intersection (`lane_connector`).
         vehicle: open to motor vehicles.
         left_type, right_type: the most frequent marking along each side.
@@ -196,7 +196,7 @@ class _MapFile:
         return ExpansionLane(
             token=token,
             centerline=line,
-            polygon=self._polygon(row.get("polygon_token"), where),
+            polygon=self._polygon(row.get("polygon_token"), where) if layer == "lane" else None,
             connector=layer == "lane_connector",
             vehicle=row.get("lane_type", "CAR") != "BIKE",
             left_type=_marking(row, "left_lane_divider_segments", where),

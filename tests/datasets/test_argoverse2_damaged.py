@@ -142,6 +142,7 @@ MAPS = {
     "no areas": (lambda content: content.pop("drivable_areas"), ("drivable_areas",)),
     "NaN in a lane": (lane(left_lane_boundary=spoiled("x", float("nan"))), ("lane_segments.5", "left_lane_boundary")),
     "infinite lane": (lane(left_lane_boundary=spoiled("y", float("inf"))), ("left_lane_boundary", "finite")),
+    "lane around the Earth": (lane(left_lane_boundary=spoiled("x", 4e7)), ("left_lane_boundary", "km apart")),
     "missing coordinate": (lane(left_lane_boundary=spoiled("z", None)), ("left_lane_boundary[1]", "'z'")),
     "text coordinate": (lane(left_lane_boundary=spoiled("x", "12.0")), ("left_lane_boundary", "text")),
     "null coordinate": (lane(left_lane_boundary=[{"x": None, "y": 0.0, "z": 0.0}] * 2), ("left_lane_boundary",)),
@@ -167,6 +168,10 @@ MAPS = {
     "crossing without an edge": (lambda content: content["pedestrian_crossings"]["1"].pop("edge2"), ("edge2",)),
     "crossing edge of one point": (entry("pedestrian_crossings", "edge1", points((0, 0))), ("edge1", "1 points")),
     "NaN in a crossing": (entry("pedestrian_crossings", "edge1", points((0, 0), (np.nan, 1))), ("edge1", "finite")),
+    "crossing around the Earth": (
+        entry("pedestrian_crossings", "edge1", points((4e7, 0), (4e7, 5))),
+        ("pedestrian_crossings.1", "km apart"),
+    ),
     "area of two points": (entry("drivable_areas", "area_boundary", points((0, 0), (1, 1))), ("area_boundary",)),
     "NaN in an area": (
         entry("drivable_areas", "area_boundary", points((0, 0), (1, np.nan), (2, 0))),

@@ -140,6 +140,7 @@ def edit(*keys, value):
             if layer not in ("version", "canvas_edge")
         ),
         (edit("node", 3, "x", value=float("nan")), r"node holds nan at \[3, 0\]"),
+        (edit("node", 3, "y", value=4e7), "polygon polygon-0: points 2 and 3 are 39998.9 km apart"),
         (edit("node", 3, "y", value="1130.0"), "node is of type list, expected numbers"),
         (edit("node", 3, "y", value="far"), "node is of type list, expected numbers"),
         (edit("node", 3, "y", value=...), "node n3 lacks the entry 'y'"),
@@ -158,6 +159,7 @@ def edit(*keys, value):
         (edit("arcline_path_3", value=[]), "arcline_path_3 is of type list, expected a mapping from lanes"),
         (edit("arcline_path_3", "north", 0, "shape", value="LLL"), r"arcline_path_3 north\[0\]\.shape is 'LLL'"),
         (edit("connectivity", "turn", "incoming", value=...), "connectivity turn lacks the entry 'incoming'"),
+        (edit("connectivity", "turn", "incoming", value=[{}]), "connectivity turn: {} is no token of a lane"),
         (edit("connectivity", "turn", "incoming", value="north"), "incoming is of type str, expected a list"),
         (edit("polygon", 0, "exterior_node_tokens", value=None), r"polygon polygon-0: exterior_node_tokens is missing"),
         (edit("line", 0, "node_tokens", value=...), "line line-0 lacks the entry 'node_tokens'"),

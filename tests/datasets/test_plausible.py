@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tflane_jax.datasets.plausible import FAR, check_distance, check_motion, check_place
+from tflane_jax.datasets.plausible import FAR, check_distance, check_motion, check_place, check_steps
 from tflane_jax.errors import UserError
 
 TIMES = np.arange(3) * 500_000_000
@@ -30,3 +30,11 @@ def test_distance():
     check_distance(np.zeros((0, 3)), "")
     with pytest.raises(UserError, match="b: the box is 600 m from the vehicle"):
         check_distance(np.array([[1.0, 0.0, 0.0], [0.0, -600.0, 0.0]]), "ab")
+
+
+def test_steps():
+    check_steps(np.array([[0.0, 0.0, 9e9], [9999.0, 0.0, 0.0], [9999.0, 5.0, 0.0]]), "a")
+    check_steps(np.zeros((1, 2)), "a")
+    for far, text in ((3e7, "30000"), (1e300, "inf")):
+        with pytest.raises(UserError, match=f"a: points 1 and 2 are {text} km apart"):
+            check_steps(np.array([[0.0, 0.0], [1.0, 0.0], [far, 0.0]]), "a")

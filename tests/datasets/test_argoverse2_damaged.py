@@ -19,6 +19,7 @@ feather = pytest.importorskip("pyarrow.feather")
 NUMBERS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 SIZES = ("length_m", "width_m", "height_m")
 WRONG = {"nan": np.nan, "inf": -np.inf, "empty": None, "text": "1.0"}
+STANDS = {ANNOTATIONS: {}, POSES: {"tx_m": 0.0}}
 FILES = ((ANNOTATIONS, (*NUMBERS, *SIZES)), (POSES, NUMBERS))
 
 
@@ -212,3 +213,19 @@ def test_what_is_read_is_finite(folder):
     assert np.isfinite(flow.position[flow.valid]).all()
     assert lanes.valid.any()
     assert np.isfinite(lanes.points[lanes.valid]).all()
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [
+        (lambda time: time // 1000, ("0.0001 s apart", "nanoseconds")),  # microseconds
+        (lambda time: time * 1000, ("1e+02 s apart", "nanoseconds")),
+        (lambda time: time + (10**12 if time >= 1300 * 10**6 else 0), ("no box for 1000 s", "several logs")),
+    ],
+)
+def test_times_in_another_unit_are_refused(folder, scale, said):
+    for name in (ANNOTATIONS, POSES):
+        rows = feather.read_table(folder / name).to_pylist()
+        # The vehicle stands: a moving one would jump.
+        write(folder / name, [row | {"timestamp_ns": scale(row["timestamp_ns"])} | STANDS[name] for row in rows])
+    refused(folder, said)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tflane_jax.datasets.plausible import FAR, check_distance, check_motion, check_place, check_steps
+from tflane_jax.datasets.plausible import FAR, check_distance, check_interval, check_motion, check_place, check_steps
 from tflane_jax.errors import UserError
 
 TIMES = np.arange(3) * 500_000_000
@@ -14,6 +14,15 @@ def test_speed():
     check_motion(np.zeros((1, 2)), TIMES[:1], "a")
     with pytest.raises(UserError, match=r"c: the vehicle is 40 m from its place 0\.5 s before"):
         check_motion(np.array([[0.0, 0.0], [0.0, 0.0], [40.0, 0.0]]), TIMES, "abc")
+
+
+def test_interval():
+    check_interval(TIMES, "nanoseconds", "a")
+    check_interval(TIMES[:1], "nanoseconds", "a")
+    for factor, text in ((1000, "5e+02"), (1e-3, "0.0005")):
+        with pytest.raises(UserError) as error:
+            check_interval((TIMES * factor).astype(np.int64), "nanoseconds", "a")
+        assert str(error.value) == f"a: its frames are {text} s apart: are its times in nanoseconds?"
 
 
 def test_place():

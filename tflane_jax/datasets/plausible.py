@@ -23,6 +23,9 @@ FARTHEST_STEP = 10_000.0
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
 
+SHORTEST, LONGEST = 0.002, 60.0
+"""Seconds between the frames of a drive: less or more means that its times are in another unit."""
+
 T = TypeVar("T")
 
 
@@ -32,6 +35,19 @@ def check_motion(position: Float[np.ndarray, "f 2"], times_ns: Int[np.ndarray, "
     if (jumps := metres > _FASTEST * seconds + _JITTER).any():
         i = int(jumps.argmax())
         raise UserError(f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before")
+
+
+def check_interval(times_ns: Int[np.ndarray, " f"], unit: str, where: str) -> None:
+    """Raise UserError, which names the place, where the times of frames cannot be in the unit of their format.
+
+    A drive in microseconds instead of nanoseconds would have an empty traffic flow: its history would look back a
+    thousand times as many frames.
+    """
+    if len(times_ns) < 2:
+        return
+    seconds = float(np.median(np.diff(times_ns))) / 1e9
+    if not SHORTEST <= seconds <= LONGEST:
+        raise UserError(f"{where}: its frames are {seconds:.2g} s apart: are its times in {unit}?")
 
 
 def check_place(lanes: Sequence[Float[np.ndarray, "_ d"]], position: Float[np.ndarray, "f 2"], where: str) -> None:

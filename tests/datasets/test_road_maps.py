@@ -10,7 +10,9 @@ from tests.datasets.small_argoverse2 import write_log
 from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tests.datasets.test_nuscenes_scenes import content
 from tests.world.small_map import crossroads
+from tflane_jax.datasets import road_maps
 from tflane_jax.datasets.geojson_lanes import read_lanes
+from tflane_jax.datasets.nuscenes_tables import TABLES
 from tflane_jax.datasets.road_maps import chosen_maps, find_maps, road_map_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, transform_points
@@ -98,8 +100,41 @@ def test_scenes_of_the_nuscenes_folder_have_the_map_around_them(tmp_path):
     path.unlink()
     with pytest.raises(UserError, match=r"singapore-onenorth\.json"):
         one.content()
+    path.write_text("{}")
+    for table in ("ego_pose", "sample_annotation"):  # the drive, and the parked vehicles
+        before, file = one.content(), tmp_path / "v1.0-mini" / f"{table}.json"
+        file.write_text(file.read_text() + " ")
+        assert one.content() != before
     (tmp_path / "v1.0-mini" / "log.json").write_text("[]")
     with pytest.raises(UserError, match=r"names a log that is not in .*log\.json"):
+        find_maps(tmp_path)
+
+
+def test_a_file_that_scenes_share_is_read_once(tmp_path, monkeypatch):
+    """Of 850 scenes, each has the same tables and one of four maps: gigabytes."""
+    read, whole = [], road_maps.hashlib.file_digest
+    monkeypatch.setattr(
+        road_maps.hashlib, "file_digest", lambda file, kind: (read.append(file.name), whole(file, kind))[1]
+    )
+    for one in find_maps(write_nuscenes(tmp_path)):
+        assert one.content() == one.content()
+    assert len(read) == len(set(read)) == len(TABLES) + 2
+
+
+@pytest.mark.parametrize(
+    ("table", "content", "message"),
+    [
+        ("scene", "5", r"scene\.json is no JSON list"),
+        ("log", "null", r"log\.json is no JSON list"),
+        ("log", "[3]", r"log\.json: a row is of type int"),
+        ("log", '[{"token": [1], "location": "x"}]', r"log\.json: token is \[1\], expected text"),
+        ("scene", '[{"name": "x", "log_token": {}}]', r"scene\.json: log_token is {}, expected text"),
+        ("scene", '[{"name": null, "log_token": "x"}]', r"scene\.json: name is None, expected text"),
+    ],
+)
+def test_damaged_tables_of_scenes_are_named(tmp_path, table, content, message):
+    (write_nuscenes(tmp_path) / "v1.0-mini" / f"{table}.json").write_text(content)
+    with pytest.raises(UserError, match=message):
         find_maps(tmp_path)
 
 

@@ -219,6 +219,36 @@ def test_lanes_of_a_geojson_file_have_their_places_markings_and_successors(tmp_p
     assert len(prepare_roads(town, 1.8).spots(55.0)) > 10
 
 
+def test_a_map_as_tables_are_exported(tmp_path):
+    """Every geometry as Multi..., truth as 0 and 1, and what a feature does not have as null."""
+    features = crossroads_features()
+    plain = read_lanes(write(tmp_path / "town.geojson", features))
+    columns = {key for one in features for key in one["properties"]}
+    for one in features[:-1]:  # not the tree
+        geometry, properties = one["geometry"], one["properties"]
+        geometry |= {"type": f"Multi{geometry['type']}", "coordinates": [geometry["coordinates"]]}
+        if "intersection" in properties:
+            properties |= {"intersection": int(properties["intersection"]), "bicycle": 0}
+        properties |= {name: 1 for name in ("boundary", "crossing") if name in properties}
+        one["properties"] = dict.fromkeys(columns | {"successors"}) | properties
+    found = read_lanes(write(tmp_path / "town.geojson", features))
+    assert (len(found.map.crossings), len(found.map.road_boundaries)) == (1, 1)
+    for lane_, wanted in zip(found.map.segments.values(), plain.map.segments.values(), strict=True):
+        np.testing.assert_array_equal(lane_.left, wanted.left)
+        assert (lane_.successors, lane_.is_intersection, lane_.vehicle) == (
+            wanted.successors,
+            wanted.is_intersection,
+            True,
+        )
+
+
+def shaped(feature, kind, coordinates=None):
+    """Return a feature with another type of geometry."""
+    given = feature["geometry"]["coordinates"] if coordinates is None else coordinates
+    return feature | {"geometry": {"type": kind, "coordinates": given}}
+
+
+CORNERS = [(0, 0), (0, 5), (3, 5), (3, 2), (2, 0), (0, 0)]
 ARM = [(0, 0), (80, 0)]
 
 
@@ -233,6 +263,25 @@ ARM = [(0, 0), (80, 0)]
         ([lane(1, *ARM, successors=2)], "feature 0: successors is 2, expected a list"),
         ([lane(1, *ARM, width="wide")], "feature 0: width is 'wide', expected metres"),
         ([lane(1, *ARM, width=30)], "feature 0: width is 30, expected metres"),
+        ([lane(1, *ARM, intersection="true")], "feature 0: intersection is 'true', expected true or false"),
+        ([lane(1, *ARM, bicycle="yes")], "feature 0: bicycle is 'yes', expected true or false"),
+        ([lane(1, *ARM, left=["solid"])], r"feature 0: left is \['solid'\], expected one of none"),
+        ([shaped(lane(1), "MultiLineString", [place(*ARM), place(*ARM)])], "lane 1 is a MultiLineString of 2 lines"),
+        ([shaped(lane(1), "Polygon", [place(*CORNERS)])], "lane 1 is a Polygon of 1 lines"),
+        ([shaped(lane(1), "MultiPolygon", 7)], "feature 0: coordinates is of type int, expected a list"),
+        (
+            [
+                {
+                    "type": "Feature",
+                    "properties": {"crossing": True},
+                    "geometry": shaped(lane(1), "Polygon", [place(*CORNERS)])["geometry"],
+                }
+            ],
+            "feature 0: a crossing is a Polygon of four corners",
+        ),
+        ([lane(1, *ARM) | {"properties": ["lane"]}], r"feature 0: properties is \['lane'\], expected a mapping"),
+        ([lane(1, *ARM) | {"geometry": [1]}], r"feature 0: geometry is \[1\], expected a mapping"),
+        ([lane(1, (0, 0), (4e6, 0))], "feature 0: points 0 and 1 are .* km apart"),
         ([lane(1, *ARM, left="blue")], "feature 0: left is 'blue', expected one of none, solid, dashed"),
         ([lane(1, (0, 0), (0, 0))], "feature 0 is a lane without length"),
         ([lane(1, *ARM)], "too small a map: .*the most is 2 m"),

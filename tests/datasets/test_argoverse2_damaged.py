@@ -229,3 +229,29 @@ def test_times_in_another_unit_are_refused(folder, scale, said):
         # The vehicle stands: a moving one would jump.
         write(folder / name, [row | {"timestamp_ns": scale(row["timestamp_ns"])} | STANDS[name] for row in rows])
     refused(folder, said)
+
+
+FRAMES, LOGS = '{"val": {"10003": ["1000000000.json"]}}', '{"val": {"10003": "log"}}'
+
+
+@pytest.mark.parametrize(
+    ("frames", "logs", "message"),
+    [
+        ("[]", LOGS, r"subset_A\.json is of type list, expected a mapping"),
+        (FRAMES, "[]", r"log\.json is of type list, expected a mapping"),
+        ('{"val": []}', LOGS, r"subset_A\.json: val is \[\], expected a mapping from segments"),
+        (FRAMES, '{"val": 3}', r"log\.json: val is 3, expected a mapping from segments"),
+        (FRAMES, '{"val": {"10003": ["log"]}}', r"log\.json: val: 10003 is \['log'\], expected the id of a log"),
+        ('{"val": {"10003": 5}}', LOGS, "val: 10003 is of type int, expected a list"),
+        ('{"val": {"10003": [1.5]}}', LOGS, r"val: 10003: 1\.5 is no frame, expected <timestamp>"),
+        ('{"val": {"10003": ["first.json"]}}', LOGS, r"val: 10003: 'first\.json' is no frame"),
+        (f'{{"val": {{"10003": ["{10**30}.json"]}}}}', LOGS, "is no frame"),
+        ("[" * 100_000, LOGS, "nested too deep"),
+    ],
+)
+def test_damaged_split_files_are_named(folder, tmp_path, frames, logs, message):
+    (tmp_path / "OpenLane-V2").mkdir()
+    (tmp_path / "OpenLane-V2" / "data_dict_subset_A.json").write_text(frames)
+    (tmp_path / "subset_A_segment_to_av2_log.json").write_text(logs)
+    with pytest.raises(UserError, match=message):
+        load_log(folder, openlane=tmp_path)

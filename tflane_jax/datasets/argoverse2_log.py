@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
-from tflane_jax.datasets.plausible import check_distance, check_interval, check_motion, check_place
+from tflane_jax.datasets.plausible import FARTHEST, check_distance, check_interval, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
@@ -163,14 +163,20 @@ def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def poses_of(path: Path, table: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses in the columns of a file; raise UserError for a quaternion that is not of unit length."""
+    """Return the poses in the columns of a file; raise UserError for what is no unit quaternion, or not in metres."""
     quaternion = np.stack([table[c] for c in _QUATERNION], -1)
     if (odd := np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) > _UNIT).any():
         row = int(odd.argmax())
         raise UserError(
             f"{path}: qw, qx, qy, qz of row {row} are {quaternion[row].tolist()}, no unit quaternion: download it again"
         )
-    return pose_matrix(matrix_from_quaternion(quaternion), np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1))
+    place = np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1)
+    if (far := np.abs(place).max(-1, initial=0.0) > FARTHEST).any():
+        row = int(far.argmax())
+        raise UserError(
+            f"{path}: tx_m, ty_m, tz_m of row {row} are {place[row].tolist()}, no metres: download it again"
+        )
+    return pose_matrix(matrix_from_quaternion(quaternion), place)
 
 
 def _read_boxes(path: Path) -> dict[str, np.ndarray]:

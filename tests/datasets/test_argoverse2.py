@@ -11,6 +11,7 @@ from tests.datasets.small_argoverse2 import FRAMES, MS, POSE, box, write, write_
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
 from tflane_jax.datasets.argoverse2_map import line_type
+from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LineType, RoadUser
 
@@ -62,6 +63,23 @@ def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, t
     assert [k.timestamp_ns for k in load_log(other, openlane=openlane).keyframes] == [1000 * MS, 1500 * MS]
     with pytest.raises(UserError, match="split files"):
         load_log(folder, openlane=tmp_path)
+
+
+def test_frames_without_a_box_are_frames_of_the_history(folder):
+    """The file has no rows of them: frames 2 and 3 of six."""
+    write(folder / ANNOTATIONS, [box(frame, "car", "REGULAR_VEHICLE", 10.0) for frame in (0, 1, 4, 5)])
+    log = load_log(folder)
+    assert (log.timestamps_ns // MS).tolist() == [1000, 1100, 1200, 1300, 1400, 1500]
+    assert log.tracks.valid[:, 0].tolist() == [True, True, False, False, True, True]
+    assert log.global_from_ego[:, 0, 3].tolist() == [10, 11, 12, 13, 14, 15]
+    assert [k.track_frame for k in log.keyframes] == [0, 5]
+    moments = load_log(folder, keyframes="annotations").keyframes
+    assert [(k.timestamp_ns // MS, k.track_frame) for k in moments] == [(1000, 0), (1100, 1), (1400, 4), (1500, 5)]
+    config = Argoverse2Config(folder, example=ExampleConfig(sensor=None, history=5))
+    flow = Argoverse2Dataset(config).example(1).traffic_flow
+    assert flow.valid[0].tolist() == [True, True, False, False, True]
+    # Boxes are 10 m ahead of a vehicle that drives a metre a frame.
+    np.testing.assert_allclose(flow.position[0, flow.valid[0], 0], [5.0, 6.0, 9.0])
 
 
 def test_dataset_orders_logs_by_name_and_survives_pickling(folder):

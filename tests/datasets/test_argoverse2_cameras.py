@@ -116,6 +116,16 @@ def no_lens(folder):
     write(path, [row | {"fx_px": 0.0} for row in rows_of(path)])
 
 
+def long_lens(folder):
+    path = folder / "calibration" / "intrinsics.feather"
+    write(path, [row | {"fx_px": 1e300} for row in rows_of(path)])
+
+
+def far_away(folder):
+    path = folder / "calibration" / "egovehicle_SE3_sensor.feather"
+    write(path, [row | {"tz_m": 1e300} for row in rows_of(path)])
+
+
 def no_pose(folder):
     path = folder / POSES
     write(path, [row for row in rows_of(path) if not 960 * MS < row["timestamp_ns"] < 1000 * MS])
@@ -136,6 +146,8 @@ def uncalibrated(folder):
         (without_side, r"intrinsics.feather lacks ring_side_left, which has images"),
         (twice, r"egovehicle_SE3_sensor.feather has two rows of ring_front_center"),
         (no_lens, r"intrinsics.feather: ring_front_center has focal lengths 0 and 300 .* no camera"),
+        (long_lens, r"ring_front_center has focal lengths 1e\+300 and 300 .* no camera"),
+        (far_away, r"egovehicle_SE3_sensor.feather: tx_m, ty_m, tz_m of row 0 are .*1e\+300\], no metres"),
         (no_pose, r"has no pose at the time of .*ring_front_center/980000000.jpg"),
         (renamed, r"first.jpg is not named after its time"),
         (uncalibrated, r"intrinsics.feather is missing"),

@@ -19,6 +19,7 @@ feather = pytest.importorskip("pyarrow.feather")
 NUMBERS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 SIZES = ("length_m", "width_m", "height_m")
 WRONG = {"nan": np.nan, "inf": -np.inf, "empty": None, "text": "1.0"}
+STANDS = {ANNOTATIONS: {}, POSES: {"tx_m": 0.0}}
 FILES = ((ANNOTATIONS, (*NUMBERS, *SIZES)), (POSES, NUMBERS))
 
 
@@ -142,6 +143,7 @@ MAPS = {
     "no areas": (lambda content: content.pop("drivable_areas"), ("drivable_areas",)),
     "NaN in a lane": (lane(left_lane_boundary=spoiled("x", float("nan"))), ("lane_segments.5", "left_lane_boundary")),
     "infinite lane": (lane(left_lane_boundary=spoiled("y", float("inf"))), ("left_lane_boundary", "finite")),
+    "lane around the Earth": (lane(left_lane_boundary=spoiled("x", 4e7)), ("left_lane_boundary", "km apart")),
     "missing coordinate": (lane(left_lane_boundary=spoiled("z", None)), ("left_lane_boundary[1]", "'z'")),
     "text coordinate": (lane(left_lane_boundary=spoiled("x", "12.0")), ("left_lane_boundary", "text")),
     "null coordinate": (lane(left_lane_boundary=[{"x": None, "y": 0.0, "z": 0.0}] * 2), ("left_lane_boundary",)),
@@ -167,6 +169,10 @@ MAPS = {
     "crossing without an edge": (lambda content: content["pedestrian_crossings"]["1"].pop("edge2"), ("edge2",)),
     "crossing edge of one point": (entry("pedestrian_crossings", "edge1", points((0, 0))), ("edge1", "1 points")),
     "NaN in a crossing": (entry("pedestrian_crossings", "edge1", points((0, 0), (np.nan, 1))), ("edge1", "finite")),
+    "crossing around the Earth": (
+        entry("pedestrian_crossings", "edge1", points((4e7, 0), (4e7, 5))),
+        ("pedestrian_crossings.1", "km apart"),
+    ),
     "area of two points": (entry("drivable_areas", "area_boundary", points((0, 0), (1, 1))), ("area_boundary",)),
     "NaN in an area": (
         entry("drivable_areas", "area_boundary", points((0, 0), (1, np.nan), (2, 0))),
@@ -207,3 +213,45 @@ def test_what_is_read_is_finite(folder):
     assert np.isfinite(flow.position[flow.valid]).all()
     assert lanes.valid.any()
     assert np.isfinite(lanes.points[lanes.valid]).all()
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [
+        (lambda time: time // 1000, ("0.0001 s apart", "nanoseconds")),  # microseconds
+        (lambda time: time * 1000, ("1e+02 s apart", "nanoseconds")),
+        (lambda time: time + (10**12 if time >= 1300 * 10**6 else 0), ("no box for 1000 s", "several logs")),
+    ],
+)
+def test_times_in_another_unit_are_refused(folder, scale, said):
+    for name in (ANNOTATIONS, POSES):
+        rows = feather.read_table(folder / name).to_pylist()
+        # The vehicle stands: a moving one would jump.
+        write(folder / name, [row | {"timestamp_ns": scale(row["timestamp_ns"])} | STANDS[name] for row in rows])
+    refused(folder, said)
+
+
+FRAMES, LOGS = '{"val": {"10003": ["1000000000.json"]}}', '{"val": {"10003": "log"}}'
+
+
+@pytest.mark.parametrize(
+    ("frames", "logs", "message"),
+    [
+        ("[]", LOGS, r"subset_A\.json is of type list, expected a mapping"),
+        (FRAMES, "[]", r"log\.json is of type list, expected a mapping"),
+        ('{"val": []}', LOGS, r"subset_A\.json: val is \[\], expected a mapping from segments"),
+        (FRAMES, '{"val": 3}', r"log\.json: val is 3, expected a mapping from segments"),
+        (FRAMES, '{"val": {"10003": ["log"]}}', r"log\.json: val: 10003 is \['log'\], expected the id of a log"),
+        ('{"val": {"10003": 5}}', LOGS, "val: 10003 is of type int, expected a list"),
+        ('{"val": {"10003": [1.5]}}', LOGS, r"val: 10003: 1\.5 is no frame, expected <timestamp>"),
+        ('{"val": {"10003": ["first.json"]}}', LOGS, r"val: 10003: 'first\.json' is no frame"),
+        (f'{{"val": {{"10003": ["{10**30}.json"]}}}}', LOGS, "is no frame"),
+        ("[" * 100_000, LOGS, "nested too deep"),
+    ],
+)
+def test_damaged_split_files_are_named(folder, tmp_path, frames, logs, message):
+    (tmp_path / "OpenLane-V2").mkdir()
+    (tmp_path / "OpenLane-V2" / "data_dict_subset_A.json").write_text(frames)
+    (tmp_path / "subset_A_segment_to_av2_log.json").write_text(logs)
+    with pytest.raises(UserError, match=message):
+        load_log(folder, openlane=tmp_path)

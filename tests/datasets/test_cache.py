@@ -83,6 +83,17 @@ def test_configuration_and_code_are_part_of_the_name(tmp_path, monkeypatch):
     assert build(tmp_path, one).folder != folder
 
 
+@pytest.mark.parametrize("library", ["numpy", "scipy", "shapely", "opencv"])
+def test_another_version_of_a_library_makes_other_examples(monkeypatch, library):
+    """Images are drawn by OpenCV, road edges merged by shapely."""
+    pytest.importorskip("cv2" if library == "opencv" else library)
+    there, before = cache.importlib.metadata.version, cache.source_digest.__wrapped__()
+    monkeypatch.setattr(
+        cache.importlib.metadata, "version", lambda name: there(name) + (".1" if name.startswith(library) else "")
+    )
+    assert cache.source_digest.__wrapped__() != before
+
+
 @pytest.mark.parametrize(
     ("other", "same"),
     [

@@ -68,6 +68,25 @@ def write(path, *features, **other):
     return path
 
 
+@pytest.mark.parametrize(
+    ("properties", "expected"),
+    [
+        # As osmnx and OpenStreetMap write roads that were joined.
+        ({"highway": ["raceway", "residential", "service"]}, SdCategory.RESIDENTIAL),
+        ({"highway": "trunk_link; primary"}, SdCategory.TRUCK_ROAD),
+        ({"highway": ["raceway"]}, SdCategory.OTHER),
+        # As a table is exported whose other rows have the column.
+        ({"highway": "service", "category": None}, SdCategory.SERVICE),
+        ({"highway": None, "category": "road"}, SdCategory.ROAD),
+    ],
+)
+def test_several_values_and_null(tmp_path, properties, expected):
+    path = write(tmp_path / "map.geojson", feature(LINE, **properties))
+    assert read_geojson(path).category == (expected,)
+    path.write_text(path.read_text(), encoding="utf-8-sig")  # as programs on Windows do
+    assert read_geojson(path).category == (expected,)
+
+
 def test_a_file_becomes_a_map_around_the_vehicle(tmp_path):
     path = write(
         tmp_path / "map.geojson",
@@ -105,6 +124,13 @@ BAD = {
     "no category": (feature(LINE, name="x"), "neither of the properties `highway` and `category`"),
     "no properties": (feature(LINE) | {"properties": None}, "neither of the properties"),
     "unknown category": (feature(LINE, category="raod"), "'raod': choose one of road, cross_walk"),
+    "null": (feature(LINE, highway=None, category=None), "neither of the properties"),
+    "category of a list": (feature(LINE, category=["road"]), r"the category \['road'\]: choose one of road"),
+    "geometry of a list": (feature(LINE, ["LineString"]), r"feature 1 has a geometry of type \['LineString'\]"),
+    "number of hundreds of digits": (
+        feature([[10**400, 1], [1, 1]], highway="road"),
+        "feature 1 is no line of at least two points",
+    ),
     "no feature": ({"type": "Way"}, "feature 1 is no GeoJSON Feature"),
     "a list": ([], "feature 1 is no GeoJSON Feature"),
     "geometry": (feature(LINE, "Line", highway="road"), "feature 1 has a geometry of type 'Line'"),
@@ -125,6 +151,7 @@ def test_a_bad_feature_is_named_with_its_remedy(name, tmp_path):
     ("content", "message"),
     [
         ("{", "is no JSON"),
+        ("[" * 100_000, "nested too deep"),
         ("[]", "is no GeoJSON FeatureCollection"),
         ('{"type": "Feature"}', "is no GeoJSON FeatureCollection"),
         ('{"type": "FeatureCollection", "features": {}}', "is no GeoJSON FeatureCollection"),

@@ -8,7 +8,7 @@ import pytest
 
 from tests.fakes import fake_example, fake_views
 from tflane_jax.datasets.leaves import PARTS, example_from_leaves, example_leaves
-from tflane_jax.scene import Example, MapLines, MarkerObservations, SdMap
+from tflane_jax.scene import Example, MapLines, MarkerObservations, SdMap, VehicleState
 
 
 def full_example() -> Example:
@@ -35,13 +35,35 @@ def test_every_container_of_an_example_is_known():
     assert all(type(getattr(example, name)) is part for name, part in PARTS.items())
 
 
-@pytest.mark.parametrize("example", [full_example(), fake_example(), fake_example().replace(bev=None)])
+def with_vehicle(can_bus):
+    """An example whose images come with what published weights know of the vehicle."""
+    state = VehicleState(np.eye(4, dtype=np.float32), np.ones((4, 4), np.float32), can_bus)
+    return full_example().replace(cameras=fake_views().replace(vehicle=state))
+
+
+@pytest.mark.parametrize(
+    "example",
+    [
+        full_example(),
+        with_vehicle(np.arange(18.0)),
+        with_vehicle(None),
+        fake_example(),
+        fake_example().replace(bev=None),
+    ],
+)
 def test_round_trip_gives_the_same_arrays(example):
     leaves = example_leaves(example)
     again = example_from_leaves(leaves)
     assert len(leaves) == len(jax.tree.leaves(example))
     assert jax.tree.structure(again) == jax.tree.structure(example)
     jax.tree.map(np.testing.assert_array_equal, again, example)
+
+
+def test_every_leaf_is_an_array_of_numbers():
+    """A container in a container would be one object, which no device takes."""
+    leaves = example_leaves(with_vehicle(np.arange(18.0)))
+    assert leaves["cameras.vehicle.can_bus"].shape == (18,)
+    assert all(leaf.dtype.kind in "biuf" for leaf in leaves.values())
 
 
 def test_names_say_where_an_array_belongs():

@@ -220,6 +220,12 @@ def test_missing_and_strange_images_are_named(root):
     content["calibrated_sensor"][1]["camera_intrinsic"] = []
     with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: camera_intrinsic has shape \(0,"):
         opened(write_nuscenes(root, content), image=small).example(1)
+    content["calibrated_sensor"][1]["camera_intrinsic"] = [[1e300, 0, 32], [0, 1e300, 18], [0, 0, 1]]
+    with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: camera_intrinsic holds 1e\+300"):
+        opened(write_nuscenes(root, content), image=small).example(1)
+    content["calibrated_sensor"][1] |= {"camera_intrinsic": K, "translation": [1.0, 1e300, 0.0]}
+    with pytest.raises(UserError, match=r"row calibrated-CAM_FRONT: translation holds 1e\+300"):
+        opened(write_nuscenes(root, content), image=small).example(1)
     with pytest.raises(UserError, match=r"nuScenes has real cameras: set example\.cameras=None"):
         NuScenesDataset(NuScenesConfig(root, example=replace(SIZES, cameras=CameraRigConfig())))
 

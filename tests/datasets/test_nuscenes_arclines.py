@@ -81,6 +81,20 @@ def test_a_lane_repeats_no_joint():
     assert len(lane_points([path("LSR", (0.0, 0.0, 0.0))], 0.5, "map")) == 1
 
 
+@pytest.mark.parametrize("apart", [3e-4, 6e-4, -6e-4, 4e-3, -4e-3, 0.0])
+def test_a_joint_that_does_not_quite_fit_is_one_point(apart):
+    """A step of a millimetre, or of none after rounding, has no direction: boundaries would jump to the other side."""
+    after = path("LSR", (0.0, 2.0, 0.0), start=(2.0 + apart, 5.0, 0.0))
+    points = lane_points([path("LSR", (0.0, 2.0, 0.0), start=(0.0, 5.0, 0.0)), after], 0.5, "map")
+    np.testing.assert_allclose(points, np.column_stack([np.linspace(0.0, 4.0, 9), np.full(9, 5.0)]), atol=5e-3)
+
+
+def test_the_end_of_a_lane_stays():
+    after = path("LSR", (0.0, 0.004, 0.0), start=(2.0, 5.0, 0.0))
+    points = lane_points([path("LSR", (0.0, 2.0, 0.0), start=(0.0, 5.0, 0.0)), after], 0.5, "map")
+    np.testing.assert_array_equal(points[:, 0], [0.0, 0.5, 1.0, 1.5, 2.004])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -88,6 +102,7 @@ def test_a_lane_repeats_no_joint():
         ({"radius": 0.0}, "radius 0 and segment lengths"),
         ({"radius": "wide"}, "radius is of type str"),
         ({"segment_length": [1.0, -1.0, 1.0]}, "must be positive"),
+        ({"segment_length": [1.0, 2e7, 1.0]}, r"add up to 20000 km"),
         ({"segment_length": [1.0, 1.0]}, r"segment_length has shape \(2,\)"),
         ({"start_pose": [0.0, float("nan"), 0.0]}, "start_pose holds nan"),
     ],

@@ -55,6 +55,21 @@ def test_lanes_with_and_without_outline(file):
     np.testing.assert_allclose(connector.right[-1], [386.0, 1141.75, 0.0], atol=2e-3)
 
 
+def test_the_polygon_of_a_connector_is_no_outline(file):
+    """It is a box around the line: a diagonal one of 10 m would be 10 m wide in the middle."""
+    content = city()
+    corners = [(400.0, 1130.0), (407.0, 1130.0), (407.0, 1137.0), (400.0, 1137.0)]
+    content["node"] += [{"token": f"box{i}", "x": x, "y": y} for i, (x, y) in enumerate(corners)]
+    content["polygon"].append({"token": "box", "exterior_node_tokens": [f"box{i}" for i in range(4)], "holes": []})
+    content["lane_connector"] = [{"token": "turn", "polygon_token": "box"}]
+    content["arcline_path_3"]["turn"] = [straight([400.0, 1130.0, np.pi / 4], 7.0 * np.sqrt(2.0))]
+    for polygon in ("box", None):
+        content["lane_connector"][0]["polygon_token"] = polygon
+        (connector,) = (one for one in read(file, content).around(PATH, 50.0).segments.values() if one.is_intersection)
+        width = np.linalg.norm(connector.left - connector.right, axis=-1)
+        np.testing.assert_allclose(width, 3.5, atol=1e-9)
+
+
 def test_lines_and_areas(file):
     found = read_expansion(file).around(PATH, 50.0)
     middle, between = found.dividers  # the empty divider is left out
@@ -125,6 +140,7 @@ def edit(*keys, value):
             if layer not in ("version", "canvas_edge")
         ),
         (edit("node", 3, "x", value=float("nan")), r"node holds nan at \[3, 0\]"),
+        (edit("node", 3, "y", value=4e7), "polygon polygon-0: points 2 and 3 are 39998.9 km apart"),
         (edit("node", 3, "y", value="1130.0"), "node is of type list, expected numbers"),
         (edit("node", 3, "y", value="far"), "node is of type list, expected numbers"),
         (edit("node", 3, "y", value=...), "node n3 lacks the entry 'y'"),
@@ -143,6 +159,7 @@ def edit(*keys, value):
         (edit("arcline_path_3", value=[]), "arcline_path_3 is of type list, expected a mapping from lanes"),
         (edit("arcline_path_3", "north", 0, "shape", value="LLL"), r"arcline_path_3 north\[0\]\.shape is 'LLL'"),
         (edit("connectivity", "turn", "incoming", value=...), "connectivity turn lacks the entry 'incoming'"),
+        (edit("connectivity", "turn", "incoming", value=[{}]), "connectivity turn: {} is no token of a lane"),
         (edit("connectivity", "turn", "incoming", value="north"), "incoming is of type str, expected a list"),
         (edit("polygon", 0, "exterior_node_tokens", value=None), r"polygon polygon-0: exterior_node_tokens is missing"),
         (edit("line", 0, "node_tokens", value=...), "line line-0 lacks the entry 'node_tokens'"),

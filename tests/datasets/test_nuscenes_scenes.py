@@ -131,7 +131,8 @@ DAMAGE = {
     "lengths as fractions": (changed(polygon_len=np.ones(5)), "polygon_len must be 5 whole numbers"),
     "negative lengths": (changed(polyline_len=np.array([4, 3, 2, 7, -1])), "polyline_len must be 5 whole numbers"),
     "meta no JSON": (changed(meta=np.array("scene")), "meta is no JSON text"),
-    "no rate": (changed(meta=np.array('{"scene": "a", "rate_hz": 0}')), "rate_hz positive"),
+    "no rate": (changed(meta=np.array('{"scene": "a", "rate_hz": 0}')), "rate_hz key frames a second, not 'a' and 0"),
+    "no time at all": (changed(meta=np.array('{"scene": "a", "rate_hz": 1e-300}')), "not 'a' and 1e-300"),
     "objects": (changed(category=np.array([{}, {}], object)), "no npz file of plain arrays"),
     **{f"{key} missing": (lambda scene, key=key: scene.pop(key), f"lacks the entry '{key}'") for key in content()},
 }

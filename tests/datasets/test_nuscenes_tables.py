@@ -79,6 +79,16 @@ def repeat(table, number=0, **columns):
     return lambda content: content[table].append(content[table][number] | columns)
 
 
+def timed(scale):
+    """Return damage that writes the times of all samples in another unit."""
+
+    def damage(content):
+        for row in content["sample"]:
+            row["timestamp"] = scale(row["timestamp"])
+
+    return damage
+
+
 NAN, ZERO = float("nan"), [0.0] * 4
 DAMAGE = {
     "row without token": (change("log", 0, token=...), r"log\.json: row number 0 has no token"),
@@ -119,6 +129,15 @@ DAMAGE = {
     ),
     "prev that disagrees": (change("sample", 2, prev="sample-a0"), "row sample-a2: prev is not the sample whose next"),
     "time that runs back": (change("sample", 2, timestamp=START), "row sample-a2: its timestamp is not later"),
+    "times in nanoseconds": (
+        timed(lambda time: 1000 * time),
+        r"scene\.json: row scene-b: a sample has the time 1532402927500000000: expected microseconds",
+    ),
+    "nanoseconds from the start": (
+        timed(lambda time: 1000 * (time - START)),
+        r"row scene-b: its frames are 5e\+02 s apart: are its times in microseconds",
+    ),
+    "times in milliseconds": (timed(lambda time: time // 1000), r"frames are 0\.0005 s apart: are its times in micro"),
     "chain cut short": (change("sample", 1, next=""), r"scene\.json: row scene-a: the chain of samples has 2 and ends"),
     "number of samples": (change("scene", 1, nbr_samples=5), "the chain of samples has 4"),
     "two scenes with one name": (change("scene", 0, name="scene-0061"), "a second scene is called scene-0061"),

@@ -107,6 +107,45 @@ def test_lines_that_part_or_run_against_each_other_are_different():
     assert same_lines([], [straight]) == {}
 
 
+def _short(name, field, points):
+    """Return damage: the first lane or edge of every frame is as short as where the border cuts off a corner."""
+
+    def damage(annotation):
+        one = next(thing for thing in annotation[name] if thing.get("category", 2) == 2)
+        x, y, z = one[field][0]
+        one[field] = np.linspace([x, y, z], [x + 0.1, y, z], points).tolist()
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("flavour", "damage"),
+    [
+        ("", _short("lane_centerline", "points", 201)),
+        ("", _short("lane_centerline", "points", 1)),
+        ("-ls", _short("lane_segment", "centerline", 201)),
+        ("-ls", _short("lane_segment", "left_laneline", 1)),
+        ("-ls", _short("lane_segment", "right_laneline", 201)),
+        ("-ls", _short("area", "points", 201)),
+    ],
+)
+def test_lines_without_length_are_passed_over(tmp_path, flavour, damage):
+    """They tell nothing; the other lanes and their topology stay."""
+    files = segment_files(write_frames(tmp_path, (flavour,), EAST_TO_WEST[:4]) / "val" / "10073" / "info")
+    whole = read_segment(files).map
+    for file in files:
+        frame = json.loads(file.read_text())
+        damage(frame["annotation"])
+        file.write_text(json.dumps(frame))
+    found = read_segment(files).map
+    assert 0 <= len(whole.segments) - len(found.segments) <= 1
+    for lane in found.segments.values():
+        assert all(len(line) > 1 and np.isfinite(line).all() for line in (lane.centerline, lane.left, lane.right))
+        left, right = resample_lines([lane.left, lane.right], 21)
+        assert np.linalg.norm(left - right, axis=-1).mean() == pytest.approx(3.5, abs=0.5)
+    assert all(len(line) > 1 for line in found.road_boundaries)
+
+
 def _no_annotation(frames):
     frames[3]["annotation"] = None
 

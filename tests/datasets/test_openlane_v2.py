@@ -205,6 +205,10 @@ def copied_image(folder):
     image.write_bytes(next(small.iterdir()).read_bytes())
 
 
+def calibrated(part, **values):
+    return lambda folder: change(info(folder), lambda content: content["sensor"]["CAM_FRONT"][part].update(values))
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -212,13 +216,9 @@ def copied_image(folder):
         (copied_image, "is 48 x 16 pixels, the first image of CAM_FRONT|is 48 x 32 pixels"),
         (lambda folder: info(folder).write_text("{"), "is no JSON file"),
         (lambda folder: change(info(folder), lambda content: content.pop("sensor")), "lacks the entry 'sensor'"),
-        (
-            lambda folder: change(
-                info(folder),
-                lambda content: content["sensor"]["CAM_FRONT"]["intrinsic"].update(K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]]),
-            ),
-            "is no camera matrix",
-        ),
+        (calibrated("intrinsic", K=[[1, 0, 0], [0, 0, 0], [0, 0, 1]]), "is no camera matrix"),
+        (calibrated("intrinsic", K=[[1e39, 0, 0], [0, 1, 0], [0, 0, 1]]), r"CAM_FRONT\.intrinsic\.K holds 1e\+39"),
+        (calibrated("extrinsic", translation=[0, 0, 1e39]), r"CAM_FRONT\.extrinsic\.translation holds 1e\+39"),
         (lambda folder: info(folder, 1).unlink(), r"1 of 3 frames are missing \(train/01000/"),
         (lambda folder: shutil.rmtree(folder / "train"), "3 of 3 frames are missing"),
         (lambda folder: (folder / "data_dict_subset_B.json").write_text("{}"), "lacks the entry 'train'"),

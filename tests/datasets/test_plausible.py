@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tflane_jax.datasets.plausible import FAR, check_distance, check_motion, check_place
+from tflane_jax.datasets.plausible import FAR, check_distance, check_interval, check_motion, check_place, check_steps
 from tflane_jax.errors import UserError
 
 TIMES = np.arange(3) * 500_000_000
@@ -14,6 +14,15 @@ def test_speed():
     check_motion(np.zeros((1, 2)), TIMES[:1], "a")
     with pytest.raises(UserError, match=r"c: the vehicle is 40 m from its place 0\.5 s before"):
         check_motion(np.array([[0.0, 0.0], [0.0, 0.0], [40.0, 0.0]]), TIMES, "abc")
+
+
+def test_interval():
+    check_interval(TIMES, "nanoseconds", "a")
+    check_interval(TIMES[:1], "nanoseconds", "a")
+    for factor, text in ((1000, "5e+02"), (1e-3, "0.0005")):
+        with pytest.raises(UserError) as error:
+            check_interval((TIMES * factor).astype(np.int64), "nanoseconds", "a")
+        assert str(error.value) == f"a: its frames are {text} s apart: are its times in nanoseconds?"
 
 
 def test_place():
@@ -30,3 +39,11 @@ def test_distance():
     check_distance(np.zeros((0, 3)), "")
     with pytest.raises(UserError, match="b: the box is 600 m from the vehicle"):
         check_distance(np.array([[1.0, 0.0, 0.0], [0.0, -600.0, 0.0]]), "ab")
+
+
+def test_steps():
+    check_steps(np.array([[0.0, 0.0, 9e9], [9999.0, 0.0, 0.0], [9999.0, 5.0, 0.0]]), "a")
+    check_steps(np.zeros((1, 2)), "a")
+    for far, text in ((3e7, "30000"), (1e300, "inf")):
+        with pytest.raises(UserError, match=f"a: points 1 and 2 are {text} km apart"):
+            check_steps(np.array([[0.0, 0.0], [1.0, 0.0], [far, 0.0]]), "a")

@@ -10,7 +10,9 @@ from tests.datasets.small_argoverse2 import write_log
 from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tests.datasets.test_nuscenes_scenes import content
 from tests.world.small_map import crossroads
+from tflane_jax.datasets import road_maps
 from tflane_jax.datasets.geojson_lanes import read_lanes
+from tflane_jax.datasets.nuscenes_tables import TABLES
 from tflane_jax.datasets.road_maps import chosen_maps, find_maps, road_map_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, transform_points
@@ -98,8 +100,41 @@ def test_scenes_of_the_nuscenes_folder_have_the_map_around_them(tmp_path):
     path.unlink()
     with pytest.raises(UserError, match=r"singapore-onenorth\.json"):
         one.content()
+    path.write_text("{}")
+    for table in ("ego_pose", "sample_annotation"):  # the drive, and the parked vehicles
+        before, file = one.content(), tmp_path / "v1.0-mini" / f"{table}.json"
+        file.write_text(file.read_text() + " ")
+        assert one.content() != before
     (tmp_path / "v1.0-mini" / "log.json").write_text("[]")
     with pytest.raises(UserError, match=r"names a log that is not in .*log\.json"):
+        find_maps(tmp_path)
+
+
+def test_a_file_that_scenes_share_is_read_once(tmp_path, monkeypatch):
+    """Of 850 scenes, each has the same tables and one of four maps: gigabytes."""
+    read, whole = [], road_maps.hashlib.file_digest
+    monkeypatch.setattr(
+        road_maps.hashlib, "file_digest", lambda file, kind: (read.append(file.name), whole(file, kind))[1]
+    )
+    for one in find_maps(write_nuscenes(tmp_path)):
+        assert one.content() == one.content()
+    assert len(read) == len(set(read)) == len(TABLES) + 2
+
+
+@pytest.mark.parametrize(
+    ("table", "content", "message"),
+    [
+        ("scene", "5", r"scene\.json is no JSON list"),
+        ("log", "null", r"log\.json is no JSON list"),
+        ("log", "[3]", r"log\.json: a row is of type int"),
+        ("log", '[{"token": [1], "location": "x"}]', r"log\.json: token is \[1\], expected text"),
+        ("scene", '[{"name": "x", "log_token": {}}]', r"scene\.json: log_token is {}, expected text"),
+        ("scene", '[{"name": null, "log_token": "x"}]', r"scene\.json: name is None, expected text"),
+    ],
+)
+def test_damaged_tables_of_scenes_are_named(tmp_path, table, content, message):
+    (write_nuscenes(tmp_path) / "v1.0-mini" / f"{table}.json").write_text(content)
+    with pytest.raises(UserError, match=message):
         find_maps(tmp_path)
 
 
@@ -184,6 +219,36 @@ def test_lanes_of_a_geojson_file_have_their_places_markings_and_successors(tmp_p
     assert len(prepare_roads(town, 1.8).spots(55.0)) > 10
 
 
+def test_a_map_as_tables_are_exported(tmp_path):
+    """Every geometry as Multi..., truth as 0 and 1, and what a feature does not have as null."""
+    features = crossroads_features()
+    plain = read_lanes(write(tmp_path / "town.geojson", features))
+    columns = {key for one in features for key in one["properties"]}
+    for one in features[:-1]:  # not the tree
+        geometry, properties = one["geometry"], one["properties"]
+        geometry |= {"type": f"Multi{geometry['type']}", "coordinates": [geometry["coordinates"]]}
+        if "intersection" in properties:
+            properties |= {"intersection": int(properties["intersection"]), "bicycle": 0}
+        properties |= {name: 1 for name in ("boundary", "crossing") if name in properties}
+        one["properties"] = dict.fromkeys(columns | {"successors"}) | properties
+    found = read_lanes(write(tmp_path / "town.geojson", features))
+    assert (len(found.map.crossings), len(found.map.road_boundaries)) == (1, 1)
+    for lane_, wanted in zip(found.map.segments.values(), plain.map.segments.values(), strict=True):
+        np.testing.assert_array_equal(lane_.left, wanted.left)
+        assert (lane_.successors, lane_.is_intersection, lane_.vehicle) == (
+            wanted.successors,
+            wanted.is_intersection,
+            True,
+        )
+
+
+def shaped(feature, kind, coordinates=None):
+    """Return a feature with another type of geometry."""
+    given = feature["geometry"]["coordinates"] if coordinates is None else coordinates
+    return feature | {"geometry": {"type": kind, "coordinates": given}}
+
+
+CORNERS = [(0, 0), (0, 5), (3, 5), (3, 2), (2, 0), (0, 0)]
 ARM = [(0, 0), (80, 0)]
 
 
@@ -198,6 +263,25 @@ ARM = [(0, 0), (80, 0)]
         ([lane(1, *ARM, successors=2)], "feature 0: successors is 2, expected a list"),
         ([lane(1, *ARM, width="wide")], "feature 0: width is 'wide', expected metres"),
         ([lane(1, *ARM, width=30)], "feature 0: width is 30, expected metres"),
+        ([lane(1, *ARM, intersection="true")], "feature 0: intersection is 'true', expected true or false"),
+        ([lane(1, *ARM, bicycle="yes")], "feature 0: bicycle is 'yes', expected true or false"),
+        ([lane(1, *ARM, left=["solid"])], r"feature 0: left is \['solid'\], expected one of none"),
+        ([shaped(lane(1), "MultiLineString", [place(*ARM), place(*ARM)])], "lane 1 is a MultiLineString of 2 lines"),
+        ([shaped(lane(1), "Polygon", [place(*CORNERS)])], "lane 1 is a Polygon of 1 lines"),
+        ([shaped(lane(1), "MultiPolygon", 7)], "feature 0: coordinates is of type int, expected a list"),
+        (
+            [
+                {
+                    "type": "Feature",
+                    "properties": {"crossing": True},
+                    "geometry": shaped(lane(1), "Polygon", [place(*CORNERS)])["geometry"],
+                }
+            ],
+            "feature 0: a crossing is a Polygon of four corners",
+        ),
+        ([lane(1, *ARM) | {"properties": ["lane"]}], r"feature 0: properties is \['lane'\], expected a mapping"),
+        ([lane(1, *ARM) | {"geometry": [1]}], r"feature 0: geometry is \[1\], expected a mapping"),
+        ([lane(1, (0, 0), (4e6, 0))], "feature 0: points 0 and 1 are .* km apart"),
         ([lane(1, *ARM, left="blue")], "feature 0: left is 'blue', expected one of none, solid, dashed"),
         ([lane(1, (0, 0), (0, 0))], "feature 0 is a lane without length"),
         ([lane(1, *ARM)], "too small a map: .*the most is 2 m"),

@@ -27,6 +27,8 @@ def test_rows_are_those_of_the_json_module(tmp_path, rows, indent):
         (b"[1 2]", "expected ',' or ']' in line 1"),
         (b"[1] 2", "something follows the list"),
         (b"[\xff]", "not text"),
+        (b"[" * 100_000, "nested too deep"),
+        (b"[" + b"1" * 5000 + b"]", "no JSON file that can be read: Exceeds the limit"),
     ],
 )
 def test_what_is_no_list_is_named(tmp_path, content, message):
@@ -35,6 +37,13 @@ def test_what_is_no_list_is_named(tmp_path, content, message):
     with pytest.raises(UserError, match=message) as error:
         list(json_rows(path))
     assert str(path) in str(error.value)
+
+
+def test_a_byte_order_mark_is_no_row(tmp_path):
+    """Programs on Windows write one."""
+    path = tmp_path / "rows.json"
+    path.write_text("[1]", encoding="utf-8-sig")
+    assert list(json_rows(path)) == [1]
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from tflane_jax.datasets.argoverse2_log import POSE_COLUMNS, POSES, poses_of, read_poses
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
-from tflane_jax.datasets.plausible import first_twice
+from tflane_jax.datasets.plausible import MOST_PIXELS, first_twice
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
@@ -155,7 +155,7 @@ def _intrinsics(path: Path) -> tuple[dict[str, tuple[int, int]], dict[str, np.nd
     for row, name in enumerate(table["sensor_name"].tolist()):
         fx, fy, cx, cy = (float(table[column][row]) for column in ("fx_px", "fy_px", "cx_px", "cy_px"))
         width, height = int(table["width_px"][row]), int(table["height_px"][row])
-        if not (fx > 0.0 and fy > 0.0 and 0.0 < cx < width and 0.0 < cy < height):
+        if not (0.0 < fx <= MOST_PIXELS and 0.0 < fy <= MOST_PIXELS and 0.0 < cx < width and 0.0 < cy < height):
             raise UserError(
                 f"{path}: {name} has focal lengths {fx:g} and {fy:g} and principal point {cx:g}, {cy:g} in images of "
                 f"{width} x {height} pixels, which is no camera: download it again"

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.argoverse2_map import read_map
 from tflane_jax.datasets.openlane_splits import openlane_timestamps
-from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
+from tflane_jax.datasets.plausible import FARTHEST, check_distance, check_interval, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.feather_table import Kind, read_columns
 from tflane_jax.geometry import matrix_from_quaternion, pose_matrix
@@ -41,6 +41,8 @@ _BOX_COLUMNS: Mapping[str, Kind] = {
 _UNIT = 1e-2
 # Every fifth lidar frame is 2 Hz, the rate of OpenLane-V2.
 _FRAMES_PER_KEYFRAME = 5
+# Seconds without a box after which annotations are not those of one drive.
+_QUIET = 600.0
 
 CATEGORIES: Mapping[str, RoadUser | None] = {
     "REGULAR_VEHICLE": RoadUser.CAR,
@@ -95,7 +97,7 @@ def load_log(
         folder: holds annotations.feather, city_SE3_egovehicle.feather and map/.
         keyframes: "openlane_v2" takes the 2 Hz frames of OpenLane-V2, "annotations" every annotated frame (10 Hz).
         openlane: folder of the OpenLane-V2 split files, which hold the exact timestamps (of the front camera). Without
-            it, or for a log that is not in them, "openlane_v2" takes every fifth annotated frame.
+            it, or for a log that is not in them, "openlane_v2" takes every fifth frame.
         categories: road user of each category, None to leave it out.
         with_map: False leaves the map empty, for tracks alone.
 
@@ -105,17 +107,19 @@ def load_log(
     folder = Path(folder)
     pose_times, poses = read_poses(folder)
     boxes = _read_boxes(folder / ANNOTATIONS)
-    times = np.unique(boxes["timestamp_ns"])
-    if len(times) == 0:
+    annotated = np.unique(boxes["timestamp_ns"])
+    if len(annotated) == 0:
         raise UserError(
             f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
         )
+    check_interval(annotated, "nanoseconds", str(folder / ANNOTATIONS))
+    _poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
+    times = _with_empty_frames(annotated, folder)
     tracks = _tracks(boxes, times, categories, folder)
-    moments = times if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
+    moments = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
     if keyframes == "openlane_v2" and openlane is not None:
         moments = openlane_timestamps(openlane).get(folder.name, moments)
-    nearest = np.abs(moments[:, None] - times).argmin(-1)
-    at_frames = _poses_at(times, pose_times, poses, folder)
+    nearest, at_frames = _nearest(times, moments), poses[_nearest(pose_times, times)]
     city = VectorMap({})
     if with_map:
         city = read_map(folder / "map")
@@ -159,14 +163,20 @@ def read_poses(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def poses_of(path: Path, table: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 4 4"]:
-    """Return the poses in the columns of a file; raise UserError for a quaternion that is not of unit length."""
+    """Return the poses in the columns of a file; raise UserError for what is no unit quaternion, or not in metres."""
     quaternion = np.stack([table[c] for c in _QUATERNION], -1)
     if (odd := np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) > _UNIT).any():
         row = int(odd.argmax())
         raise UserError(
             f"{path}: qw, qx, qy, qz of row {row} are {quaternion[row].tolist()}, no unit quaternion: download it again"
         )
-    return pose_matrix(matrix_from_quaternion(quaternion), np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1))
+    place = np.stack([table[c] for c in ("tx_m", "ty_m", "tz_m")], -1)
+    if (far := np.abs(place).max(-1, initial=0.0) > FARTHEST).any():
+        row = int(far.argmax())
+        raise UserError(
+            f"{path}: tx_m, ty_m, tz_m of row {row} are {place[row].tolist()}, no metres: download it again"
+        )
+    return pose_matrix(matrix_from_quaternion(quaternion), place)
 
 
 def _read_boxes(path: Path) -> dict[str, np.ndarray]:
@@ -199,6 +209,35 @@ def _poses_at(times: np.ndarray, pose_times: np.ndarray, poses: np.ndarray, fold
             "annotations and poses are not of the same log; download both again"
         )
     return poses[row]
+
+
+def _nearest(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the row of the nearest of ascending times for each wanted one; the earlier of two that are as near."""
+    after = np.searchsorted(times, wanted).clip(1, max(len(times) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(times) - 1)
+    return np.where(times[after] - wanted < wanted - times[before], after, before)
+
+
+def _with_empty_frames(annotated: np.ndarray, folder: Path) -> np.ndarray:
+    """Return the times of all frames: annotated ones, and those between them in which there was no box at all.
+
+    The file has no row of such a frame. History counts frames, so that what was seen before a quiet stretch would move
+    up to the present. Raises UserError for a stretch that is too long to be one.
+    """
+    steps = np.diff(annotated)
+    if not len(steps):
+        return annotated
+    if steps.max() > _QUIET * 1e9:
+        raise UserError(
+            f"{folder / ANNOTATIONS} has no box for {steps.max() / 1e9:.0f} s after {annotated[steps.argmax()]}: are "
+            "these several logs?"
+        )
+    missing = np.rint(steps / np.median(steps)).astype(int) - 1
+    between = [
+        annotated[i] + steps[i] * np.arange(1, missing[i] + 1) // (missing[i] + 1) for i in np.flatnonzero(missing > 0)
+    ]
+    return np.sort(np.concatenate([annotated, *between]))
 
 
 def _tracks(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.datasets.plausible import first_twice, left_of
+from tflane_jax.datasets.plausible import check_steps, first_twice, left_of
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.fields import items, load_json, member, numbers, whole_number
 from tflane_jax.geometry.polylines import resample
@@ -78,6 +78,7 @@ def _points(record: Any, name: str, where: str, least: int) -> np.ndarray:
     points = numbers(rows, (None, 3), f"{where}.{name}")
     if len(points) < least:
         raise UserError(f"{where}.{name} has {len(points)} points, expected at least {least}")
+    check_steps(points, f"{where}.{name}")
     return points
 
 
@@ -118,7 +119,9 @@ def _mark(record: Any, name: str, where: str) -> LineType:
 
 def _crossing(record: Any, where: str) -> np.ndarray:
     (a, b), (c, d) = (_points(record, edge, where, 2)[:2] for edge in ("edge1", "edge2"))
-    return np.stack([a, b, d, c, a])
+    ring = np.stack([a, b, d, c, a])
+    check_steps(ring, where)
+    return ring
 
 
 def _boundaries(areas: list[np.ndarray]) -> tuple[np.ndarray, ...]:

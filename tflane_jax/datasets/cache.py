@@ -13,6 +13,7 @@ import copy
 import errno
 import functools
 import hashlib
+import importlib.metadata
 import json
 import multiprocessing
 import os
@@ -42,6 +43,9 @@ _UNUSABLE = (
 
 # Packages whose code determines the examples.
 _SOURCES = ("scene", "geometry", "world", "markers", "datasets")
+# Libraries by which it draws, searches images, merges areas and finds neighbours; OpenCV has several names.
+_OPENCV = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
+_LIBRARIES = ("numpy", "scipy", "shapely", *_OPENCV)
 
 
 _UNGUARDED = (
@@ -109,9 +113,9 @@ def cached(
 
 
 def fingerprint(dataset: Cacheable) -> str:
-    """Return the hash of all that an entry depends on: configuration, code and the version of numpy."""
+    """Return the hash of all that an entry depends on: configuration, code and the versions of libraries."""
     digest = hashlib.sha256()
-    for text in (_kind(dataset), repr(dataset.config), np.__version__, source_digest()):
+    for text in (_kind(dataset), repr(dataset.config), source_digest()):
         digest.update(text.encode() + b"\0")
     return digest.hexdigest()
 
@@ -122,13 +126,16 @@ def _kind(dataset: IndexedExamples) -> str:
 
 @functools.cache
 def source_digest() -> str:
-    """Return the hash of the code that makes examples, without comments, docstrings and layout."""
+    """Return the hash of the code that makes examples, without comments, docstrings and layout, and of libraries."""
     package = Path(tflane_jax.__file__).parent
     found = [path for name in _SOURCES for path in (package / name, *(package / name).rglob("*.py"))]
     digest = hashlib.sha256()
     for file in sorted(path for path in found if path.is_file()):
         digest.update(file.relative_to(package).as_posix().encode() + b"\0")
         digest.update(_code(file.read_text(encoding="utf-8")).encode() + b"\0")
+    for name in _LIBRARIES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            digest.update(f"{name} {importlib.metadata.version(name)}".encode() + b"\0")
     return digest.hexdigest()
 
 

@@ -1,12 +1,12 @@
 """SD maps from GeoJSON files, such as OpenStreetMap's exports: LineStrings in WGS84 around a place.
 
 A line's category is its property `category`, one of the names of `CATEGORIES`, or follows from its OpenStreetMap tag
-`highway` (`HIGHWAYS`; values that are not listed there are "other"). Points and polygons are ignored.
+`highway` (`HIGHWAYS`; values that are not listed there are "other", and of several the first that is listed counts). A
+property that is null is none: exports of a table fill in what a feature does not have. Points and polygons are ignored.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Iterator
@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import load_json, shown
 from tflane_jax.scene import SdCategory, SdMap
 from tflane_jax.world.roads.sd_map import SdMapConfig, pack_lines
 
@@ -101,9 +102,9 @@ def read_geojson(path: str | Path) -> RoadLines:
         if geometry is None:
             continue
         kind = geometry.get("type") if isinstance(geometry, dict) else None
-        if kind not in _LINES:
+        if not isinstance(kind, str) or kind not in _LINES:
             if kind not in _OTHERS:
-                raise UserError(f"{name} has a geometry of type {kind!r}: export roads as LineString")
+                raise UserError(f"{name} has a geometry of type {shown(kind)}: export roads as LineString")
             continue
         found = line_coordinates(geometry.get("coordinates"), _LINES[kind], name)
         lines += found
@@ -151,12 +152,7 @@ def to_ego(line: Float[np.ndarray, "n 2"], origin: Origin) -> Float[np.ndarray, 
 
 def read_features(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the features of a file, each with its name for error messages."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}. Give the path of a GeoJSON file") from None
-    except ValueError as error:
-        raise UserError(f"{path} is no JSON ({error}): export it again as GeoJSON") from None
+    content = load_json(path)
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list) or content.get("type") != "FeatureCollection":
         raise UserError(f"{path} is no GeoJSON FeatureCollection: export it again as GeoJSON")
@@ -178,7 +174,7 @@ def line_coordinates(coordinates: Any, depth: int, name: str) -> list[np.ndarray
         try:
             # A third number is the height.
             points = np.array([point[:2] for point in line], np.float64)
-        except (TypeError, ValueError, IndexError, KeyError):
+        except (TypeError, ValueError, IndexError, KeyError, OverflowError):
             points = np.zeros(0)
         if points.ndim != 2 or points.shape[-1] != 2 or len(points) < 2:
             raise UserError(f"{name} is no line of at least two points [longitude, latitude]: mend it or take it out")
@@ -192,14 +188,16 @@ def line_coordinates(coordinates: Any, depth: int, name: str) -> list[np.ndarray
 
 def _category(properties: Any, name: str) -> int:
     properties = properties if isinstance(properties, dict) else {}
-    if "category" in properties:
-        if properties["category"] not in CATEGORIES:
-            raise UserError(
-                f"{name} has the category {properties['category']!r}: choose one of {', '.join(CATEGORIES)}"
-            )
-        return CATEGORIES[properties["category"]]
-    if "highway" not in properties:
+    named, tag = properties.get("category"), properties.get("highway")
+    if named is not None:
+        if not isinstance(named, str) or named not in CATEGORIES:
+            raise UserError(f"{name} has the category {shown(named)}: choose one of {', '.join(CATEGORIES)}")
+        return CATEGORIES[named]
+    if tag is None:
         raise UserError(
             f"{name} has neither of the properties `highway` and `category`: add one, or keep only roads in the file"
         )
-    return HIGHWAYS.get(str(properties["highway"]).removesuffix("_link"), SdCategory.OTHER)
+    # Roads that a tool has joined have several values, as a list or with semicolons between them.
+    values = tag if isinstance(tag, list) else str(tag).split(";")
+    known = [HIGHWAYS.get(str(value).strip().removesuffix("_link")) for value in values]
+    return next((category for category in known if category is not None), SdCategory.OTHER)

@@ -10,7 +10,8 @@
 | LineString or Polygon, edge of the drivable area | `boundary`: true |
 | Polygon of four corners, the first two along the walk | `crossing`: true |
 
-Other features are ignored. A roundabout is several lanes.
+Other features are ignored, and so are properties that are null: exports of a table fill in what a feature does not
+have. A geometry of type Multi... counts as its only part, 1 and 0 as true and false. A roundabout is several lanes.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.geojson import Origin, line_coordinates, read_features, to_ego
 from tflane_jax.datasets.lane_outlines import HALF_WIDTH, LaneOutline, boundaries
+from tflane_jax.datasets.plausible import check_steps
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import as_list, shown
 from tflane_jax.scene import LineType
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads.map_roadside import lane_points
@@ -32,6 +35,8 @@ from tflane_jax.world.roads.road_map import RoadMap
 
 # Lanes that end and start nearer to each other than this continue one another, metres.
 _SAME_END = 0.3
+# Depth of the lists of coordinates.
+_DEPTHS = {"LineString": 1, "MultiLineString": 2, "Polygon": 2, "MultiPolygon": 3}
 _MARKINGS = {"none": LineType.NONE, "solid": LineType.SOLID, "dashed": LineType.DASHED}
 # A place of an example lies this far inside the hull of all lanes, or as far as the map allows, but at least the
 # second, metres.
@@ -48,28 +53,57 @@ def read_lanes(path: Path) -> RoadMap:
     lanes: dict[str, tuple[np.ndarray, Mapping[str, Any], str]] = {}
     border, crossings = [], []
     for name, feature in read_features(path):
-        geometry, properties = feature.get("geometry") or {}, feature.get("properties") or {}
-        kind = geometry.get("type") if isinstance(geometry, dict) else None
-        if not isinstance(properties, dict) or kind not in ("LineString", "Polygon"):
+        geometry, properties = _record(feature, "geometry", name), _record(feature, "properties", name)
+        kind = str(geometry.get("type"))
+        edge, walk = (properties.get(one) == 1 for one in ("boundary", "crossing"))  # text is OpenStreetMap's
+        if kind not in _DEPTHS or not (edge or walk or "lane" in properties):
             continue
-        lines = line_coordinates(geometry.get("coordinates"), 2 if kind == "Polygon" else 1, name)
-        if "lane" in properties and kind == "LineString":
+        lines = _lines(geometry, kind, name)
+        given = {key: value for key, value in properties.items() if value is not None}
+        if "lane" in given or not (edge or walk):
             number = _identity(properties["lane"], name)
+            if "LineString" not in kind or len(lines) != 1:
+                raise UserError(f"{name}: lane {number} is a {kind} of {len(lines)} lines: a lane is one LineString")
             if number in lanes:
                 raise UserError(f"{name} has the lane id {number} of an earlier feature: give it another one")
-            lanes[number] = lines[0], properties, name
-        elif properties.get("boundary") is True:
-            border += lines
-        elif properties.get("crossing") is True and kind == "Polygon" and len(lines[0]) == 5:
-            crossings.append(lines[0])
+            lanes[number] = lines[0], given, name
+        elif edge:
+            border += [(line, name) for line in lines]
+        elif "Polygon" not in kind or len(lines) != 1 or len(lines[0]) != 5:
+            raise UserError(f"{name}: a crossing is a Polygon of four corners, the first two along the walk")
+        else:
+            crossings.append((lines[0], name))
     if not lanes:
         raise UserError(f"{path} holds no lane: a lane is a LineString with the property `lane`, its id")
     middle = np.concatenate([line for line, _, _ in lanes.values()]).mean(0)
     origin = Origin(latitude=float(middle[1]), longitude=float(middle[0]), heading=90.0)
-    segments = _segments({key: (to_ego(line, origin), props, name) for key, (line, props, name) in lanes.items()})
+    segments = _segments(
+        {key: (_metres(line, origin, name), props, name) for key, (line, props, name) in lanes.items()}
+    )
     places, complete = _places(segments, path)
-    flat = [[np.pad(to_ego(line, origin), ((0, 0), (0, 1))) for line in lines] for lines in (crossings, border)]
-    return RoadMap(path.stem, "geojson", VectorMap(segments, tuple(flat[0]), tuple(flat[1])), places, complete)
+    flat = [tuple(_flat(_metres(line, origin, name)) for line, name in lines) for lines in (crossings, border)]
+    return RoadMap(path.stem, "geojson", VectorMap(segments, flat[0], flat[1]), places, complete)
+
+
+def _record(feature: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    """Return geometry or properties of a feature; nothing where they are null."""
+    value = feature.get(name) or {}
+    if not isinstance(value, dict):
+        raise UserError(f"{where}: {name} is {shown(value)}, expected a mapping: export the file again")
+    return value
+
+
+def _lines(geometry: Mapping[str, Any], kind: str, name: str) -> list[np.ndarray]:
+    """Return the lines or rings of a geometry of any type in `_DEPTHS`, degrees."""
+    coordinates = geometry.get("coordinates")
+    parts = as_list(coordinates, f"{name}: coordinates") if _DEPTHS[kind] == 3 else [coordinates]
+    return [line for part in parts for line in line_coordinates(part, min(_DEPTHS[kind], 2), name)]
+
+
+def _metres(line: Float[np.ndarray, "n 2"], origin: Origin, name: str) -> Float[np.ndarray, "n 2"]:
+    line = to_ego(line, origin)
+    check_steps(line, name)
+    return line
 
 
 def _identity(value: Any, name: str) -> str:
@@ -109,9 +143,9 @@ def _segments(lanes: Mapping[str, tuple[np.ndarray, Mapping[str, Any], str]]) ->
             right=_flat(right),
             left_type=_marking(properties, "left", name),
             right_type=_marking(properties, "right", name),
-            is_intersection=properties.get("intersection") is True,
+            is_intersection=_flag(properties, "intersection", name),
             successors=after[i],
-            vehicle=properties.get("bicycle") is not True,
+            vehicle=not _flag(properties, "bicycle", name),
         )
     return segments
 
@@ -131,9 +165,16 @@ def _width(properties: Mapping[str, Any], name: str) -> float:
     return float(width)
 
 
+def _flag(properties: Mapping[str, Any], flag: str, name: str) -> bool:
+    value = properties.get(flag, False)
+    if value not in (True, False):  # which 1 and 0 equal
+        raise UserError(f"{name}: {flag} is {value!r:.40}, expected true or false")
+    return bool(value)
+
+
 def _marking(properties: Mapping[str, Any], side: str, name: str) -> LineType:
     marking = properties.get(side, "none")
-    if marking not in _MARKINGS:
+    if not isinstance(marking, str) or marking not in _MARKINGS:
         raise UserError(f"{name}: {side} is {marking!r:.40}, expected one of {', '.join(_MARKINGS)}")
     return _MARKINGS[marking]
 

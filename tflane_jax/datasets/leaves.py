@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -20,6 +20,7 @@ from tflane_jax.scene import (
     SdMap,
     TrafficElements,
     TrafficFlow,
+    VehicleState,
 )
 
 # Fields of `Example` that are containers; its other fields are arrays.
@@ -39,41 +40,48 @@ PARTS = {
 IMAGE_PARTS = {"lines": LaneLines}
 
 
+# Containers in a container, by the field that holds them.
+_WITHIN: Mapping[type, Mapping[str, type]] = {
+    Example: PARTS,
+    RoadImage: IMAGE_PARTS,
+    CameraViews: {"vehicle": VehicleState},
+}
+
+
 def example_leaves(example: Example | RoadImage) -> dict[str, np.ndarray]:
     """Return the example's arrays by name in the order of the fields; what is None has no entry."""
-    parts = IMAGE_PARTS if isinstance(example, RoadImage) else PARTS
-    leaves = {}
-    for field in fields(example):
-        value = getattr(example, field.name)
-        if value is None:
-            continue
-        if field.name in parts:
-            for inner in fields(parts[field.name]):
-                if (leaf := getattr(value, inner.name)) is not None:
-                    leaves[f"{field.name}.{inner.name}"] = np.asarray(leaf)
-        else:
-            leaves[field.name] = np.asarray(value)
-    return leaves
+    return dict(_named(example, ""))
 
 
 def example_from_leaves(leaves: Mapping[str, np.ndarray]) -> Example:
     """Return the example whose arrays these are, with or without leading axes; absent parts become None."""
-    return Example(**_gathered(Example, PARTS, leaves))
+    return Example(**_gathered(Example, leaves, ""))
 
 
 def image_from_leaves(leaves: Mapping[str, np.ndarray]) -> RoadImage:
     """Return the road image whose arrays these are, with or without leading axes; absent parts become None."""
-    return RoadImage(**_gathered(RoadImage, IMAGE_PARTS, leaves))
+    return RoadImage(**_gathered(RoadImage, leaves, ""))
 
 
-def _gathered(kind: type, containers: Mapping[str, type], leaves: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    parts: dict[str, Any] = {}
+def _named(value: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield name and array of each leaf of a container."""
+    within = _WITHIN.get(type(value), {})
+    for field in fields(value):
+        inner, name = getattr(value, field.name), f"{prefix}{field.name}"
+        if inner is not None and field.name in within:
+            yield from _named(inner, f"{name}.")
+        elif inner is not None:
+            yield name, np.asarray(inner)
+
+
+def _gathered(kind: type, leaves: Mapping[str, np.ndarray], prefix: str) -> dict[str, Any]:
+    """Return the fields of a container whose leaves have names that begin with `prefix`."""
+    within, parts = _WITHIN.get(kind, {}), {}
     for field in fields(kind):
-        container = containers.get(field.name)
-        if container is None:
-            parts[field.name] = leaves.get(field.name)
+        name = f"{prefix}{field.name}"
+        if field.name not in within:
+            parts[field.name] = leaves.get(name)
             continue
-        inner = {f.name: leaves.get(f"{field.name}.{f.name}") for f in fields(container)}
-        absent = all(value is None for value in inner.values())
-        parts[field.name] = None if absent else container(**inner)
+        container, there = within[field.name], any(leaf.startswith(f"{name}.") for leaf in leaves)
+        parts[field.name] = container(**_gathered(container, leaves, f"{name}.")) if there else None
     return parts

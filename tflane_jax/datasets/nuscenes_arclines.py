@@ -13,17 +13,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.datasets.plausible import FARTHEST_STEP
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers
 
 SHAPES = ("LRL", "RLR", "LSL", "LSR", "RSL", "RSR")
 _TURN = {"L": 1.0, "S": 0.0, "R": -1.0}
-# Metres; consecutive points that are nearer are one point.
-_SAME_POINT = 1e-4
+# Metres; consecutive points that are nearer are one point: a path may start a little before or behind the end of the
+# one that it continues, and such a step has any direction.
+_SAME_POINT = 0.01
 
 
 def lane_points(paths: Sequence[Any], resolution: float, where: str) -> Float[np.ndarray, "n 2"]:
-    """Return the points of a lane's paths, without the repeated ones where a path continues another.
+    """Return the points of a lane's paths to a millimetre, without repeated ones where a path continues another.
 
     Args:
         paths: records of the map's `arcline_path_3`.
@@ -31,11 +33,13 @@ def lane_points(paths: Sequence[Any], resolution: float, where: str) -> Float[np
         where: place in the file, for messages.
     """
     parts = [path_poses(path, resolution, f"{where}[{number}]") for number, path in enumerate(paths)]
-    points = np.concatenate([np.zeros((0, 3)), *parts])[:, :2]
+    points = np.concatenate([np.zeros((0, 3)), *parts])[:, :2].round(3)
     if not len(points):
         return points
-    apart = np.linalg.norm(np.diff(points, axis=0), axis=-1) > _SAME_POINT
-    return points[np.concatenate([[True], apart])]
+    new = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=-1) > _SAME_POINT])
+    if not new[-1] and new.sum() > 1:  # the end stays where it is, for the lanes that start there
+        new[[np.flatnonzero(new)[-1], -1]] = False, True
+    return points[new]
 
 
 def path_poses(path: Any, resolution: float, where: str) -> Float[np.ndarray, "n 3"]:
@@ -57,6 +61,8 @@ def path_poses(path: Any, resolution: float, where: str) -> Float[np.ndarray, "n
         raise UserError(f"{where}: radius {radius:g} and segment lengths {lengths.tolist()} must be positive")
     curvature = np.array([_TURN[letter] for letter in shape]) / radius
     total = float(lengths.sum())
+    if total > FARTHEST_STEP:
+        raise UserError(f"{where}: segment lengths {lengths.tolist()} add up to {total / 1e3:g} km: restore the file")
     along = np.linspace(0.0, total, int(max(math.ceil(total / resolution) + 1.5, 2)))
     # Poses at the start of each piece, then of the piece that holds each point.
     starts = [start]

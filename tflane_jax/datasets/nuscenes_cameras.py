@@ -15,6 +15,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.nuscenes_can_bus import can_bus
 from tflane_jax.datasets.nuscenes_tables import LIDAR, Row, Tables
 from tflane_jax.datasets.openlane_frames import SUBSETS, FrameCamera
+from tflane_jax.datasets.plausible import MOST_PIXELS
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit, fit_image
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
@@ -70,7 +71,7 @@ def _camera(
     token = row["calibrated_sensor_token"]
     where = f"{tables.where('calibrated_sensor', token)}: camera_intrinsic"
     record = tables.rows["calibrated_sensor"][token]
-    intrinsics = numbers(record["camera_intrinsic"], (3, 3), where).astype(np.float64)
+    intrinsics = numbers(record["camera_intrinsic"], (3, 3), where, largest=MOST_PIXELS).astype(np.float64)
     if not (intrinsics[0, 0] > 0.0 and intrinsics[1, 1] > 0.0 and (intrinsics[2] == (0.0, 0.0, 1.0)).all()):
         raise UserError(f"{where} is no camera matrix (positive focal lengths, last row 0 0 1)")
     pose = tables.calibration(sample, name)

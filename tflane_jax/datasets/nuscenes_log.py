@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tflane_jax.datasets.nuscenes_tables import Row, Tables, poses_of, vectors
-from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
+from tflane_jax.datasets.plausible import check_distance, check_interval, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.scene import RoadUser
@@ -94,11 +94,16 @@ def scene_frames(tables: Tables, scene: Row, frame: ReferenceFrame = "ego") -> S
     """Return the key frames of a scene.
 
     Raises:
-        UserError: the chain of samples is broken, the vehicle jumps, or a sample has no lidar frame or no proper pose.
+        UserError: the chain of samples is broken, the vehicle jumps, times are not in microseconds, or a sample has no
+            lidar frame or no proper pose.
     """
     samples = tables.samples(scene)
     ego = np.stack([tables.ego_pose(sample) for sample in samples])
+    where = tables.where("scene", scene["token"])
+    if samples[-1]["timestamp"] > np.iinfo(np.int64).max // 1000:  # the latest
+        raise UserError(f"{where}: a sample has the time {samples[-1]['timestamp']}: expected microseconds")
     times = np.array([sample["timestamp"] for sample in samples], np.int64) * 1000
+    check_interval(times, "microseconds", where)
     check_motion(ego[:, :2, 3], times, [tables.where("sample", sample["token"]) for sample in samples])
     lidar = np.stack([tables.calibration(sample) for sample in samples]) if frame == "lidar" else None
     return SceneFrames(

@@ -1,9 +1,9 @@
 """The map expansion of nuScenes (`maps/expansion/<location>.json`, version 1.3 or later) -> `VectorMap`.
 
-The file holds a whole city in flat coordinates, which are nuScenes' global ones. Traps: a polygon may be null, a lane
-may lack its arcline, and `connectivity` names lanes that the file does not have. The rules of the lines are MapTR's:
-dividers are the records of `road_divider` and `lane_divider`, boundaries the border of the union of road segments and
-lanes.
+The file holds a whole city in flat coordinates, which are nuScenes' global ones. Traps: a polygon may be null, that of
+a lane connector is only a box around it (https://github.com/nutonomy/nuscenes-devkit/issues/915), a lane may lack its
+arcline, and `connectivity` names lanes that the file does not have. The rules of the lines are MapTR's: dividers are
+the records of `road_divider` and `lane_divider`, boundaries the border of the union of road segments and lanes.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.nuscenes_arclines import lane_points
+from tflane_jax.datasets.plausible import check_steps
 from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.fields import items, load_json, member, numbers
 from tflane_jax.scene import LineType
@@ -40,7 +41,7 @@ class ExpansionLane:
     Attributes:
         token: of the record.
         centerline: (n, 2) at `RESOLUTION`.
-        polygon: None where the file has none.
+        polygon: None where the file has none, and of connectors, whose polygons are boxes around them.
         connector: through an intersection (`lane_connector`).
         vehicle: open to motor vehicles.
         left_type, right_type: the most frequent marking along each side.
@@ -182,7 +183,7 @@ class _MapFile:
         for token in sorted([*rows["lane"], *rows["lane_connector"]]):
             where = self._where("arcline_path_3", token)
             if arclines.get(token):
-                lines[token] = lane_points(items(arclines, token, where), RESOLUTION, where).round(3)
+                lines[token] = lane_points(items(arclines, token, where), RESOLUTION, where)
         number = {token: i for i, token in enumerate(token for token, line in lines.items() if len(line) > 1)}
         after = self._successors(number)
         found = {i: self._lane(token, rows, lines[token], tuple(sorted(after[i]))) for token, i in number.items()}
@@ -196,7 +197,7 @@ class _MapFile:
         return ExpansionLane(
             token=token,
             centerline=line,
-            polygon=self._polygon(row.get("polygon_token"), where),
+            polygon=self._polygon(row.get("polygon_token"), where) if layer == "lane" else None,
             connector=layer == "lane_connector",
             vehicle=row.get("lane_type", "CAR") != "BIKE",
             left_type=_marking(row, "left_lane_divider_segments", where),
@@ -210,6 +211,8 @@ class _MapFile:
         for token, row in self._dict("connectivity").items():
             where = self._where("connectivity", token)
             outgoing, incoming = (items(row, name, where) for name in ("outgoing", "incoming"))
+            if wrong := [other for other in (*outgoing, *incoming) if not isinstance(other, str)]:
+                raise UserError(f"{where}: {wrong[0]!r:.40} is no token of a lane")
             pairs = [*((token, other) for other in outgoing), *((other, token) for other in incoming)]
             for first, second in pairs:
                 if first in number and second in number and first != second:
@@ -239,7 +242,9 @@ class _MapFile:
         for token in tokens:
             if not isinstance(token, str) or token not in self.nodes:
                 raise UserError(f"{where}: the node {token!r:.60} is not in the file")
-        return np.array([self.nodes[token] for token in tokens], float).reshape(-1, 2)
+        points = np.array([self.nodes[token] for token in tokens], float).reshape(-1, 2)
+        check_steps(points, where)
+        return points
 
     def _line(self, token: Any, where: str) -> np.ndarray:
         if not isinstance(token, str) or token not in self.line_rows:

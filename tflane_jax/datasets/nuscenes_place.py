@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from tflane_jax.datasets.nuscenes_log import scene_frames, scene_log
 from tflane_jax.datasets.nuscenes_map import MapExpansion, read_expansion
-from tflane_jax.datasets.nuscenes_tables import Tables, read_tables
+from tflane_jax.datasets.nuscenes_tables import TABLES, Tables, read_tables
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, member
+from tflane_jax.files.fields import member, shown
+from tflane_jax.files.json_rows import json_rows
 from tflane_jax.scene.logs import Log
 
 SCENE_TABLE = "scene.json"
@@ -19,7 +21,9 @@ _REACH = 180.0
 
 
 def scene_files(scenes: Path) -> Iterator[tuple[str, tuple[Path, ...]]]:
-    """Yield the name of each scene and the files that tell its map: small tables, and the expansion of its city.
+    """Yield the name of each scene and the files on which its map depends: the tables, and the expansion of its city.
+
+    The tables tell the drive, near which the world drives, and the parked vehicles.
 
     Args:
         scenes: the table scene.json, beside the others.
@@ -27,13 +31,21 @@ def scene_files(scenes: Path) -> Iterator[tuple[str, tuple[Path, ...]]]:
     Raises UserError for tables that are missing or damaged.
     """
     logs = scenes.with_name("log.json")
-    city = {member(row, "token", str(logs)): member(row, "location", str(logs)) for row in load_json(logs)}
+    city = {_text(row, "token", logs): _text(row, "location", logs) for row in json_rows(logs)}
+    others = tuple(scenes.with_name(f"{name}.json") for name in TABLES if f"{name}.json" != scenes.name)
     expansions = scenes.parent.parent / "maps" / "expansion"
-    for row in load_json(scenes):
-        place = city.get(member(row, "log_token", str(scenes)))
+    for row in json_rows(scenes):
+        name, place = _text(row, "name", scenes), city.get(_text(row, "log_token", scenes))
         if place is None:
-            raise UserError(f"{scenes}: scene {row.get('name')} names a log that is not in {logs}")
-        yield str(member(row, "name", str(scenes))), (scenes, logs, expansions / f"{place}.json")
+            raise UserError(f"{scenes}: scene {name} names a log that is not in {logs}")
+        yield name, (scenes, *others, expansions / f"{place}.json")
+
+
+def _text(row: Any, column: str, path: Path) -> str:
+    value = member(row, column, f"{path}: a row")
+    if not isinstance(value, str):
+        raise UserError(f"{path}: {column} is {shown(value)}, expected text")
+    return value
 
 
 def read_scene(folder: Path, name: str) -> Log:

@@ -26,9 +26,9 @@ from jaxtyping import Float
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
 from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user
 from tflane_jax.datasets.nuscenes_map import flat
-from tflane_jax.datasets.plausible import check_distance, check_motion, check_place
+from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import member, numbers
+from tflane_jax.files.fields import member, numbers, shown
 from tflane_jax.geometry import invert_pose, transform_points, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
@@ -123,8 +123,10 @@ def _meta(text: np.ndarray, where: str) -> tuple[str, int, str]:
         raise UserError(f"{where} is no JSON text: {error.msg}") from None
     rate = float(numbers(member(meta, "rate_hz", where), (), f"{where}: rate_hz"))
     name = member(meta, "scene", where)
-    if not isinstance(name, str) or not rate > 0.0:
-        raise UserError(f"{where}: scene must be a text and rate_hz positive")
+    if not isinstance(name, str) or not 1.0 / LONGEST <= rate <= 1.0 / SHORTEST:
+        raise UserError(
+            f"{where}: scene must be a text and rate_hz key frames a second, not {shown(name)} and {rate:g}"
+        )
     area = meta.get("location", "")
     return name, round(1e9 / rate), area if isinstance(area, str) else ""
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.datasets.plausible import FARTHEST
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import numbers
 from tflane_jax.files.json_rows import json_rows
@@ -284,7 +285,7 @@ def _check_links(folder: Path, rows: Mapping[str, Mapping[str, Row]]) -> None:
 
 
 def vectors(rows: Sequence[Row], column: str, size: int, where: Sequence[str]) -> Float[np.ndarray, "n size"]:
-    """Return a column of vectors; raises UserError that names the row whose vector has another size or is not finite.
+    """Return a column of vectors; raises UserError that names the row whose vector has another size or no such numbers.
 
     Args:
         rows: of one table.
@@ -293,10 +294,10 @@ def vectors(rows: Sequence[Row], column: str, size: int, where: Sequence[str]) -
         where: place of each row, for messages.
     """
     try:
-        return numbers([row[column] for row in rows], (len(rows), size), column).astype(np.float64)
+        return numbers([row[column] for row in rows], (len(rows), size), column, largest=FARTHEST).astype(np.float64)
     except UserError:
         for row, place in zip(rows, where, strict=True):
-            numbers(row[column], (size,), f"{place}: {column}")
+            numbers(row[column], (size,), f"{place}: {column}", largest=FARTHEST)
         raise
 
 

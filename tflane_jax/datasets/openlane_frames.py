@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.base import Split
+from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import items, load_json, member, numbers
 from tflane_jax.files.openlane import FrameKey
@@ -227,7 +228,9 @@ def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") 
 
 def _camera(sensors: Any, name: str, root: Path, where: str) -> FrameCamera:
     sensor, where = sensors[name], f"{where}: sensor.{name}"
-    intrinsics = numbers(member(member(sensor, "intrinsic", where), "K", where), (3, 3), f"{where}.intrinsic.K")
+    intrinsics = numbers(
+        member(member(sensor, "intrinsic", where), "K", where), (3, 3), f"{where}.intrinsic.K", largest=MOST_PIXELS
+    )
     if not (intrinsics[0, 0] > 0.0 and intrinsics[1, 1] > 0.0 and (intrinsics[2] == (0.0, 0.0, 1.0)).all()):
         raise UserError(f"{where}.intrinsic.K is no camera matrix (positive focal lengths, last row 0 0 1)")
     pose = frame_pose(member(sensor, "extrinsic", where), f"{where}.extrinsic")
@@ -237,7 +240,7 @@ def _camera(sensors: Any, name: str, root: Path, where: str) -> FrameCamera:
 def frame_pose(record: Any, where: str) -> Float[np.ndarray, "4 4"]:
     """Return a pose of a frame's file; raises UserError where it is missing, or its rotation is none."""
     rotation = numbers(member(record, "rotation", where), (3, 3), f"{where}.rotation").astype(np.float64)
-    translation = numbers(member(record, "translation", where), (3,), f"{where}.translation").astype(np.float64)
+    translation = numbers(member(record, "translation", where), (3,), f"{where}.translation", largest=FARTHEST)
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
         raise UserError(f"{where}.rotation is no rotation: its rows are not orthonormal, or it mirrors")
-    return pose_matrix(rotation, translation)
+    return pose_matrix(rotation, translation.astype(np.float64))

@@ -121,7 +121,7 @@ class _Lines:
     kinds: list[tuple[int, int]] = field(default_factory=list)
     after: list[set[int]] = field(default_factory=list)
     _before: list[np.ndarray] = field(default_factory=list)
-    _numbers: list[int] = field(default_factory=list)
+    _numbers: dict[int, int] = field(default_factory=dict)  # by row of the latest frame
 
     def step(
         self,
@@ -129,30 +129,33 @@ class _Lines:
         connector: Sequence[bool] | np.ndarray = (),
         kinds: Sequence[Sequence[int]] | np.ndarray = (),
     ) -> None:
-        """Take the lines of the next frame, global metres."""
+        """Take the lines of the next frame, global metres; one without length is passed over."""
         found = [tuple(_clean(line) for line in parts) for parts in found]
-        now = [parts[0] for parts in found]
+        rows = [row for row, parts in enumerate(found) if len(parts[0]) > 1]
+        now, before = [found[row][0] for row in rows], list(self._numbers.values())
         known = same_lines(now, self._before)
-        numbers = []
-        for row, parts in enumerate(found):
-            if row in known:
-                number = self._numbers[known[row]]
+        numbers = {}
+        for place, row in enumerate(rows):
+            parts = found[row]
+            if place in known:
+                number = before[known[place]]
                 pairs = zip(self.parts[number], parts, strict=True)
-                self.parts[number] = tuple(joined(before, after) for before, after in pairs)
+                self.parts[number] = tuple(joined(before_, after) for before_, after in pairs)
             else:
                 number = len(self.parts)
                 self.parts.append(parts)
                 self.connector.append(bool(len(connector) and connector[row]))
                 self.kinds.append((int(kinds[row][0]), int(kinds[row][1])) if len(kinds) else (0, 0))
                 self.after.append(set())
-            numbers.append(number)
+            numbers[row] = number
         self._before, self._numbers = now, numbers
 
     def connect(self, successor: np.ndarray) -> None:
         """Add the topology (n, n) of the latest frame."""
-        for i, j in zip(*np.nonzero(successor), strict=True):
-            if i != j and self._numbers[i] != self._numbers[j]:
-                self.after[self._numbers[i]].add(self._numbers[j])
+        for i, j in np.argwhere(successor).tolist():
+            a, b = self._numbers.get(i), self._numbers.get(j)
+            if a is not None and b is not None and a != b:
+                self.after[a].add(b)
 
 
 def _segments(lanes: _Lines, *, sides: bool) -> Iterator[tuple[int, LaneSegment]]:
@@ -161,13 +164,14 @@ def _segments(lanes: _Lines, *, sides: bool) -> Iterator[tuple[int, LaneSegment]
     after: dict[int, set[int]] = {i: set() for i in lines}
     for i, following in enumerate(lanes.after):
         after.setdefault(keep[i], set()).update(keep[j] for j in following)
-    alone = {} if sides else {i: LaneOutline(_plain(line), None) for i, line in lines.items()}
-    beside = boundaries(alone, {})
+    # A side without length is none.
+    plain = {i: _plain(line) for i, line in lines.items() if not sides or min(map(len, lanes.parts[i])) < 2}
+    beside = boundaries({i: LaneOutline(line[:, :2], None) for i, line in plain.items()}, {})
     for i, line in lines.items():
         left, right = lanes.parts[i][1:]
-        if not sides:
-            line = alone[i].centerline
-            left, right, line = (np.pad(one, ((0, 0), (0, 1))) for one in (*beside[i], line))
+        if i in plain:
+            height = plain[i][:, 2] if sides else np.zeros(len(plain[i]))
+            left, right, line = (np.column_stack([one[:, :2], height]) for one in (*beside[i], plain[i]))
         yield (
             i,
             LaneSegment(
@@ -213,6 +217,8 @@ def joined(before: Float[np.ndarray, "n 3"], after: Float[np.ndarray, "m 3"]) ->
 
 def _station(line: np.ndarray, along: np.ndarray, point: np.ndarray) -> float:
     """Return the distance along a line of its place nearest to a point."""
+    if len(line) < 2:
+        return 0.0
     _, place = line_distances(point[None, None], line[None])
     return float(np.interp(place[0, 0, 0], np.arange(len(line)), along))
 
@@ -241,7 +247,7 @@ def _clean(line: np.ndarray) -> np.ndarray:
     return line[np.concatenate([[True], apart])]
 
 
-def _plain(line: np.ndarray) -> Float[np.ndarray, "n 2"]:
-    """Return a line on the plane with points at most 2 m apart."""
+def _plain(line: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    """Return a line with points at most 2 m apart."""
     along = arc_length(line)
-    return sample_at(line, np.linspace(0.0, along[-1], max(int(along[-1] // 2) + 1, 2)))[:, :2]
+    return sample_at(line, np.linspace(0.0, along[-1], max(int(along[-1] // 2) + 1, 2)))

@@ -1,15 +1,16 @@
-"""OpenLane-V2 split files: which frames of which Argoverse 2 logs it holds ."""
+"""OpenLane-V2 split files: which frames of which Argoverse 2 logs it holds."""
 
 from __future__ import annotations
 
 import functools
-import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import as_list, load_json, member, shown
 
 SPLIT_FILE, LOG_FILE = "OpenLane-V2/data_dict_subset_A.json", "subset_A_segment_to_av2_log.json"
 
@@ -23,19 +24,34 @@ def openlane_timestamps(folder: Path) -> dict[str, np.ndarray]:
 
     Raises UserError where one of the files is missing or damaged.
     """
-    frames, logs = (_read_json(Path(folder) / name) for name in (SPLIT_FILE, LOG_FILE))
-    return {
-        logs[split][segment]: np.sort([int(name.removesuffix(".json")) for name in names])
-        for split, segments in frames.items()
-        for segment, names in segments.items()
-        if segment in logs.get(split, {})
-    }
+    files = [Path(folder) / name for name in (SPLIT_FILE, LOG_FILE)]
+    for path in files:
+        if not path.is_file():
+            raise UserError(f"{path} is missing: it is one of the OpenLane-V2 split files")
+    frames, logs = (_by_split(path) for path in files)
+    found = {}
+    for split, segments in frames.items():
+        for segment, names in segments.items():
+            if (log := logs.get(split, {}).get(segment)) is None:
+                continue
+            where = f"{files[0]}: {split}: {segment}"
+            if not isinstance(log, str):
+                raise UserError(f"{files[1]}: {split}: {segment} is {shown(log)}, expected the id of a log")
+            found[log] = np.sort([_time(name, where) for name in as_list(names, where)])
+    return found
 
 
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text())
-    except OSError as error:
-        raise UserError(f"{path} is missing: it is one of the OpenLane-V2 split files") from error
-    except ValueError as error:
-        raise UserError(f"{path} is not valid json ({error}): download it again") from error
+def _by_split(path: Path) -> Mapping[str, Mapping[str, Any]]:
+    """Return a mapping from splits to mappings from segments."""
+    content, where = load_json(path), str(path)
+    for split in content if isinstance(content, Mapping) else ("train",):
+        if not isinstance(segments := member(content, split, where), Mapping):
+            raise UserError(f"{where}: {split} is {shown(segments)}, expected a mapping from segments")
+    return content
+
+
+def _time(name: Any, where: str) -> int:
+    text = str(name).removesuffix(".json")
+    if not text.isdecimal() or len(text) > 19 or int(text) > np.iinfo(np.int64).max:
+        raise UserError(f"{where}: {shown(name)} is no frame, expected <timestamp>.json")
+    return int(text)

@@ -1,6 +1,7 @@
 """What cannot be true of a drive: a vehicle that jumps, a map of another place, a box that nobody can have seen.
 
-Such files would give examples without lanes or with senseless traffic, and no error.
+Such files would give examples without lanes or with senseless traffic, and no error. A line of a map with one
+coordinate of thousands of kilometres would fill the memory with its points.
 """
 
 from __future__ import annotations
@@ -17,8 +18,15 @@ from tflane_jax.errors import UserError
 _FASTEST, _JITTER = 70.0, 0.5
 FAR = 200.0
 """Metres from a vehicle to the nearest lane. Parking lots are not on the map; another city is farther."""
+FARTHEST_STEP = 10_000.0
+"""Metres from one point of a map's line to the next, or along one of its arcs; more is a damaged number."""
+FARTHEST, MOST_PIXELS = 1e8, 1e6
+"""Metres of a coordinate, and pixels of a camera matrix; more would be infinite in float32, or senseless."""
 # Metres from the vehicle to a box; the annotators of nuScenes saw some 150 m far.
 _UNSEEN = 500.0
+
+SHORTEST, LONGEST = 0.002, 60.0
+"""Seconds between the frames of a drive: less or more means that its times are in another unit."""
 
 T = TypeVar("T")
 
@@ -29,6 +37,19 @@ def check_motion(position: Float[np.ndarray, "f 2"], times_ns: Int[np.ndarray, "
     if (jumps := metres > _FASTEST * seconds + _JITTER).any():
         i = int(jumps.argmax())
         raise UserError(f"{where[i + 1]}: the vehicle is {metres[i]:.0f} m from its place {seconds[i]:.2g} s before")
+
+
+def check_interval(times_ns: Int[np.ndarray, " f"], unit: str, where: str) -> None:
+    """Raise UserError, which names the place, where the times of frames cannot be in the unit of their format.
+
+    A drive in microseconds instead of nanoseconds would have an empty traffic flow: its history would look back a
+    thousand times as many frames.
+    """
+    if len(times_ns) < 2:
+        return
+    seconds = float(np.median(np.diff(times_ns))) / 1e9
+    if not SHORTEST <= seconds <= LONGEST:
+        raise UserError(f"{where}: its frames are {seconds:.2g} s apart: are its times in {unit}?")
 
 
 def check_place(lanes: Sequence[Float[np.ndarray, "_ d"]], position: Float[np.ndarray, "f 2"], where: str) -> None:
@@ -44,6 +65,15 @@ def check_place(lanes: Sequence[Float[np.ndarray, "_ d"]], position: Float[np.nd
         raise UserError(
             f"{where}: the vehicle never comes within {FAR:.0f} m of a lane: the map is empty or of another place"
         )
+
+
+def check_steps(line: Float[np.ndarray, "n d"], where: str) -> None:
+    """Raise UserError, which names the place, where two successive points of a map's line are impossibly far apart."""
+    with np.errstate(over="ignore"):
+        metres = np.linalg.norm(np.diff(line[:, :2], axis=0), axis=-1)
+    if (far := ~(metres <= FARTHEST_STEP)).any():
+        i = int(far.argmax())
+        raise UserError(f"{where}: points {i} and {i + 1} are {metres[i] / 1e3:g} km apart: restore the file")
 
 
 def left_of(left: Float[np.ndarray, "n d"], right: Float[np.ndarray, "m d"]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import zipfile
@@ -59,9 +60,11 @@ class MapFile:
         digest = hashlib.sha256(self.name.encode())
         for file in self.files:
             try:
-                digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+                state = file.stat()
+                content = _digest(file, state.st_size, state.st_mtime_ns)
             except OSError as error:
                 raise UserError(f"cannot read {file}: {error.strerror or error}") from None
+            digest.update(file.name.encode() + b"\0" + content + b"\0")
         return digest.hexdigest()
 
     def log(self) -> Log:
@@ -77,6 +80,13 @@ class MapFile:
         if self.kind == "openlane_v2":
             return read_segment(self.files)
         return read_lanes(self.files[0]) if not self.recorded else road_map_of(self.log())
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest(file: Path, size: int, changed_ns: int) -> bytes:
+    """Return the hash of a file; many scenes share the tables and the map of a city, which are large."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
 
 
 def find_maps(root: Path) -> list[MapFile]:

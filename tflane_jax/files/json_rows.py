@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
+from tflane_jax.files.fields import read_text
 
 _SPACE = re.compile(r"[ \t\n\r]*")
 
@@ -22,12 +23,7 @@ def json_rows(path: Path) -> Iterator[Any]:
         UserError: the file cannot be read, is no JSON, or holds something other than one list; names the file and,
             where there is one, the line.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is no JSON file: it is not text") from None
+    text = read_text(Path(path))
     place = _after_space(text, 0)
     if text[place : place + 1] != "[":
         raise UserError(f"{path} is no JSON list: it starts with {text[place : place + 10]!r}")
@@ -39,6 +35,10 @@ def json_rows(path: Path) -> Iterator[Any]:
             row, place = decoder.raw_decode(text, place)
         except json.JSONDecodeError as error:
             raise UserError(f"{path} is no JSON file: {error.msg} in line {error.lineno}") from None
+        except RecursionError:
+            raise UserError(f"{path} is no JSON file of this kind: its lists are nested too deep") from None
+        except ValueError as error:  # an integer of more than 4300 digits
+            raise UserError(f"{path} is no JSON file that can be read: {str(error).partition(';')[0]}") from None
         yield row
         place = _after_space(text, place)
         more = text[place : place + 1] == ","

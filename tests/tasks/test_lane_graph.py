@@ -52,6 +52,13 @@ def test_a_raster_of_another_range_is_named():
     LaneGraphTask(model).check(data, EXAMPLES)
 
 
+def test_a_raster_that_does_not_fold_is_named():
+    model = replace(TopoNetConfig(), encoder=replace(TopoNetConfig().encoder, cell=3))
+    named = r"100 x 200 cells \(data\.example\.sensor\.grid\).*blocks of 3 x 3 \(task\.model\.encoder\.cell\)"
+    with pytest.raises(UserError, match=named):
+        LaneGraphTask(model).check(WorldData(), EXAMPLES)
+
+
 @pytest.mark.parametrize(
     ("model", "setting"),
     [

@@ -5,7 +5,8 @@
     tflane train --config camera/bevformer_detr_r50 --data.root PATH \\
         --training.init-from runs/imagenet --training.init-partly
 
-Encoder and training are those of `toponet_r50.py`; control points, loss weights and image sizes are the baseline's.
+Encoder and training are those of `toponet_r50.py`; control points, loss weights, image sizes and augmentation (without
+GridMask) are the baseline's.
 `:remat` recomputes activations in the backward pass, `:bfloat16` does so in half precision.
 """
 
@@ -13,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config, with_remat
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.models.bevformer_detr import paper_config
@@ -27,7 +29,9 @@ def get_config() -> RunConfig:
     task = LaneGraphTask(
         replace(paper_config(control_points=5), encoder=toponet.task.model.encoder), BevFormerDetrLossConfig()
     )
-    return replace(toponet, task=task, data=replace(toponet.data, image=BASELINE_LARGE))
+    return replace(
+        toponet, task=task, data=replace(toponet.data, image=BASELINE_LARGE, augmentation=PhotometricConfig())
+    )
 
 
 def ablations() -> dict[str, RunConfig]:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig
+from tflane_jax.datasets.photometric import TOPONET_PHOTOMETRIC
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.toponet import paper_config
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -32,7 +33,7 @@ def get_config() -> RunConfig:
     """Return the paper's configuration."""
     return RunConfig(
         task=LaneGraphTask(replace(paper_config(), encoder=ENCODER)),
-        data=OpenLaneV2Data(Path("data/OpenLane-V2")),
+        data=OpenLaneV2Data(Path("data/OpenLane-V2"), augmentation=TOPONET_PHOTOMETRIC),
         optim=OptimConfig(
             decayed="all", epoch_steps=EPOCH, ema_decay=0.0, lr_factors=(("encoder/images/backbone", 0.1),)
         ),

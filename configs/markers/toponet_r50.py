@@ -17,6 +17,7 @@ from typing import Any
 
 from tflane_jax.config import OpenLaneV2Data, RunConfig, load_config
 from tflane_jax.datasets.openlane_markers import BoardsConfig
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.markers.simulation import MarkerConfig
@@ -74,7 +75,9 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
     return replace(
         config,
         task=replace(config.task, model=_recomputing(_six_layers(config.task.model), priors), clip=CLIP, time="scan"),
-        data=replace(config.data, image=BASELINE_LARGE, example=example, boards=boards),
+        data=replace(
+            config.data, image=BASELINE_LARGE, augmentation=PhotometricConfig(), example=example, boards=boards
+        ),
         optim=replace(config.optim, lr=1e-4, epoch_steps=EPOCH),
         training=replace(
             config.training,

@@ -11,6 +11,7 @@ import pytest
 from tests.golden import case_id, golden_modules, load_module_case, options
 from tests.golden_compare import assert_gradients_close
 from tflane_jax.layers.positions import inverse_sigmoid
+from tflane_jax.losses.common import quality_focal
 from tflane_jax.losses.costs import focal_cost, generalised_iou, pairwise_l1
 from tflane_jax.losses.toponet import TopoNetLossConfig, matching_cost
 from tflane_jax.losses.traffic_elements import ElementLossConfig, element_cost
@@ -131,3 +132,17 @@ def test_pairwise_l1(queries, targets):
     for q in range(queries):
         for n in range(targets):
             assert got[q, n] == pytest.approx(np.abs(a[q] - b[n]).sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.5, 1.0, 2.0])
+def test_quality_focal_loss_has_a_finite_gradient_at_saturated_logits_and_at_its_target(gamma):
+    logits, target = jnp.array([0.0, 20.0, 200.0, -200.0, 1.0]), jnp.array([0.5, 1.0, 1.0, 0.0, 0.3])
+    p = 1.0 / (1.0 + np.exp(-np.asarray(logits, np.float64)))
+    entropy = np.logaddexp(0.0, np.asarray(logits, np.float64)) - np.asarray(logits * target, np.float64)
+    loss, gradient = quality_focal(logits, target, gamma), jax.grad(lambda x: quality_focal(x, target, gamma).sum())
+    # At p = target, the loss of an exponent below 1 is that of a distance of 1e-6.
+    np.testing.assert_allclose(loss, np.abs(target - p) ** gamma * entropy, rtol=1e-5, atol=1e-3)
+    found = gradient(logits)
+    assert np.isfinite(found).all()
+    if gamma == 0.0:  # plain cross-entropy
+        np.testing.assert_allclose(found, p - np.asarray(target), atol=1e-6)

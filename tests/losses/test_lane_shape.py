@@ -121,10 +121,11 @@ def test_lines_share_the_highest_row_if_configured():
 
 
 def test_cells_are_those_with_a_point():
-    points = np.zeros((1, 2, 3, 2), np.float32)
-    points[0, 0] = [[0.1, 0.1], [0.6, 0.3], [1.2, 0.6]]  # the last lies outside
+    points = np.zeros((1, 2, 5, 2), np.float32)
+    # The third and the last two lie outside: to the right, above by less than a cell, and above by more than one.
+    points[0, 0] = [[0.1, 0.1], [0.6, 0.3], [1.2, 0.6], [0.3, -0.2], [0.9, -0.6]]
     points[0, 1] = np.nan
-    truth = LaneLines(points, np.ones((1, 2, 3), bool), np.array([[True, False]]))
+    truth = LaneLines(points, np.ones((1, 2, 5), bool), np.array([[True, False]]))
     targets = jax.tree.map(lambda leaf: leaf[0], lane_shape_targets(truth))
     taken = np.zeros((2, 4))
     taken[0, 0] = taken[0, 2] = 1

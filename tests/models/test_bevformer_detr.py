@@ -1,5 +1,6 @@
 """BEVFormer-DETR's lane head against the reference's numbers, and Bezier lanes."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.golden import case_id, golden_modules, load_module_case
+from tests.models.cases import BASELINE, make_example
 from tests.models.golden_lanes import (
     bev_maps,
     by_layer,
@@ -20,9 +22,16 @@ from tests.models.golden_lanes import (
 )
 from tests.parameters import random_params
 from tflane_jax.convert.toponet import baseline_lane_params
+from tflane_jax.errors import UserError
+from tflane_jax.losses.bevformer_detr import BevFormerDetrLossConfig
 from tflane_jax.losses.toponet import TopoNetLossConfig, lane_losses, matching_cost
 from tflane_jax.matching import match
+from tflane_jax.models.auxiliary import AUXILIARY
 from tflane_jax.models.bevformer_detr import BevFormerDetr, BevFormerDetrConfig
+from tflane_jax.models.lane_denoising import DenoisingConfig
+from tflane_jax.models.lane_queries import LaneProposalConfig
+from tflane_jax.scene import stack_examples
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
 @pytest.mark.golden
@@ -61,3 +70,42 @@ def check_head(case):
         return out, (cost, assignment)
 
     check_matching(case, *check(case, outputs))
+
+
+DETR = BevFormerDetrConfig(
+    encoder=BASELINE.encoder, elements=None, decoder=replace(BASELINE.decoder, refine="fixed"), control_points=5
+)
+
+
+def test_true_lanes_are_noised_as_control_points():
+    """A straight lane of 11 points has five control points, equally spaced; other lanes are padding, NaN here."""
+    lanes = make_example(lanes=2).lanes
+    lanes.points[2:] = np.nan
+    taken, _ = DETR.build().apply({}, lanes, method="_in_controls", mutable=[AUXILIARY])
+    expected = np.linspace(lanes.points[:2, 0], lanes.points[:2, -1], 5, axis=1)
+    np.testing.assert_allclose(taken.points[:2], expected, atol=1e-4)
+    np.testing.assert_array_equal(taken.valid, lanes.valid)
+
+
+def test_curves_learn_from_noised_lanes():
+    task = LaneGraphTask(replace(DETR, denoising=DenoisingConfig(copies=2)), BevFormerDetrLossConfig())
+    example = make_example()
+    params = jax.eval_shape(task.init, jax.random.key(0), example)
+    batch = stack_examples([example, make_example(1)])
+    _, terms = jax.eval_shape(task.loss, params, batch, jax.random.key(1))
+    assert {"points", "denoised_points"} <= terms.keys()
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting"),
+    [
+        ({"control_points": 12}, r"control_points is 12: it must be at most decoder\.points \(11\)"),
+        (
+            {"decoder": replace(DETR.decoder, proposals=LaneProposalConfig(count=2))},
+            "decoder.proposals is LaneProposalConfig: it must be None with control_points",
+        ),
+    ],
+)
+def test_curves_that_cannot_be_are_named(changes, setting):
+    with pytest.raises(UserError, match=setting):
+        replace(DETR, **changes).build()

@@ -171,6 +171,20 @@ def test_groups_of_queries_hear_nothing_of_each_other(name, depth):
     assert np.abs(leaking[0] - leaking[1])[:2].max() > 1e-3
 
 
+def test_one_softmax_takes_modules_in_any_order_and_all_or_none_of_the_traffics():
+    found = []
+    for fusions in (LANE_FUSIONS, LANE_FUSIONS[::-1]):
+        config = TrafficFlowModuleConfig(fusions, heads=2, spatial_depth=2, masking=VARIANTS["joint"])
+        module, asked = SpatialEncoder(config, DIM), queries()
+        arguments = asked.features, asked.position, jnp.ones((3, DIM)), mask_of(VARIANTS["joint"])
+        found.append(module.apply(random_params(module.init, *arguments), *arguments))
+    np.testing.assert_array_equal(*found)
+    # Tokens that read lanes without the module T->L would pass groups of queries on to each other.
+    config = TrafficFlowModuleConfig(("T->T", "L->T", "L->L"), masking=VARIANTS["joint"])
+    with pytest.raises(UserError, match=r"fusions is .*: it must be L->T and L->L, or all four"):
+        TrafficFlowConfig(module=config).build(HostSpec(DIM, RANGE, RANGE))
+
+
 @pytest.mark.parametrize("temporal", ["all", "causal"])
 def test_a_frame_hears_later_ones_only_if_it_may(temporal):
     layer = TemporalLayer(8, 2)

@@ -21,6 +21,8 @@ from tflane_jax.evaluation.results import EvaluationConfig
 from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.markers.simulation import MarkerConfig
 from tflane_jax.models.area_decoder import AreaDecoderConfig
+from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
+from tflane_jax.models.evidence_encoder import EvidenceEncoderConfig
 from tflane_jax.models.lanesegnet import LaneSegNetConfig
 from tflane_jax.models.map_lines import LineDecoderConfig
 from tflane_jax.models.maptr import MapTrConfig
@@ -50,9 +52,21 @@ def test_a_raster_of_another_range_is_named():
     LaneGraphTask(model).check(data, EXAMPLES)
 
 
+def test_a_raster_that_does_not_fold_is_named():
+    model = replace(TopoNetConfig(), encoder=replace(TopoNetConfig().encoder, cell=3))
+    named = r"100 x 200 cells \(data\.example\.sensor\.grid\).*blocks of 3 x 3 \(task\.model\.encoder\.cell\)"
+    with pytest.raises(UserError, match=named):
+        LaneGraphTask(model).check(WorldData(), EXAMPLES)
+
+
 @pytest.mark.parametrize(
     ("model", "setting"),
-    [(TopoNetConfig(), "lane_points"), (LaneSegNetConfig(), "segment_points"), (LaneSegNetConfig(), "area_points")],
+    [
+        (TopoNetConfig(), "lane_points"),
+        (BevFormerDetrConfig(encoder=EvidenceEncoderConfig(), elements=None), "lane_points"),
+        (LaneSegNetConfig(), "segment_points"),
+        (LaneSegNetConfig(), "area_points"),
+    ],
 )
 def test_truth_of_other_points_is_named(model, setting):
     task, forms = LaneGraphTask(model), {name: value for name, (value, _) in model.example_forms.items()}

@@ -11,6 +11,8 @@ import pytest
 from tests.models.images import HEIGHT, WIDTH, road_image, road_images, tiny_model, tiny_task
 from tests.parameters import random_params
 from tests.slow import with_slow
+from tflane_jax.config import FrontViewData
+from tflane_jax.errors import UserError
 from tflane_jax.layers.batch_norm import STATISTICS
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig
 from tflane_jax.models.graph_encoders import GcnEncoderConfig, GtnEncoderConfig, HanEncoderConfig
@@ -210,3 +212,10 @@ def curves_of(**options):
 @pytest.mark.parametrize("changes", [{"shrink": 2}, {"located": True}, {"anchors": (0.4, 1.0)}])
 def test_options_change_the_prediction(changes):
     assert not np.array_equal(curves_of().curves, curves_of(**changes).curves)
+
+
+def test_images_that_do_not_shrink_by_whole_blocks_are_named():
+    data = FrontViewData()
+    LaneShapeTask(dataclasses.replace(tiny_model(), shrink=8)).check_settings(data)
+    with pytest.raises(UserError, match=r"task\.model\.shrink is 7: it must be a divisor of 360 and 640"):
+        LaneShapeTask(dataclasses.replace(tiny_model(), shrink=7)).check_settings(data)

@@ -51,6 +51,8 @@ class PhotometricConfig:
 
 LANESEGNET_PHOTOMETRIC = PhotometricConfig(grid_mask=0.7)
 """LaneSegNet at the paper's size: photometric distortion, and one GridMask for all views."""
+TOPONET_PHOTOMETRIC = LANESEGNET_PHOTOMETRIC
+"""TopoNet at the paper's size has the same."""
 LANESEGNET_BUCKET_PHOTOMETRIC = PhotometricConfig(probability=0.0, swap=0.0, grid_mask=0.7)
 """LaneSegNet's map-element-bucket variant: the GridMask alone."""
 MAPTR_PHOTOMETRIC = LANESEGNET_PHOTOMETRIC

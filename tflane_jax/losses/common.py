@@ -136,6 +136,8 @@ def quality_focal(logits: Float[Array, "*b"], target: Float[Array, "*b"], gamma:
         gamma: exponent, beta in the paper.
     """
     apart = jnp.abs(target - jax.nn.sigmoid(logits))
+    if gamma < 1.0:  # A power below 1 has no finite slope at 0, which saturated logits reach.
+        apart = jnp.maximum(apart, 1e-6)
     return apart**gamma * optax.losses.sigmoid_binary_cross_entropy(logits, target)
 
 

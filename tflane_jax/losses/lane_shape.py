@@ -125,7 +125,8 @@ def curve_errors(
 def cell_loss(logits: Float[Array, "h w"], targets: LaneShapeTargets) -> Float[Array, ""]:
     """Return the mean cross-entropy over one example's cells; a cell is positive if it contains a lane-line point."""
     height, width = logits.shape
-    inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1) & (targets.rows < 1)
+    inside = targets.point_valid & (targets.columns >= 0) & (targets.columns < 1)
+    inside &= (targets.rows >= 0) & (targets.rows < 1)
     # Index `height` lies outside, so other points write nowhere.
     row = jnp.where(inside, (targets.rows * height).astype(jnp.int32), height)
     column = jnp.where(inside, (targets.columns * width).astype(jnp.int32), 0)

@@ -30,13 +30,14 @@ class AreaDecoderConfig(LineDecoderConfig):
         output: as of `LineDecoderConfig`; "raw" is the fault of the published code: the predicted points are the raw
             change, scaled to the range, without the reference and the sigmoid by which the decoder refines them. Its
             weights need it.
+        coordinates, classes: those of areas.
         others: see `LineDecoderConfig`.
     """
 
     queries: Count = 12
     points: Annotated[int, at_least(2)] = 20
-    coordinates: Literal[2, 3] = 3
-    classes: Literal[2, 3, 4] = AREA_CLASSES
+    coordinates: Literal[3] = 3  # pyright: ignore[reportIncompatibleVariableOverride]
+    classes: Literal[2] = AREA_CLASSES  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 PAPER_AREA_DECODER = AreaDecoderConfig(dim=256, layers=6, queries=50, class_layers=1, hidden=512, dropout=0.1)

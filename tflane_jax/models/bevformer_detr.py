@@ -14,10 +14,10 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from tflane_jax.geometry.bezier import bezier_basis
+from tflane_jax.geometry.bezier import bezier_basis, bezier_fit
 from tflane_jax.layers.precision import run_layer
 from tflane_jax.limits import Rules, at_least, check_settings
-from tflane_jax.models.auxiliary import AuxiliaryName
+from tflane_jax.models.auxiliary import AUXILIARY, AuxiliaryName
 from tflane_jax.models.camera_encoder import PAPER_CAMERA_ENCODER, CameraEncoderConfig
 from tflane_jax.models.element_decoder import PAPER_ELEMENT_DECODER, ElementDecoderConfig, ElementOutput
 from tflane_jax.models.encoders import EncoderConfig, element_limits
@@ -58,16 +58,26 @@ class BevFormerDetrConfig(HostConfig):
         """Those of the lane decoder, and those of every host."""
         return (*lane_auxiliary(self.decoder, self.denoising), *super().auxiliary)
 
+    @property
+    def example_points(self) -> dict[str, int]:
+        """Lanes are compared point by point; control points are fitted to points that stand as those of a curve."""
+        return {"lane_points": self.decoder.points}
+
     def build(self) -> BevFormerDetr:
         """Return the Linen module; raises UserError where its parts do not fit together."""
         check_settings(self, "task.model.")
         return BevFormerDetr(self)
 
     def limits(self) -> Rules:
-        """Those of a host with traffic elements, and references that stay."""
+        """Those of a host with traffic elements, references that stay, and control points that points determine."""
         yield from super().limits()
         yield from element_limits(self.elements, self.encoder, self.decoder.layers)
         yield "decoder.refine", self.decoder.refine == "fixed", "fixed: the references of BEVFormer-DETR never move"
+        if self.control_points is not None:
+            points = self.decoder.points
+            yield "control_points", self.control_points <= points, f"at most decoder.points ({points}), or None"
+            alone = self.decoder.proposals is None
+            yield "decoder.proposals", alone, "None with control_points: proposals are points of a lane"
 
 
 def paper_config(control_points: int | None = 5) -> BevFormerDetrConfig:
@@ -104,12 +114,21 @@ class BevFormerDetr(Host):
 
         Sows the queries of every layer as `layer_queries` if the collection `intermediates` is mutable.
         """
-        return decode_lanes(self, self._lines(), bev, elements, tokens or {}, lanes, deterministic)
+        return decode_lanes(self, self._lines(), bev, elements, tokens or {}, self._in_controls(lanes), deterministic)
 
     def _lines(self) -> LaneDecoderConfig:
         """Return the decoder's sizes, with `points` the number of predicted (control) points."""
         controls = self.config.control_points
         return self.config.decoder if controls is None else replace(self.config.decoder, points=controls)
+
+    def _in_controls(self, lanes: LaneGraph | None) -> LaneGraph | None:
+        """Return true lanes for denoising with as many points as the heads predict: control points where they do."""
+        controls = self.config.control_points
+        if controls is None or lanes is None or not self.is_mutable_collection(AUXILIARY):
+            return lanes
+        points = jnp.asarray(lanes.points)
+        fit = jnp.asarray(bezier_fit(points.shape[-2], controls), points.dtype)
+        return replace(lanes, points=jnp.einsum("kp,npc->nkc", fit, points))
 
     def decode_queries(self, start, bev, elements, tokens, deterministic) -> Prediction:
         """Return the predictions of one set of queries; `start` as from `LaneQueries`."""

@@ -67,3 +67,4 @@ def element_limits(elements: ElementDecoderConfig | None, encoder: EncoderConfig
     if isinstance(encoder, CameraEncoderConfig):
         pyramid = encoder.images.pyramid
         yield "elements.levels", elements.levels == pyramid.levels, f"encoder.images.pyramid.levels ({pyramid.levels})"
+        yield "elements.dim", elements.dim == pyramid.dim, f"encoder.images.pyramid.dim ({pyramid.dim})"

@@ -19,6 +19,9 @@ from tflane_jax.limits import Count, Rules
 from tflane_jax.models.auxiliary import LaneCellHead
 from tflane_jax.models.prior import BevHook
 
+# Of channels, in every norm.
+_GROUPS = 8
+
 
 @dataclass(frozen=True)
 class EvidenceEncoderConfig:
@@ -48,8 +51,10 @@ class EvidenceEncoderConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Four groups of channels encode the positions of cells."""
-        yield "dim", self.dim % 4 == 0, "a multiple of 4, for sine and cosine of x and y"
+        """Channels split over the groups of the norms, and so over sine and cosine of x and y."""
+        yield "dim", self.dim % _GROUPS == 0, f"a multiple of {_GROUPS}, the groups of its norms"
+        split = all(channels % _GROUPS == 0 for channels in self.levels)
+        yield "levels", split, f"multiples of {_GROUPS}, the groups of their norms"
 
     @property
     def bev_range(self) -> PerceptionRange:
@@ -154,4 +159,4 @@ def _positions(places: np.ndarray, x: Float[Array, "h w d"]) -> Float[Array, "h*
 
 def _norm(name: str) -> nn.GroupNorm:
     # Group norm: statistics of one example, as modules have no batch axis.
-    return nn.GroupNorm(num_groups=8, name=name)
+    return nn.GroupNorm(num_groups=_GROUPS, name=name)

@@ -66,7 +66,8 @@ class LiftConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Whole depth bins follow each other from the first depth to the last."""
+        """Whole depth bins follow each other from the first depth to the last; channels encode positions."""
+        yield "dim", self.dim % 4 == 0, "a multiple of 4, for sine and cosine of x and y"
         first, last, size = self.depth
         count = (last - first) / size
         fits = first + size <= last and abs(count - round(count)) < 1e-6

@@ -77,8 +77,11 @@ class TrafficFlowModuleConfig:
     remat: bool = False
 
     def limits(self) -> Rules:
-        """Channels split over heads, and each head has its window."""
+        """Channels split over heads, each head has its window, and a joint softmax all or none of the T modules."""
         yield splits("heads", self.heads, "width", self.width)
+        known = set(self.fusions) in (set(LANE_FUSIONS), set(ALL_FUSIONS))
+        joint = self.masking.softmax == "joint"
+        yield "fusions", known or not joint, "L->T and L->L, or all four, where masking.softmax is joint"
         fits = len(self.masking.head_windows) in (0, self.heads)
         yield "masking.head_windows", fits, f"one window for each of the {self.heads} heads, or ()"
 
@@ -329,7 +332,7 @@ class SpatialEncoder(nn.Module):
         config, count = self.config, len(lanes)
         tokens, whole = jnp.concatenate([lanes, traffic]), mask.dense()
         placed = tokens + jnp.concatenate([lane_position, jnp.zeros_like(traffic)])
-        rows = count if config.fusions == LANE_FUSIONS else len(tokens)
+        rows = len(tokens) if "T->L" in config.fusions else count
         label = "joint" + (f"_{layer}" if layer else "")
         attend = MultiHeadAttention(self.dim, config.heads, name=label)
         found, own = attend(placed[:rows], placed, tokens, whole[..., :rows, :]), tokens[:rows]

@@ -31,6 +31,7 @@ def check_settings_fit(model: HostConfig, config: ExampleConfig, *, image_scale:
     _check_inputs(model, config, images=image_scale is not None)
     _check_scale(model, image_scale)
     _check_ranges(model, config)
+    _check_raster(model, config)
     _check_lines(model, config)
     _check_marker_points(model, config)
     _check_points(model, config)
@@ -94,6 +95,18 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
         raise UserError(
             f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), beyond the "
             f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
+        )
+
+
+def _check_raster(model: HostConfig, config: ExampleConfig) -> None:
+    encoder = model.encoder
+    if not isinstance(encoder, EvidenceEncoderConfig) or config.sensor is None:
+        return
+    grid = config.sensor.grid
+    if grid.rows % encoder.cell or grid.columns % encoder.cell:
+        raise UserError(
+            f"the evidence raster has {grid.rows} x {grid.columns} cells (data.example.sensor.grid), which do not fold "
+            f"into blocks of {encoder.cell} x {encoder.cell} (task.model.encoder.cell): choose a divisor of both"
         )
 
 

@@ -30,6 +30,7 @@ from tflane_jax.evaluation.predict import Predictor, predict_batch, predicted_ba
 from tflane_jax.evaluation.results import Evaluation, EvaluationConfig
 from tflane_jax.files.tusimple import RowLanes
 from tflane_jax.layers.batch_norm import BATCH_AXIS, STATISTICS
+from tflane_jax.limits import SettingError
 from tflane_jax.losses.lane_shape import LaneShapeLossConfig, lane_shape_loss, lane_shape_targets
 from tflane_jax.metrics.tusimple import TuSimpleMetrics
 from tflane_jax.models.auxiliary import AUXILIARY, auxiliary_outputs
@@ -118,6 +119,13 @@ class LaneShapeTask(Task[RoadImage, LabelledImages, ImageSource, None]):
         lines = LaneLines.empty(CAPACITY, len(ROWS))
         size = (INPUT_HEIGHT, INPUT_WIDTH)
         return shapes_of(RoadImage(np.zeros((*size, 3), np.uint8), np.zeros(size, bool), lines))
+
+    def check_settings(self, data: SplitData) -> None:
+        """Raise UserError if images do not shrink by whole blocks."""
+        side = self.model.shrink
+        if INPUT_HEIGHT % side or INPUT_WIDTH % side:
+            whole = f"a divisor of {INPUT_HEIGHT} and {INPUT_WIDTH}, the height and width of images"
+            raise SettingError("task.model.shrink", side, whole)
 
     def prepare(self, data: SplitData) -> Prepare | None:
         """Return the augmentation of the data, None for none."""

@@ -1,0 +1,40 @@
+"""Settings of models that no array could have: each is named before anything is computed."""
+
+import dataclasses
+
+import pytest
+
+from tests.models.cases import BASELINE, CAMERA_TOPONET, LIFTED_LINES, SEGMENTS
+from tflane_jax.limits import SettingError
+from tflane_jax.models.area_decoder import AreaDecoderConfig
+
+
+def changed(config, path, value):
+    """Return a configuration with another value at a dotted path."""
+    name, _, rest = path.partition(".")
+    return dataclasses.replace(config, **{name: changed(getattr(config, name), rest, value) if rest else value})
+
+
+BUCKET = dataclasses.replace(
+    SEGMENTS, decoder=dataclasses.replace(SEGMENTS.decoder, classes=1), areas=AreaDecoderConfig(dim=16, heads=2)
+)
+CASES = [
+    (BASELINE, "encoder.dim", 12, "a multiple of 8"),
+    (BASELINE, "encoder.levels", (16, 12), "multiples of 8"),
+    (CAMERA_TOPONET, "elements.dim", 32, r"encoder\.images\.pyramid\.dim \(16\)"),
+    (BUCKET, "areas.coordinates", 2, "3"),
+    (BUCKET, "areas.classes", 3, "2"),
+]
+
+
+@pytest.mark.parametrize(("config", "path", "value", "allowed"), CASES, ids=[case[1] for case in CASES])
+def test_a_setting_that_does_not_fit_the_others_is_named(config, path, value, allowed):
+    config.build()
+    with pytest.raises(SettingError, match=rf"task\.model\.{path} is .*: it must be {allowed}"):
+        changed(config, path, value).build()
+
+
+def test_channels_of_the_lift_encode_positions():
+    narrow = changed(LIFTED_LINES, "encoder.images.pyramid.dim", 18)
+    with pytest.raises(SettingError, match=r"task\.model\.encoder\.bev\.dim is 18: it must be a multiple of 4"):
+        changed(narrow, "encoder.bev.dim", 18).build()

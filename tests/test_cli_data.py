@@ -14,7 +14,7 @@ from tflane_jax.cli import main
 def test_data_stats_counts_lanes_and_traffic(capsys):
     assert main(["data", "stats", "--data", "street", "--split", "val", "--count", "2"]) == 0
     printed = capsys.readouterr().out
-    assert "procedural-val: 2 examples" in printed
+    assert "street-val: 2 examples" in printed
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
     mean, low, _, high = map(float, rows["lanes"])
     assert 1.0 <= low <= mean <= high

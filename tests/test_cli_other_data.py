@@ -1,22 +1,25 @@
-"""Commands on data other than a configuration's own: what fits a model, names of results."""
+"""Commands on data other than a configuration's own: what fits a model, names of results, options without effect."""
 
 import argparse
 import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.test_cli import CONFIG, use_fakes
 from tflane_jax.cli import main
+from tflane_jax.commands import submit
 from tflane_jax.commands.sources import data_name
-from tflane_jax.config import LogData, RunConfig, WorldData
+from tflane_jax.config import LogData, NuScenesData, RunConfig, WorldData
 from tflane_jax.datasets.base import ExampleConfig, MarkerConfig
 from tflane_jax.datasets.data_source import Choice
 from tflane_jax.datasets.map_lines import MapLinesConfig
 from tflane_jax.datasets.nuscenes_scenes import SceneFileConfig
 from tflane_jax.datasets.sources import named_source
+from tflane_jax.errors import UserError
 from tflane_jax.world.cameras.ring import CameraRigConfig
 
 PRESETS = {
@@ -103,3 +106,40 @@ def test_a_preset_has_the_priors_and_the_truth_that_the_model_reads(name):
 def test_other_worlds_folders_and_splits_have_other_names(source, given, name):
     options = {"data": None, "root": None, "split": None, "default_split": "test"} | given
     assert data_name(source, argparse.Namespace(**options)) == name
+
+
+def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):
+    config = RunConfig(data=NuScenesData(tmp_path / "nowhere"))
+    monkeypatch.setattr(submit, "opened", lambda options: (SimpleNamespace(config=config), []))
+    given = {"data": None, "root": None, "split": None, "default_split": "test", "openlane": None}
+    told = {"method": "", "authors": [], "email": "", "institution": "", "country": "CH"}
+    with pytest.raises(UserError, match="--country is for OpenLane-V2's server"):
+        submit.run(argparse.Namespace(out=tmp_path / "out.json", **given, **told))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("eval RUN --openlane x", "--openlane chooses the frames of --data argoverse2 with --root"),
+        ("predict RUN --data city --openlane x", "--openlane chooses the frames of --data argoverse2"),
+        ("data show --openlane x --count 1", "--openlane chooses the frames of --data argoverse2"),
+        ("data stats --beside city --openlane x --count 1", "--openlane chooses the frames of --data argoverse2"),
+        ("eval --config gtn_lane/lstr --weights x --checkpoint 7", "--checkpoint 7 is of a run"),
+        ("predict --config gtn_lane/lstr --weights x --checkpoint best", "--checkpoint best is of a run"),
+        ("summary --no-compile --kind a100", "--kind does nothing without --plan: add it"),
+        ("summary --no-compile --utilisation 0.5", "--utilisation does nothing without --plan"),
+        ("summary --no-compile --plan 2 --depth 3", "--depth does nothing with --plan: leave --depth or --plan out"),
+        ("summary --no-compile --plan 2 --no-training", "--no-training does nothing with --plan"),
+        ("summary --no-compile --depth 0", "--depth 0: at least one level of names"),
+        ("score lanesegnet a.pkl b.pkl --scenes c.json", "--scenes names the drives for --by scene and --bootstrap"),
+        ("tables gtn_lane.9 gtn_lane.9", "gtn_lane.9 is named twice"),
+        ("markers run --store s --images i --poses p --threshold 7", "--threshold 7: it must be a score from 0 to 1"),
+    ],
+)
+def test_options_without_effect_are_refused(arguments, message, trained, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.replace("RUN", str(trained)).split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"tflane: {message}")
+    assert said.count("\n") == 1
+    assert os.listdir(tmp_path) == []

@@ -61,6 +61,8 @@ def _check(options: argparse.Namespace, protocol: ScoringProtocol) -> None:
         raise UserError(f"--bootstrap {options.bootstrap}: give a number of draws, 0 for none")
     if options.by not in (None, "scene", *protocol.groups):
         raise UserError(f"{options.protocol} cannot be reported by {options.by}")
+    if options.scenes is not None and options.by != "scene" and not options.bootstrap:
+        raise UserError("--scenes names the drives for --by scene and --bootstrap: add one of them, or leave it out")
     inputs = [path for path in (options.predictions, options.truth, options.scenes) if path is not None]
     if _same(options.predictions, options.truth):
         raise UserError(f"{options.predictions} is given as PREDICTIONS and as GROUND_TRUTH: name the other file too")

@@ -131,7 +131,6 @@ def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):
         ("summary --no-compile --plan 2 --depth 3", "--depth does nothing with --plan: leave --depth or --plan out"),
         ("summary --no-compile --plan 2 --no-training", "--no-training does nothing with --plan"),
         ("summary --no-compile --depth 0", "--depth 0: at least one level of names"),
-        ("score lanesegnet a.pkl b.pkl --scenes c.json", "--scenes names the drives for --by scene and --bootstrap"),
         ("tables gtn_lane.9 gtn_lane.9", "gtn_lane.9 is named twice"),
         ("markers run --store s --images i --poses p --threshold 7", "--threshold 7: it must be a score from 0 to 1"),
     ],

@@ -17,6 +17,7 @@ from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.scene import RoadImage, stack_examples
 from tflane_jax.tasks import spread
@@ -107,6 +108,8 @@ def check(options: argparse.Namespace) -> int:
 
 def overlap_of_splits(options: argparse.Namespace) -> int:
     """Print the fraction of a validation split that lies near training frames."""
+    if options.out is not None:
+        check_stem(options.out)
     train, validation = read_drives(options.train), read_drives(options.validation)
     found = overlap(train, validation)
     title = (

@@ -18,6 +18,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quantities, pooled
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.distributions import save_distributions
 from tflane_jax.scene import Example, RoadImage
@@ -35,6 +36,8 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
 
     All have the box, the history and at least the capacities of the chosen data, so that they can be compared.
     """
+    if options.out is not None:
+        check_stem(options.out)
     others = [text.partition("=")[0] for text in options.beside]
     is_for_others = options.data != _READS_OPENLANE and _READS_OPENLANE in others
     first = chosen_source(config, _with(options, openlane=None) if is_for_others else options)
@@ -60,7 +63,7 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
     if options.out is not None:
         paths = list(save_table(options.out, rows, {"values": _summary(values)}, title=title))
         if importlib.util.find_spec("matplotlib") is not None:
-            paths.append(save_distributions(options.out.with_suffix(".png"), values))
+            paths.append(save_distributions(options.out.with_name(f"{options.out.name}.png"), values))
         print("\nwritten to", *paths)
     return 0
 

@@ -22,6 +22,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import Run, evaluate_run, training_nearness
 from tflane_jax.scene import stack_examples
@@ -37,6 +38,8 @@ _IMAGES = 8  # over which a HAN's weights are averaged
 
 def run(options: argparse.Namespace) -> int:
     """Evaluate, print the table, and write it as Markdown and JSON."""
+    if options.out is not None:
+        check_stem(options.out)  # before the evaluation, which takes minutes
     configure_jax()
     trained, rest = opened(options)
     if rest:

@@ -8,6 +8,7 @@ from typing import Any
 
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plan import make_plan
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
@@ -17,6 +18,8 @@ from tflane_jax.training.runtime import configure_jax
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Print the two tables, and save them to --out; or the estimate of --plan."""
     _check_together(options)
+    if options.out is not None:
+        check_stem(options.out)
     configure_jax(keep_programs=False)  # compiling is timed
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)

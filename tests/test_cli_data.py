@@ -14,7 +14,7 @@ from tflane_jax.cli import main
 def test_data_stats_counts_lanes_and_traffic(capsys):
     assert main(["data", "stats", "--data", "street", "--split", "val", "--count", "2"]) == 0
     printed = capsys.readouterr().out
-    assert "procedural-val: 2 examples" in printed
+    assert "street-val: 2 examples" in printed
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
     mean, low, _, high = map(float, rows["lanes"])
     assert 1.0 <= low <= mean <= high
@@ -41,6 +41,32 @@ def test_data_stats_needs_lane_graphs(arguments, message, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("sheet.txt", "cannot write sheet.txt: no picture ends in .txt; choose .png, .pdf, .svg or .jpg"),
+        (".", "cannot write .: it names no file, only a folder; add a name"),
+    ],
+)
+def test_what_is_no_picture_is_told(out, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["data", "show", "--data", "street", "--count", "1", "--out", out]) == 2
+    assert capsys.readouterr().err == f"tflane: {message}\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments", ["eval RUN --out OUT", "summary --no-compile --out OUT", "data overlap RUN RUN --out OUT"]
+)
+@pytest.mark.parametrize("out", ["/", "taken"])
+def test_where_a_table_cannot_be_written_is_told_before_the_work(arguments, out, tmp_path, monkeypatch, capsys):
+    """There is no run here: a message about the table means that nothing was read before."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.md").mkdir()
+    assert main(arguments.replace("OUT", out).split()) == 2
+    assert capsys.readouterr().err.startswith("tflane: cannot write ")
+
+
 @pytest.mark.slow
 def test_data_show_draws_world_cameras(tmp_path, capsys):
     assert main(["data", "show", "--data", "world-cameras", "--count", "1", "--out", str(tmp_path / "world.png")]) == 0
@@ -52,7 +78,7 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     maps = tmp_path / "maps"
     maps.mkdir()
     write(maps / "town.geojson", crossroads_features())
-    chosen = ["data", "stats", "--data", "street", "--split", "val", "--count", "1", "--out", str(tmp_path / "table")]
+    chosen = ["data", "stats", "--data", "street", "--split", "val", "--count", "1", "--out", str(tmp_path / "of.1")]
     assert main([*chosen, "--beside", f"real-maps={maps}", "--beside", "street"]) == 0
     printed = capsys.readouterr().out
     for column in ("street (1 frames)", "real-maps (1 frames)", "street #2 (1 frames)"):
@@ -62,9 +88,9 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
         first, other, again = (cell.strip() for cell in rows[quantity])
         assert first == again
         assert float(other.split(" ")[0]) >= 0.0
-    written = json.loads((tmp_path / "table.json").read_text())
+    written = json.loads((tmp_path / "of.1.json").read_text())
     assert written["meta"]["values"]["street"]["lanes"]["values"] == 1
-    assert {path.suffix for path in tmp_path.glob("table.*")} == {".md", ".json", ".png"}
+    assert {path.name for path in tmp_path.glob("of*")} == {"of.1.md", "of.1.json", "of.1.png"}
 
 
 @pytest.mark.parametrize(

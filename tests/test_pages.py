@@ -9,7 +9,7 @@ import pytest
 
 from tests.shared import ROOT
 from tflane_jax.cli import build_parser
-from tflane_jax.config import apply_overrides, load_config
+from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.errors import UserError
 
 PAGES = {
@@ -20,7 +20,9 @@ PAGES = {
 
 def commands(text: str) -> Iterator[list[str]]:
     """Yield the words of the `tflane` commands in blocks of code; those with shell variables or "..." are left out."""
-    for block in re.findall(r"^```\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+    for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        if language:
+            continue
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True) if line.startswith("tflane ") else []
             if words and not any("..." in word or set(word) & set("${[") for word in words):
@@ -33,8 +35,9 @@ def fault(words: list[str]) -> str | None:
         options, rest = build_parser().parse_known_args(words)
         if rest and not options.takes_overrides:
             return f"unknown argument {rest[0]}"
-        if rest and getattr(options, "config", None):
-            apply_overrides(_config(options.config), rest)
+        if rest and options.command not in ("compare", "sweep"):  # of these, the settings are for any configuration
+            config = getattr(options, "config", None)
+            apply_overrides(RunConfig() if config is None else _config(config), rest)
     except SystemExit as error:
         return "wrong arguments" if error.code else None
     except UserError as error:
@@ -54,7 +57,7 @@ def anchors(text: str) -> set[str]:
 
 def test_commands_in_pages_parse():
     found = [(page, words) for page, text in PAGES.items() for words in commands(text)]
-    assert len(found) > 80, "hardly anything found: has the pattern changed?"
+    assert len(found) > 110, "hardly anything found: has the pattern changed?"
     wrong = {f"{page}: tflane {shlex.join(words)}": said for page, words in found if (said := fault(words))}
     assert wrong == {}
 
@@ -64,6 +67,7 @@ def test_commands_in_pages_parse():
     [
         ("train --config tf_lane/argoverse2 --data.root LOGS", "unknown setting --data.root"),
         ("train --config markers/toponet_r50 --task.model.encoder.bev.remat True", "True"),
+        ("data stats --data argoverse2 --root LOGS --data.example.history-hz 2", "data.world.keyframes"),
         ("eval RUN --evaluation.versions v1.0", "unknown argument --evaluation.versions"),
         ("predict RUN --split all", "wrong arguments"),
     ],
@@ -71,6 +75,12 @@ def test_commands_in_pages_parse():
 def test_wrong_commands_are_found(command, said):
     (words,) = commands(f"```\ntflane {command}    # a remark\n```\n")
     assert said in (fault(words) or "")
+
+
+def test_commands_behind_blocks_of_python_are_found():
+    """The end of a Python block looks like the begin of one without a language."""
+    text = "```python\nx = 1\n```\n\n```\ntflane bench\n```\n\n```\ntflane demo\n```\n"
+    assert list(commands(text)) == [["bench"], ["demo"]]
 
 
 def test_links_lead_to_headings():

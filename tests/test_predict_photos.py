@@ -112,6 +112,7 @@ def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypa
     [
         (["a.png"], {"root": "TUSIMPLE"}, "--root selects labelled examples, and a.png is given too: leave one out"),
         (["a.png"], {"split": "test"}, "--split selects"),
+        (["a.png"], {"count": 3}, "--count selects"),
         ([], {"horizon": 300.0}, "--horizon is of photos: name some, or leave it out"),
         ([], {"focal": 0.0}, "--focal is of photos"),
     ],
@@ -119,7 +120,7 @@ def test_a_missing_package_is_no_fault_of_the_photos(predict, tmp_path, monkeypa
 def test_options_without_effect_are_refused(monkeypatch, inputs, setting, said):
     trained = SimpleNamespace(config=SimpleNamespace(task=LaneShapeTask()), name="model")
     monkeypatch.setattr(predict_command, "opened", lambda options: (trained, [Path(name) for name in inputs]))
-    options = dict.fromkeys(("threshold", "split", "data", "root", "openlane", "focal", "horizon")) | setting
+    options = dict.fromkeys(("threshold", "split", "data", "root", "openlane", "count", "focal", "horizon")) | setting
     with pytest.raises(UserError, match=said):
         predict_command.run(Namespace(**options))
 

@@ -154,6 +154,9 @@ def test_the_command_says_how_to_train_from_it(file, tmp_path, capsys, monkeypat
     said = capsys.readouterr().out
     assert f"it holds {PART} alone; train from it: --training.init-from {tmp_path / 'out'}" in said
     assert written == [{"part": PART}]
+    with_edges = ["--edge-weight", "0.9", "--out", str(tmp_path / "other")]
+    assert main(["convert", "--config", "x", "--weights", str(file), *with_edges]) == 2
+    assert "--edge-weight is of GTN encoders" in capsys.readouterr().err
 
 
 def task():

@@ -62,7 +62,7 @@ def training_data(data: Path) -> None:
 def commands(data: Path, folder: Path) -> None:
     run, root = model(folder), ["--data", "toy", "--root", str(data)]
     text = tflane("data", "show", *root, "--split", "val", "--count", "2", "--out", str(folder / "toys.png"))
-    assert "toy-val: the 2 examples drawn" in text
+    assert "toy-val-toys: the 2 examples drawn" in text
     assert (folder / "toys.png").is_file()
 
     text = tflane("data", "check", "--format", "toy", str(data))

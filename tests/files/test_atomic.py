@@ -13,7 +13,7 @@ import threading
 import pytest
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import is_temporary, replacing, write_bytes, write_json, write_text
+from tflane_jax.files.atomic import check_stem, is_temporary, replacing, write_bytes, write_json, write_text
 
 
 def names(folder):
@@ -205,3 +205,18 @@ def test_writers_side_by_side_never_mix(tmp_path):
     for thread in threads:
         thread.join()
     assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("path", [".", "/", ""])
+def test_a_path_without_a_name_is_told(path):
+    for write in (check_stem, lambda path: write_text(path, "x")):
+        with pytest.raises(UserError, match="it names no file, only a folder; add a name"):
+            write(path)
+
+
+def test_the_files_of_a_stem_are_checked_before_they_are_made(tmp_path):
+    check_stem(tmp_path / "deep" / "table")
+    assert names(tmp_path) == []
+    (tmp_path / "table.json").mkdir()
+    with pytest.raises(UserError, match=r"cannot write .*table\.json: it is a folder"):
+        check_stem(tmp_path / "table")

@@ -29,6 +29,8 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"{options.config} names no weights: add --weights FILE")
     part = None
     if isinstance(config.task, LaneGraphTask) and is_backbone(read_state_dict(weights)):
+        if options.edge_weight is not None:
+            raise UserError(f"--edge-weight is of GTN encoders: {weights} is a backbone, leave it out")
         part = BACKBONE
         params, table = load_backbone(weights, config.task.model)
         save_weights(config, params, options.out, part=part)

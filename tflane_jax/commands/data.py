@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.commands.sources import chosen_source
+from tflane_jax.commands.sources import chosen_source, data_name
 from tflane_jax.commands.views import with_images
 from tflane_jax.config import FrontViewData, RunConfig, apply_overrides, load_config
 from tflane_jax.datasets import sources
@@ -17,6 +17,7 @@ from tflane_jax.datasets.base import SPLITS
 from tflane_jax.datasets.batches import prepared
 from tflane_jax.datasets.overlap import overlap, read_drives
 from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import dataset_summary, format_table, save_camera_views, save_table, show_dataset
 from tflane_jax.scene import RoadImage, stack_examples
 from tflane_jax.tasks import spread
@@ -44,13 +45,14 @@ def show(options: argparse.Namespace) -> int:
         path, names = options.out.with_stem(f"{options.out.stem}-cameras"), titles(dataset, indices)
         shape = {"ground": source.example.ground, "view": source.example.range}
         written.append(save_camera_views(path, seen, titles=[names[i] for i in shown], **shape))
-    print(
-        format_table(
-            dataset_summary(examples), title=f"{sources.source_name(source)}: the {len(indices)} examples drawn"
-        )
-    )
+    title = f"{data_name(source, options)}: {_drawn(len(indices), 'example')}"
+    print(format_table(dataset_summary(examples), title=title))
     print("\nwritten to", *written)
     return 0
+
+
+def _drawn(count: int, what: str) -> str:
+    return f"the {what} drawn" if count == 1 else f"the {count} {what}s drawn"
 
 
 def _images(config: RunConfig) -> RunConfig:
@@ -74,7 +76,7 @@ def _show_images(source: Any, config: RunConfig, options: argparse.Namespace) ->
         print(f"{name} written to {save_road_images(path, shown, titles=[f'image {index}' for index in indices])}")
     counts = np.bincount(examples.lines.valid.sum(-1))
     rows = [{"lane lines": lines, "images": int(images)} for lines, images in enumerate(counts) if images]
-    print("\n" + format_table(rows, title=f"{sources.source_name(source)}: the {len(indices)} images drawn"))
+    print("\n" + format_table(rows, title=f"{data_name(source, options)}: {_drawn(len(indices), 'image')}"))
     return 0
 
 
@@ -106,6 +108,8 @@ def check(options: argparse.Namespace) -> int:
 
 def overlap_of_splits(options: argparse.Namespace) -> int:
     """Print the fraction of a validation split that lies near training frames."""
+    if options.out is not None:
+        check_stem(options.out)
     train, validation = read_drives(options.train), read_drives(options.validation)
     found = overlap(train, validation)
     title = (

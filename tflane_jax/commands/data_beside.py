@@ -13,17 +13,19 @@ from jaxtyping import Float
 from tflane_jax.commands.data_stats import example_stats
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig
-from tflane_jax.datasets import sources
+from tflane_jax.datasets import argoverse2, sources
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quantities, pooled
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import format_table, save_table
 from tflane_jax.plots.distributions import save_distributions
 from tflane_jax.scene import Example, RoadImage
 from tflane_jax.tasks import spread
 
 _CAPACITIES = ("lanes", "segments", "areas", "tracks", "elements")
+_READS_OPENLANE = argoverse2.SOURCE.name
 _QUANTILES = (0.1, 0.5, 0.9)
 # Entries of `example_stats` that are taken over, by their starts.
 _TRAFFIC = ("road users in range", "- ", "fraction of lane length driven on")
@@ -34,13 +36,17 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
 
     All have the box, the history and at least the capacities of the chosen data, so that they can be compared.
     """
-    first = chosen_source(config, options)
+    if options.out is not None:
+        check_stem(options.out)
+    others = [text.partition("=")[0] for text in options.beside]
+    is_for_others = options.data != _READS_OPENLANE and _READS_OPENLANE in others
+    first = chosen_source(config, _with(options, openlane=None) if is_for_others else options)
     _check(first)
     chosen = {options.data or sources.source_name(first): first}
     for text in options.beside:
         name, _, root = text.partition("=")
-        other = argparse.Namespace(**(vars(options) | {"data": name, "root": root or None}))
-        source = chosen_source(config, other)
+        openlane = options.openlane if name == _READS_OPENLANE else None
+        source = chosen_source(config, _with(options, data=name, root=root or None, openlane=openlane))
         _check(source)
         chosen[_unused(name, chosen)] = replace(source, example=_same(first.example, source))
     values, counts = {}, {}
@@ -57,9 +63,13 @@ def beside(config: RunConfig, options: argparse.Namespace) -> int:
     if options.out is not None:
         paths = list(save_table(options.out, rows, {"values": _summary(values)}, title=title))
         if importlib.util.find_spec("matplotlib") is not None:
-            paths.append(save_distributions(options.out.with_suffix(".png"), values))
+            paths.append(save_distributions(options.out.with_name(f"{options.out.name}.png"), values))
         print("\nwritten to", *paths)
     return 0
+
+
+def _with(options: argparse.Namespace, **other: Any) -> argparse.Namespace:
+    return argparse.Namespace(**(vars(options) | other))
 
 
 def _check(source: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.commands.sources import chosen_source
+from tflane_jax.commands.sources import chosen_source, data_name
 from tflane_jax.config import RunConfig, apply_overrides, load_config
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import ExampleConfig
@@ -46,7 +46,7 @@ def stats(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         raise UserError(f"nothing to count: {dataset.name} has {len(dataset)} examples, {options.count} asked for")
     counted = [example_stats(dataset.example(index), source.example) for index in indices]
     rows = [_row(name, np.array([one[name] for one in counted if name in one])) for name in counted[0] | counted[-1]]
-    print(format_table(rows, title=f"{sources.source_name(source)}: {len(indices)} examples"))
+    print(format_table(rows, title=f"{data_name(source, options)}: {len(indices)} examples"))
     return 0
 
 

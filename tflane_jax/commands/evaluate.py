@@ -7,14 +7,22 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tflane_jax.commands.sources import chosen_source, limited_task, opened, with_chosen_topology, with_chosen_traffic
+from tflane_jax.commands.sources import (
+    data_name,
+    limited_task,
+    opened,
+    source_for,
+    with_chosen_topology,
+    with_chosen_traffic,
+)
 from tflane_jax.config_io import to_json
 from tflane_jax.datasets.overlap import Nearness
-from tflane_jax.datasets.sources import open_dataset, source_name
+from tflane_jax.datasets.sources import open_dataset
 from tflane_jax.errors import UserError
 from tflane_jax.evaluation.edge_types import weights_edge_types
 from tflane_jax.evaluation.interventions import with_traffic
 from tflane_jax.evaluation.lane_errors import lane_errors
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.runs import Run, evaluate_run, training_nearness
 from tflane_jax.scene import stack_examples
@@ -30,6 +38,8 @@ _IMAGES = 8  # over which a HAN's weights are averaged
 
 def run(options: argparse.Namespace) -> int:
     """Evaluate, print the table, and write it as Markdown and JSON."""
+    if options.out is not None:
+        check_stem(options.out)  # before the evaluation, which takes minutes
     configure_jax()
     trained, rest = opened(options)
     if rest:
@@ -37,13 +47,13 @@ def run(options: argparse.Namespace) -> int:
     trained = with_chosen_topology(with_chosen_traffic(trained, options), options)
     if options.errors and not _predicts_lanes(trained.config.task):
         raise UserError("--errors needs a model that predicts centerlines or lane segments")
-    source = chosen_source(trained.config, options)
+    source = source_for(trained, options)
     near = _nearness(trained, source, options.training_root)
     groups = [] if near is None else near.groups
     task = limited_task(trained, options)
     protocol, rows = evaluate_run(trained, source, task=task, frame_groups=groups)
 
-    name = f"{source_name(source)}-step{trained.step}"
+    name = f"{data_name(source, options)}-step{trained.step}"
     if options.max_instances is not None:
         name += f"-max_instances{options.max_instances}"
     if (traffic := trained.config.evaluation.traffic) != "own":

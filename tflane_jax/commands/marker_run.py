@@ -53,6 +53,8 @@ _RINGS = {"argoverse2": ARGOVERSE2_RING, "nuscenes": NUSCENES_RING}
 
 def run(options: argparse.Namespace) -> int:
     """Follow a drive: markers, store, confidence, memory and, with a model, lanes."""
+    if not 0.0 <= options.threshold <= 1.0:
+        raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
     configure_jax()
     store, drive = load_store(options.store), load_drive(options.poses, options.images)
     if options.interval is not None:

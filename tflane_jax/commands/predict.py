@@ -13,6 +13,7 @@ from tflane_jax.training.runtime import configure_jax
 
 # A lane line of LSTR is a query that is more probably a lane than not.
 _OF_LANES, _OF_LANE_LINES = 0.3, 0.5
+_EXAMPLES = 8
 _OF_PHOTOS = "is of photos: name some, or leave it out"
 
 
@@ -24,6 +25,8 @@ def run(options: argparse.Namespace) -> int:
     trained, photos = opened(options)
     of_images = isinstance(trained.config.task, LaneShapeTask)
     _check_inputs(options, photos)
+    if options.count is None:
+        options.count = _EXAMPLES
     if options.threshold is None:
         options.threshold = _OF_LANE_LINES if of_images else _OF_LANES
     if not of_images:
@@ -41,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _check_inputs(options: argparse.Namespace, photos: list[Path]) -> None:
     """Raise UserError for options that would have no effect on photos, or without them."""
-    for name in ("split", "data", "root", "openlane") if photos else ("focal", "horizon"):
+    for name in ("split", "data", "root", "openlane", "count") if photos else ("focal", "horizon"):
         if getattr(options, name) is not None:
             said = f"selects labelled examples, and {photos[0]} is given too: leave one out" if photos else _OF_PHOTOS
             raise UserError(f"--{name} {said}")

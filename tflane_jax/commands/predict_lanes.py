@@ -36,7 +36,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit
 
-from tflane_jax.commands.sources import chosen_source, limited_task, make_folder
+from tflane_jax.commands.sources import limited_task, make_folder, source_for
 from tflane_jax.commands.views import with_images
 from tflane_jax.datasets import sources
 from tflane_jax.datasets.base import FrameInfo
@@ -60,7 +60,7 @@ _OF_SEGMENTS = ("left", "right", "category", "left_type", "right_type")
 def predict(trained: Run, options: argparse.Namespace) -> int:
     """Predict some examples of a split with the first seed, and write all files to --out."""
     task = limited_task(trained, options) or trained.config.task
-    source = chosen_source(trained.config, options)
+    source = source_for(trained, options)
     dataset = sources.open_dataset(source)
     if options.count < 1 or len(dataset) == 0:
         raise UserError(f"nothing to predict: {len(dataset)} examples, --count {options.count}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.atomic import check_writable
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
 from tflane_jax.scoring.scenes import read_scenes, scene_names
@@ -64,13 +64,11 @@ def _check(options: argparse.Namespace, protocol: ScoringProtocol) -> None:
     inputs = [path for path in (options.predictions, options.truth, options.scenes) if path is not None]
     if _same(options.predictions, options.truth):
         raise UserError(f"{options.predictions} is given as PREDICTIONS and as GROUND_TRUTH: name the other file too")
-    if not options.out.name:
-        raise UserError(f"--out {options.out} names no file: give the beginning of its name, such as score")
+    check_stem(options.out)
     for suffix in (".md", ".json"):
         written = options.out.with_name(options.out.name + suffix)
         if any(_same(written, path) for path in inputs):
             raise UserError(f"--out {options.out} would write over {written}, which is read: choose another name")
-        check_writable(written)
 
 
 def _same(one: Path, other: Path) -> bool:

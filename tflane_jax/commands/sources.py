@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.config import RunConfig, load_config
-from tflane_jax.datasets.base import Split
+from tflane_jax.datasets import argoverse2
+from tflane_jax.datasets.base import SPLITS, Split
 from tflane_jax.datasets.data_source import Choice, DataSource
-from tflane_jax.datasets.sources import SOURCES, named_source, source_names, source_of
+from tflane_jax.datasets.sources import SOURCES, named_source, source_name, source_names, source_of
 from tflane_jax.errors import UserError
 from tflane_jax.run_checks import KINDS, check_kind
 from tflane_jax.runs import Run, open_run, open_weights
 from tflane_jax.scene import Example, RoadImage
+from tflane_jax.tasks.fit import check_settings_fit
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 from tflane_jax.tasks.traffic import limit_instances
@@ -26,6 +28,8 @@ def opened(options: argparse.Namespace) -> tuple[Run, list[Path]]:
     The model is that of --config (published weights), or else the first input (a run folder).
     """
     if options.config is not None:
+        if options.checkpoint is not None:
+            raise UserError(f"--checkpoint {options.checkpoint} is of a run: published weights (--config) have but one")
         config = load_config(options.config)
         return open_weights(replace(config, weights=options.weights or config.weights)), options.inputs
     if options.weights is not None:
@@ -74,7 +78,8 @@ def with_chosen_topology(run: Run, options: argparse.Namespace) -> Run:
 def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split | None = None) -> Any:
     """Return the data selected by --split, --data, --root and --openlane: a configuration of `datasets.sources`.
 
-    Without --data and --root, this is the configuration's split. With --data, sizes of examples stay as configured.
+    Without --data and --root, this is the configuration's split. With --data, sizes of examples stay as configured; the
+    presets of the built-in world have their own box, history and capacities.
 
     Args:
         config: of the run; its task determines the type of examples.
@@ -91,12 +96,46 @@ def chosen_source(config: RunConfig, options: argparse.Namespace, split: Split |
     configured = config.data.source(split)
     kind = RoadImage if isinstance(config.task, LaneShapeTask) else Example
     check_kind(config)
+    source = source_of(configured) if options.data is None else named_source(options.data)
+    if options.openlane is not None and (options.root is None or source is not argoverse2.SOURCE):
+        raise UserError("--openlane chooses the frames of --data argoverse2 with --root: other data do not read it")
     if options.data is None and options.root is None:
         return configured
-    source = source_of(configured) if options.data is None else named_source(options.data)
     _check_choice(source, kind, options)
     root, openlane = (None if path is None else Path(path) for path in (options.root, options.openlane))
     return source.choose(Choice(split, given is not None, configured, root, openlane))
+
+
+def source_for(run: Run, options: argparse.Namespace) -> Any:
+    """Return `chosen_source` for a trained model; raise UserError for a world that does not fit the model.
+
+    Other boxes would give numbers all the same: evidence would lie in the wrong place, and lanes that the model cannot
+    perceive would count as missed.
+    """
+    source, task = chosen_source(run.config, options), run.config.task
+    if options.data is None or named_source(options.data).root is not None or not isinstance(task, LaneGraphTask):
+        return source
+    cameras = source.example.cameras
+    try:
+        check_settings_fit(task.model, source.example, image_scale=None if cameras is None else cameras.scale)
+    except UserError as error:
+        why = str(error).rpartition(": ")[0]  # without the remedy, which is for trainings
+        raise UserError(f"--data {options.data} does not fit this model: {why}; choose data like its own") from None
+    return source
+
+
+def data_name(source: Any, options: argparse.Namespace) -> str:
+    """Return the name of the data of `chosen_source` for titles and files.
+
+    Other worlds, folders and splits have other names, so that one table does not replace another.
+    """
+    name = source_name(source)
+    if options.data is not None and named_source(options.data).root is None:  # presets are one kind of data
+        return f"{options.data}-{options.split or options.default_split}"
+    if options.split is not None and not set(SPLITS) & set(name.split("-")):
+        name = f"{name}-{options.split}"
+    folder = "" if options.root is None else Path(options.root).resolve().name
+    return name if f"-{folder}-" in f"-{name}-" or not folder else f"{name}-{folder}"
 
 
 def _check_choice(source: DataSource[Any], kind: type[Any], options: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from tflane_jax.commands.sources import chosen_source, opened
+from tflane_jax.commands.sources import opened, source_for
 from tflane_jax.datasets.nuscenes import NuScenesConfig, NuScenesDataset
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config, OpenLaneV2Dataset
 from tflane_jax.errors import UserError
@@ -28,6 +28,8 @@ from tflane_jax.startup import showing, stage
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.training.runtime import configure_jax
 
+_OF_SERVER = ("method", "authors", "email", "institution", "country")
+
 
 def run(options: argparse.Namespace) -> int:
     """Predict all frames of the split and write the submission."""
@@ -40,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     predicts = set(task.model.predicts) if isinstance(task, LaneGraphTask) else set()
     if options.data is None and options.root is not None:
         options.data = "nuscenes" if "lines" in predicts else "openlane-v2"
-    source = chosen_source(trained.config, options)
+    source = source_for(trained, options)
     if isinstance(source, OpenLaneV2Config):
         if not {"centerlines", "segments"} & predicts:
             raise UserError("this model predicts neither centerlines nor lane segments: OpenLane-V2 has no other task")
@@ -49,6 +51,8 @@ def run(options: argparse.Namespace) -> int:
         author = Author(options.method, tuple(options.authors), options.email, options.institution, options.country)
         write_submission(options.out, found, author)
     elif isinstance(source, NuScenesConfig):
+        if told := [name for name in _OF_SERVER if getattr(options, name)]:
+            raise UserError(f"--{told[0]} is for OpenLane-V2's server: MapTR's file has no place for it, leave it out")
         if "lines" not in predicts:
             raise UserError("MapTR's file for nuScenes holds lines of a vector map, and this model predicts none")
         dataset = NuScenesDataset(source)

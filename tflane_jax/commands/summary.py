@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from tflane_jax.config import RunConfig, apply_overrides, load_config
+from tflane_jax.errors import UserError
+from tflane_jax.files.atomic import check_stem
 from tflane_jax.plan import make_plan
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.summary import parameter_counts, prediction_program, shapes_of_params, training_program
@@ -15,6 +17,9 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     """Print the two tables, and save them to --out; or the estimate of --plan."""
+    _check_together(options)
+    if options.out is not None:
+        check_stem(options.out)
     configure_jax(keep_programs=False)  # compiling is timed
     config = load_config(options.config) if options.config else RunConfig()
     config = apply_overrides(config, overrides)
@@ -22,7 +27,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if options.plan is not None:
         return _plan(options, config, example)
     params = shapes_of_params(config.task, example)
-    counts = parameter_counts(params, options.depth)
+    counts = parameter_counts(params, 1 if options.depth is None else options.depth)
     total = sum(counts.values())
     parts = [
         {"part": name, "parameters": f"{count:,}", "fraction": f"{count / total:.1%}"} for name, count in counts.items()
@@ -53,6 +58,25 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
         meta = {"config": options.config, "parameters": counts}
         print(f"\nwritten: {save_table(options.out, rows, meta, title=title, digits=1)[0]}")
     return 0
+
+
+def _check_together(options: argparse.Namespace) -> None:
+    """Raise UserError for options that do nothing together; fill in the defaults of --plan."""
+    given = {
+        "--kind": options.kind is not None,
+        "--utilisation": options.utilisation is not None,
+        "--depth": options.depth is not None,
+        "--no-training": options.no_training,
+    }
+    of_plan = ("--kind", "--utilisation")
+    for name, is_given in given.items():
+        if is_given and (options.plan is None) == (name in of_plan):
+            remedy = "add it" if name in of_plan else f"leave {name} or --plan out"
+            raise UserError(f"{name} does nothing {'without' if name in of_plan else 'with'} --plan: {remedy}")
+    if options.depth is not None and options.depth < 1:
+        raise UserError(f"--depth {options.depth}: at least one level of names")
+    options.kind = options.kind or "h100"
+    options.utilisation = 0.25 if options.utilisation is None else options.utilisation
 
 
 def _plan(options: argparse.Namespace, config: RunConfig, example: Any) -> int:

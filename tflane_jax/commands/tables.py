@@ -21,6 +21,8 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"--steps-factor {options.steps_factor}: at least 1")
     if options.steps_factor > 1 and options.record is not None:
         raise UserError("--record keeps the tables as they are declared: leave out --steps-factor")
+    if twice := [name for name in options.names if options.names.count(name) > 1]:
+        raise UserError(f"{twice[0]} is named twice: once is enough")
     chosen = [find_table(name).lengthened(options.steps_factor) for name in options.names]
     if options.seeds is not None and options.seeds < 1:
         raise UserError(f"--seeds {options.seeds}: at least one")

@@ -7,7 +7,7 @@ training, validation and test scenes are disjoint by construction.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -239,6 +239,20 @@ def _choose_cameras(choice: Choice) -> ProceduralConfig:
     return ProceduralConfig(choice.split, scenes=_SCENES, example=replace(example, cameras=cameras))
 
 
+# What a preset decides of an example; a host's points, priors, cameras and forms of the truth stay as configured.
+_OF_PRESET = ("range", "lanes", "segments", "areas", "tracks", "elements", "history", "history_hz")
+
+
+def _chooser(preset: Callable[[int, int, int], WorldData]) -> Callable[[Choice], ProceduralConfig]:
+    def choose(choice: Choice) -> ProceduralConfig:
+        source, given = preset(*_PRESET).source(choice.split), choice.configured.example
+        own = {name: getattr(source.example, name) for name in _OF_PRESET}
+        sensor = None if given.sensor is None else source.example.sensor
+        return replace(source, example=replace(given, sensor=sensor, **own))
+
+    return choose
+
+
 def _interval(config: ProceduralConfig) -> float | None:
     """Return the mean distance of the key frames of a scene, seconds."""
     world = config.world
@@ -268,9 +282,7 @@ SOURCE = DataSource(
 )
 CAMERAS = replace(SOURCE, name="world-cameras", choose=_choose_cameras)
 """The same world with a ring of cameras, under a name of its own for `tflane data show`."""
-CITY_SOURCE = replace(SOURCE, name="city", choose=lambda choice: WorldData.city(*_PRESET).source(choice.split))
-HILLS_SOURCE = replace(SOURCE, name="hills", choose=lambda choice: WorldData.hills(*_PRESET).source(choice.split))
-REAL_LIKE_SOURCE = replace(
-    SOURCE, name="real-like", choose=lambda choice: WorldData.real_like(*_PRESET).source(choice.split)
-)
-STREET_SOURCE = replace(SOURCE, name="street", choose=lambda choice: WorldData.street(*_PRESET).source(choice.split))
+CITY_SOURCE = replace(SOURCE, name="city", choose=_chooser(WorldData.city))
+HILLS_SOURCE = replace(SOURCE, name="hills", choose=_chooser(WorldData.hills))
+REAL_LIKE_SOURCE = replace(SOURCE, name="real-like", choose=_chooser(WorldData.real_like))
+STREET_SOURCE = replace(SOURCE, name="street", choose=_chooser(WorldData.street))

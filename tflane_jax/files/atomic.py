@@ -40,10 +40,12 @@ def replacing(path: Path | str) -> Iterator[Path]:
     Two renames replace a folder. A process killed between them leaves the old folder under its temporary name.
 
     Raises:
-        UserError: an OSError occurred in the block or in renaming. The message names `path`, the cause and the remedy.
+        UserError: an OSError occurred in the block or in renaming, or `path` has no name (`.`, `/`). The message has
+            `path`, the cause and the remedy.
         ValueError: the block wrote nothing.
     """
     path = Path(path)
+    _check_name(path)
     temporary = _temporary(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -128,6 +130,19 @@ def check_writable(path: Path | str) -> None:
         raise UserError(f"cannot write {path}: {above} is no folder; choose another path")
     if not os.access(above, os.W_OK | os.X_OK):
         raise UserError(f"cannot write {path}: no right to write in {above}; choose another path")
+
+
+def check_stem(stem: Path | str) -> None:
+    """Raise UserError if STEM.md and STEM.json cannot be written, as far as can be told beforehand."""
+    stem = Path(stem)
+    _check_name(stem)
+    for suffix in (".md", ".json"):
+        check_writable(stem.with_name(stem.name + suffix))
+
+
+def _check_name(path: Path) -> None:
+    if not path.name:
+        raise UserError(f"cannot write {path}: it names no file, only a folder; add a name")
 
 
 def is_temporary(path: Path | str) -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tflane_jax.errors import missing_extra
+from tflane_jax.errors import UserError, missing_extra
 from tflane_jax.files.atomic import replacing
 
 if TYPE_CHECKING:
@@ -55,11 +55,14 @@ def new_figure(
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     """Write the figure whole or not at all, in the format of the file's suffix, and return the path.
 
-    Raises UserError where the file cannot be written.
+    Raises UserError where the file cannot be written, or matplotlib does not know the format.
     """
     path = Path(path)
+    kind, known = path.suffix.removeprefix(".").lower() or "png", figure.canvas.get_supported_filetypes()
+    if kind not in known:
+        raise UserError(f"cannot write {path}: no picture ends in .{kind}; choose .png, .pdf, .svg or .jpg")
     with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=dpi, format=path.suffix.removeprefix(".") or "png")
+        figure.savefig(temporary, dpi=dpi, format=kind)
     return path
 
 

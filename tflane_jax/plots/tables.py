@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tflane_jax.files.atomic import write_text
+from tflane_jax.files.atomic import check_stem, write_text
 
 Row = Mapping[str, Any]
 
@@ -79,6 +79,7 @@ def save_table(
     Raises UserError where a file cannot be written.
     """
     stem = Path(stem)
+    check_stem(stem)
     text = json.dumps({"meta": _plain(meta), "rows": _plain(rows)}, indent=1, allow_nan=False)
     table = format_table(rows, columns, title=title, digits=digits)
     return (

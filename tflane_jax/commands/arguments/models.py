@@ -85,7 +85,6 @@ def predict(commands) -> None:
     parser.add_argument(
         "--count",
         type=int,
-        default=8,
         help="examples, spread evenly over the split (default 8); more than there are: all. At most 16 are drawn",
     )
     parser.add_argument(
@@ -175,16 +174,16 @@ def summary(commands) -> None:
         epilog=OVERRIDES,
     )
     parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (default: the default configuration)")
-    parser.add_argument("--depth", type=int, default=1, help="levels of parameter names in the table (default 1)")
+    parser.add_argument("--depth", type=int, help="levels of parameter names in the table (default 1)")
     parser.add_argument("--no-compile", action="store_true", help="count operations only, which takes seconds")
     parser.add_argument("--no-training", action="store_true", help="omit the training step")
     parser.add_argument(
         "--plan", metavar="DEVICES", type=int, help="estimate memory and time of the training on so many accelerators"
     )
     kinds = ["a100", "h100", "h200", "rtx3090", "rtx4090"]  # of plan.KINDS
-    parser.add_argument("--kind", choices=kinds, default="h100", help="kind of the accelerators (default h100)")
+    parser.add_argument("--kind", choices=kinds, help="with --plan: kind of the accelerators (default h100)")
     parser.add_argument(
-        "--utilisation", type=float, default=0.25, help="fraction of the peak that --plan assumes (default 0.25)"
+        "--utilisation", type=float, help="with --plan: fraction of the peak that is assumed (default 0.25)"
     )
     parser.add_argument("--out", metavar="STEM", type=Path, help="write STEM.md and STEM.json")
     parser.set_defaults(takes_overrides=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.datasets.nuscenes_small import PITCH, START, write_nuscenes
+from tests.datasets.small_logs import drive, lane_map, log, segment, tracks
 from tests.models.cases import CAMERA_TOPONET, SEGMENTS, WITH_TRAFFIC
 from tests.shared import shared_path
 from tflane_jax.cli import main
@@ -107,6 +108,22 @@ def test_frames_get_the_tracks_that_they_had(subset, index, request):
     np.testing.assert_allclose(got[3], expected[3], rtol=1e-6)
     np.testing.assert_array_equal(got[4], expected[4])
     assert made.traffic_flow.occluded.sum() == read.traffic_flow.occluded.sum()
+
+
+@pytest.mark.parametrize("first", [0, 6, 12])
+def test_frames_in_which_nobody_is_are_written(tmp_path, first):
+    """Also before the first and after the last road user, and where there is none."""
+    valid = np.zeros((12, 1), bool)
+    valid[first : first + 3] = True
+    poses = drive(12, start=(0.0, 0.0), step=1.0, turn=0.0)
+    made = log(
+        lane_map(segment(1, [(0, 0), (40, 0)])), tracks(np.ones((12, 1, 3)), valid=valid), poses, [(0, poses[0])]
+    )
+    folder = export_tracks([("val", made)], tmp_path / "out") / "sensor" / "val" / made.name
+    read = load_log(folder, with_map=False, keyframes="annotations")
+    np.testing.assert_array_equal(read.timestamps_ns, made.timestamps_ns)
+    np.testing.assert_array_equal(read.tracks.valid, valid[:, : len(read.tracks.uuid)])
+    assert len(read.tracks.uuid) == valid.any()
 
 
 def test_frames_are_earlier_ones_at_the_wanted_rate(written):

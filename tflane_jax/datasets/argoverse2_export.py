@@ -28,6 +28,8 @@ CATEGORY = {
     RoadUser.PEDESTRIAN: "PEDESTRIAN",
 }
 """Argoverse 2 category that stands for each road user."""
+# The vehicle itself is a track, as the tools of Argoverse write it: a frame in which nobody else is has a row, too.
+_EGO, _EGO_SIZE = "EGO_VEHICLE", (4.9, 1.9, 1.7)
 
 
 def export_tracks(
@@ -35,7 +37,7 @@ def export_tracks(
 ) -> Path:
     """Write logs as `<out>/sensor/<split>/<log>/`, all or none of them.
 
-    A box that its tracker did not see has no interior points; every other has one.
+    A box that its tracker did not see has no interior points; every other has one. The vehicle's own has none.
 
     Args:
         logs: with their splits.
@@ -75,15 +77,18 @@ def _poses(log: Log, offset: int) -> dict[str, np.ndarray]:
 
 
 def _boxes(log: Log, offset: int) -> dict[str, np.ndarray]:
-    """Return one row for each valid box, in the ego frame of its own time."""
+    """Return one row for each valid box and one for the vehicle itself, in the ego frame of its own time."""
     tracks: Tracks = log.tracks
     frame, track = np.nonzero(tracks.valid)
-    half = tracks.yaw[frame, track] / 2.0
-    size = tracks.size[track]
+    empty, own = np.zeros(len(log.timestamps_ns)), np.full(len(log.timestamps_ns), _EGO)
+    half = np.concatenate([tracks.yaw[frame, track], empty]) / 2.0
+    size = np.concatenate([tracks.size[track], np.tile(_EGO_SIZE, (len(own), 1))])
+    category = np.array([CATEGORY[RoadUser(kind)] for kind in tracks.category[track].tolist()], str)
+    points = np.where(tracks.occluded[frame, track], 0, 1)
     return {
-        "timestamp_ns": log.timestamps_ns[frame] + offset,
-        "track_uuid": tracks.uuid[track].astype(str),
-        "category": np.array([CATEGORY[RoadUser(kind)] for kind in tracks.category[track].tolist()], str),
+        "timestamp_ns": np.concatenate([log.timestamps_ns[frame], log.timestamps_ns]) + offset,
+        "track_uuid": np.concatenate([tracks.uuid[track].astype(str), own]),
+        "category": np.concatenate([category, own]),
         "length_m": size[:, 0],
         "width_m": size[:, 1],
         "height_m": size[:, 2],
@@ -91,8 +96,8 @@ def _boxes(log: Log, offset: int) -> dict[str, np.ndarray]:
         "qx": np.zeros_like(half),
         "qy": np.zeros_like(half),
         "qz": np.sin(half),
-        **_places(tracks.position[frame, track]),
-        "num_interior_pts": np.where(tracks.occluded[frame, track], 0, 1).astype(np.int64),
+        **_places(np.concatenate([tracks.position[frame, track], np.zeros((len(own), 3))])),
+        "num_interior_pts": np.concatenate([points, empty]).astype(np.int64),
     }
 
 

@@ -29,6 +29,7 @@ from tflane_jax.models.maptr import MapTrConfig
 from tflane_jax.models.marker_fusion import MarkerFusionConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
 from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.scene import Prediction, stack_examples
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -134,6 +135,23 @@ def test_truth_beyond_the_bev_features_is_named():
     data = WorldData(example=ExampleConfig(range=WIDE))
     with pytest.raises(UserError, match=r"data\.example\.range.*BEV features"):
         LaneGraphTask(TopoNetConfig()).check(data, EXAMPLES)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"decoder": replace(TopoNetConfig().decoder, output="metric")}, "lanes end"),
+        ({"priors": PriorsConfig(traffic_flow=TrafficFlowConfig())}, "traffic flow ends"),
+    ],
+)
+def test_truth_beyond_the_range_that_the_model_perceives_is_named(changes, what):
+    model = replace(TopoNetConfig(), **changes)
+    LaneGraphTask(model).check_settings(WorldData())
+    near = replace(model, range=replace(model.range, x=(-30.0, 30.0)))
+    with pytest.raises(UserError, match=rf"the model's {what} at x \(-30\.0, 30\.0\).*\(task\.model\.range\)"):
+        LaneGraphTask(near).check_settings(WorldData())
+    # Without either, the range has no effect.
+    LaneGraphTask(replace(TopoNetConfig(), range=near.range)).check_settings(WorldData())
 
 
 def test_limiting_instances_needs_traffic_flow():

@@ -96,6 +96,13 @@ def _check_ranges(model: HostConfig, config: ExampleConfig) -> None:
             f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), beyond the "
             f"model's BEV features (x {bev_range.x}, y {bev_range.y}): make either range fit the other"
         )
+    ends = getattr(getattr(model, "decoder", None), "output", None) == "metric"
+    if (ends or model.priors.traffic_flow is not None) and not model.range.contains(np.stack([low, high])).all():
+        raise UserError(
+            f"lanes are labelled within x {config.range.x}, y {config.range.y} (data.example.range), and the model's "
+            f"{'lanes end' if ends else 'traffic flow ends'} at x {model.range.x}, y {model.range.y} "
+            "(task.model.range): make either range fit the other"
+        )
 
 
 def _check_raster(model: HostConfig, config: ExampleConfig) -> None:

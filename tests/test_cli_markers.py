@@ -52,18 +52,22 @@ def test_distance_is_proportional_to_marker_size(photos, tmp_path):
     ("change", "words"),
     [
         (["--family", "QR"], "ARUCO_5X5_100"),
-        (["--size", "0"], "size"),
+        (["--size", "0"], "tflane: --size is 0.0: it must be"),
         (["--distortion", "0.1"], "--distortion"),
         (["--intrinsics", "0", "900", "1", "1"], "--intrinsics"),
-        (["--enlarge", "0"], "enlarge"),
+        (["--enlarge", "0"], "tflane: --enlarge is 0: it must be"),
     ],
 )
 def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):
     assert main(["markers", "detect", str(photos), *INTRINSICS, *change, "--out", str(tmp_path / "out")]) == 2
     assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
-def test_curves_refuse_invalid_settings(tmp_path, capsys):
-    for change in (["--scales", "-1"], ["--seeds", "0"], ["--sigma-d", "0"]):
-        assert main(["markers", "curves", "--out", str(tmp_path), *change]) == 2
-        assert capsys.readouterr().err.startswith("tflane: ")
+@pytest.mark.parametrize("option", ["--scales -1", "--seeds 0", "--sigma-d 0", "--distances 0.5", "--severity 2"])
+def test_curves_refuse_invalid_settings_by_the_name_of_the_option(option, tmp_path, capsys):
+    assert main(["markers", "curves", "--out", str(tmp_path / "out"), *option.split()]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("tflane: --")
+    assert option.split()[0] in said
+    assert not (tmp_path / "out").exists()

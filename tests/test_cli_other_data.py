@@ -131,6 +131,7 @@ def test_what_only_one_server_takes_is_refused_elsewhere(monkeypatch, tmp_path):
         ("summary --no-compile --plan 2 --depth 3", "--depth does nothing with --plan: leave --depth or --plan out"),
         ("summary --no-compile --plan 2 --no-training", "--no-training does nothing with --plan"),
         ("summary --no-compile --depth 0", "--depth 0: at least one level of names"),
+        ("convert --config gtn_lane/lstr --weights x --out RUN", "RUN already holds a run: choose another folder with"),
         ("tables gtn_lane.9 gtn_lane.9", "gtn_lane.9 is named twice"),
         ("markers run --store s --images i --poses p --threshold 7", "--threshold 7: it must be a score from 0 to 1"),
     ],
@@ -139,6 +140,6 @@ def test_options_without_effect_are_refused(arguments, message, trained, tmp_pat
     monkeypatch.chdir(tmp_path)
     assert main(arguments.replace("RUN", str(trained)).split()) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"tflane: {message}")
+    assert said.startswith(f"tflane: {message.replace('RUN', str(trained))}")
     assert said.count("\n") == 1
     assert os.listdir(tmp_path) == []

@@ -130,6 +130,7 @@ def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda source: DriveDataset())
     (tmp_path / "config.py").write_text("from tflane_jax.config import RunConfig as get_config")
     command = ["data", "export", "--config", str(tmp_path / "config.py"), "--out", str(tmp_path / "out")]
+    command += ["--data.example.cameras", "default"]
     assert main([*command, "--splits", "val", "test", "--data.val", "5"]) == 0
     said = capsys.readouterr().out
     assert "| val " in said
@@ -137,6 +138,29 @@ def test_the_command_writes_checks_and_counts(tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["data_dict_subset_B.json", "test", "val"]
     assert main(command) == 2
     assert "is not empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--out full --data.example.cameras default", "full is not empty"),
+        ("--out new --tracks full --data.example.cameras default", "full is not empty"),
+        ("--out new --tracks ./new --data.example.cameras default", "--out and --tracks are both new"),
+        ("--out new --config gtn_lane/gtn", "front-views-train are single images"),
+        ("--out new", "procedural-train has no camera images, which OpenLane-V2 needs: set data.example.cameras"),
+    ],
+)
+def test_what_cannot_be_exported_is_told_before_examples_are_made(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("tflane_jax.datasets.sources.open_dataset", lambda source: pytest.fail("opened"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.py").write_text("from tflane_jax.config import RunConfig as get_config")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").touch()
+    config = [] if "--config" in arguments else ["--config", "config.py"]
+    assert main(["data", "export", *config, *arguments.split()]) == 2
+    assert capsys.readouterr().err.startswith(f"tflane: {message}")
+    assert sorted(path.name for path in tmp_path.iterdir() if path.suffix != "") == ["config.py"]
+    assert not (tmp_path / "new").exists()
 
 
 def test_rigs_have_the_official_names():

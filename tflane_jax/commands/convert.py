@@ -22,6 +22,8 @@ from tflane_jax.training.runtime import configure_jax
 
 def run(options: argparse.Namespace) -> int:
     """Write the run, and a table with the conversion of every tensor."""
+    if (options.out / "config.json").exists():
+        raise UserError(f"{options.out} already holds a run: choose another folder with --out, or delete that one")
     configure_jax()
     config = load_config(options.config)
     weights = options.weights or config.weights

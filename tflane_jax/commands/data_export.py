@@ -23,6 +23,7 @@ from tflane_jax.datasets.openlane_frames import subset_of
 from tflane_jax.datasets.openlane_sd_map import sd_records
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table
+from tflane_jax.scene import RoadImage
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.roads.sd_map import sd_lines
 
@@ -32,6 +33,8 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     config = apply_overrides(load_config(options.config), overrides)
     chosen = {split: chosen_source(config, options, split) for split in dict.fromkeys(options.splits)}
     tracks: Path | None = options.tracks
+    _check_folders(options.out, tracks)
+    _check_cameras(chosen)
     driven = {} if tracks is None else _driven(chosen)
     datasets = {split: sources.open_dataset(source) for split, source in chosen.items()}
     out = export_openlane_v2(datasets, options.out, images=options.images, sd_maps=_sd_maps(chosen))
@@ -45,6 +48,26 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     if found.faults:
         raise UserError(f"what was written to {out} has faults: {found.faults[0]}")
     return 0
+
+
+def _check_folders(out: Path, tracks: Path | None) -> None:
+    """Raise UserError before examples are made, which may take an hour, where the folders cannot take them."""
+    for folder in (out,) if tracks is None else (out, tracks):
+        if folder.is_dir() and any(folder.iterdir()):
+            raise UserError(f"{folder} is not empty: choose another folder")
+    if tracks is not None and tracks.resolve() == out.resolve():
+        raise UserError(f"--out and --tracks are both {out}: the tracks need a folder of their own")
+
+
+def _check_cameras(chosen: Mapping[Split, Any]) -> None:
+    for source in chosen.values():
+        if sources.source_of(source).example is RoadImage:
+            raise UserError(f"{sources.source_name(source)} are single images: OpenLane-V2 has six or seven cameras")
+        if source.example.cameras is None and getattr(source, "image", None) is None:
+            raise UserError(
+                f"{sources.source_name(source)} has no camera images, which OpenLane-V2 needs: set "
+                "data.example.cameras (built-in world) or data.image"
+            )
 
 
 def _sd_maps(chosen: Mapping[Split, Any]) -> dict[Split, dict[str, Any]]:

@@ -49,12 +49,15 @@ def find(options: argparse.Namespace) -> int:
         enlarge=options.enlarge,
         search=options.search,
     )
-    check_settings(config, "DetectorConfig.")
+    check_settings(config, "--")
+    distortion: list[float] = options.distortion or []
+    if len(distortion) not in (0, 4, 5, 8):
+        raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)
     rows, records = [], []
     for number, path in enumerate(photos):
-        photo = _without_distortion(read_image(path), intrinsics, options.distortion)
+        photo = undistorted(read_image(path), intrinsics, distortion)
         found = detect(_views(photo, intrinsics, pose), config)
         picture = f"{number:03d}-{path.stem}-markers.png"
         _write_picture(options.out / picture, photo, found, config.size, intrinsics, pose)
@@ -78,21 +81,11 @@ def curves(options: argparse.Namespace) -> int:
         raise UserError(f"--scales are positive fractions of the native image size, not {min(options.scales):g}")
     if not options.sigma_d > 0.0:
         raise UserError(f"--sigma-d must be a positive distance in metres, not {options.sigma_d:g}")
+    configs = {scale: [_curve(options, scale, corners) for corners in options.corners] for scale in options.scales}
     make_folder(options.out)
     drawn: dict[str, list[dict[str, Any]]] = {}
-    for scale in options.scales:
-        # All corner methods see the same scenes.
-        configs = [
-            CurveConfig(
-                seeds=options.seeds,
-                scale=scale,
-                severity=options.severity,
-                distances=tuple(options.distances),
-                detector=DetectorConfig(_family(options.family), corners=corners, enlarge=options.enlarge),
-            )
-            for corners in options.corners
-        ]
-        for corners, config, sightings in zip(options.corners, configs, measure(configs), strict=True):
+    for scale, several in configs.items():  # all corner methods see the same scenes
+        for corners, config, sightings in zip(options.corners, several, measure(several), strict=True):
             name = f"{corners}, scale {scale:g}"
             drawn[name] = summarise(sightings)
             stem = options.out / f"curves-{corners}-{scale:g}"
@@ -101,6 +94,17 @@ def curves(options: argparse.Namespace) -> int:
             print(format_table(drawn[name], title=name) + "\n")
     print("written to", save_error_curves(options.out / "curves.png", drawn, options.sigma_d))
     return 0
+
+
+def _curve(options: argparse.Namespace, scale: float, corners: Any) -> CurveConfig:
+    """Return what is measured; raise UserError, naming the option, where it cannot be."""
+    detector = DetectorConfig(_family(options.family), corners=corners, enlarge=options.enlarge)
+    check_settings(detector, "--")
+    config = CurveConfig(
+        tuple(options.distances), seeds=options.seeds, scale=scale, severity=options.severity, detector=detector
+    )
+    check_settings(config, "--")
+    return config
 
 
 def _family(name: str) -> MarkerFamily:
@@ -114,16 +118,6 @@ def _intrinsics(numbers: list[float]) -> Float[np.ndarray, "3 3"]:
     if not (fx > 0.0 and fy > 0.0):
         raise UserError(f"--intrinsics are FX FY CX CY in pixels with positive FX and FY, not {fx:g} {fy:g}")
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _without_distortion(
-    photo: UInt8[np.ndarray, "h w 3"], intrinsics: Float[np.ndarray, "3 3"], distortion: list[float] | None
-) -> UInt8[np.ndarray, "h w 3"]:
-    if distortion is None:
-        return photo
-    if len(distortion) not in (4, 5, 8):
-        raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
-    return undistorted(photo, intrinsics, distortion)
 
 
 def _views(

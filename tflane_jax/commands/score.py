@@ -15,6 +15,9 @@ from tflane_jax.scoring.protocols import ScoringProtocol, find_protocol
 from tflane_jax.scoring.scenes import read_scenes, scene_names
 from tflane_jax.scoring.score import Scored, check_bootstrap, score
 
+_COUNTED = ("lanes", "lines")
+"""Numbers of true lanes, or of lines of a map, that the scores of a part rest on."""
+
 
 def run(options: argparse.Namespace) -> int:
     """Score, print the table, and write it as Markdown and JSON."""
@@ -40,7 +43,9 @@ def run(options: argparse.Namespace) -> int:
     rows += [{"part": group, **values} for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
-    shown = [name for name in ("part", *protocol.columns, "frames") if any(name in row for row in rows)]
+    # A part without lanes and detections has DET_l 1: without their number, nobody could tell.
+    counted = () if options.by is None else _COUNTED
+    shown = [name for name in ("part", *protocol.columns, *counted, "frames") if any(name in row for row in rows)]
     print(format_table(rows, shown, title=title, digits=4))
     meta = {
         "protocol": scored.protocol,

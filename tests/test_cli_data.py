@@ -84,7 +84,7 @@ def test_distributions_of_several_data_are_laid_side_by_side(tmp_path, capsys):
     for column in ("street (1 frames)", "real-maps (1 frames)", "street #2 (1 frames)"):
         assert column in printed
     rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in printed.splitlines() if "|" in line}
-    for quantity in ("lanes", "connectors", "length, m", "curvature, 1/100 m", "visible share"):
+    for quantity in ("lanes", "connectors", "length, m", "curvature, 1/100 m", "visible fraction"):
         first, other, again = (cell.strip() for cell in rows[quantity])
         assert first == again
         assert float(other.split(" ")[0]) >= 0.0
@@ -111,7 +111,8 @@ def test_recorded_frames_are_drawn_beside_simulated_ones(tmp_path, monkeypatch, 
     np.savez(tmp_path / "scene-0061.npz", **content())
     shown = []
 
-    def draw(dataset, count, out, **_):
+    def draw(dataset, count, out, titles, **_):
+        assert titles == ["scene-0061, recorded", "scene-0061, simulated"]
         shown.extend((dataset.info(i).source, dataset.info(i).scene) for i in range(count))
         return out
 

@@ -29,7 +29,7 @@ def test_prediction_of_lines(tmp_path, monkeypatch, truth):
             return Namespace(source="fake", scene=f"scene {index}", timestamp_ns=10**9)
 
     answer = stack_examples([example]), Prediction(lines=stack_examples([lines]))
-    monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
+    monkeypatch.setattr(predict_lanes, "source_for", lambda *_: source)
     monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: Dataset())
     monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
     options = Namespace(count=1, out=out, threshold=0.5, max_instances=None, cameras=False)

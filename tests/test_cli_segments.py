@@ -21,7 +21,7 @@ def test_prediction_of_segments_adds_boundaries_and_types(tmp_path, monkeypatch)
     dataset, segments, out = FakeDataset(FakeConfig(2)), fake_segments(), tmp_path / "predictions"
     source = RunConfig().data.source("val")
     answer = stack_examples([dataset.example(0)]), Prediction(segments=stack_examples([segments]))
-    monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
+    monkeypatch.setattr(predict_lanes, "source_for", lambda *_: source)
     monkeypatch.setattr(predict_lanes.sources, "open_dataset", lambda *_: dataset)
     monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)
     options = Namespace(count=1, out=out, threshold=0.5, max_instances=None, cameras=False)
@@ -58,7 +58,7 @@ def test_images_of_the_world_are_rendered_for_the_picture(tmp_path, monkeypatch)
 
     source = RunConfig().data.source("val")
     answer = stack_examples([World(source).example(0)]), Prediction(segments=stack_examples([fake_segments()]))
-    monkeypatch.setattr(predict_lanes, "chosen_source", lambda *_: source)
+    monkeypatch.setattr(predict_lanes, "source_for", lambda *_: source)
     for function in ("open_dataset", "make_dataset"):
         monkeypatch.setattr(predict_lanes.sources, function, World)
     monkeypatch.setattr(predict_lanes, "predict_examples", lambda *_: answer)

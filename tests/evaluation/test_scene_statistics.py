@@ -48,7 +48,7 @@ def test_lanes_are_measured_and_padding_is_not():
     # The first and the last chord of the arc point half a step off its ends.
     np.testing.assert_allclose(found["turn, degrees"], [0.0, 90.0 * 19 / 20], rtol=1e-3)
     np.testing.assert_allclose(found["curvature, 1/100 m"], [0.0, 5.0], rtol=1e-2)
-    np.testing.assert_array_equal(found["visible share"], [0.75, 0.25])
+    np.testing.assert_array_equal(found["visible fraction"], [0.75, 0.25])
 
 
 @pytest.mark.parametrize(

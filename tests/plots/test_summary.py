@@ -24,14 +24,14 @@ def test_quantities_are_counted_over_the_examples():
         "capacity": 5,
         "full": 0.5,
     }
-    assert rows["- hidden"]["mean"] == (1 + 4) / 2
-    assert rows["- share in line of sight"]["mean"] == np.mean([1.25 / 2, 1.25 / 5])
+    assert rows["- out of sight"]["mean"] == (1 + 4) / 2
+    assert rows["- fraction in line of sight"]["mean"] == np.mean([1.25 / 2, 1.25 / 5])
     assert rows["- topology links"]["most"] == 1
     assert rows["- crossings"]["mean"] == 1
     assert rows["road users"]["most"] == 2
     assert rows["- frames of each"]["mean"] == 4
-    assert rows["- share of boxes not seen"]["mean"] == 1 / 8
-    assert rows["share of ground out of sight"]["mean"] == 15 / 200
+    assert rows["- fraction of boxes not seen"]["mean"] == 1 / 8
+    assert rows["fraction of ground out of sight"]["mean"] == 15 / 200
 
 
 def test_padding_changes_nothing():
@@ -40,14 +40,14 @@ def test_padding_changes_nothing():
 
 def test_examples_without_a_quantity_do_not_count_in_its_mean():
     rows = summary(fake_example(0), empty_example())
-    assert rows["- share in line of sight"]["mean"] == 1.25 / 2
+    assert rows["- fraction in line of sight"]["mean"] == 1.25 / 2
     assert rows["lanes"]["least"] == 0
     assert summary(empty_example())["- frames of each"]["mean"] is None
 
 
 def test_quantities_that_a_dataset_lacks_have_no_row():
     bare = fake_example().replace(hidden=None, traffic_flow=None, traffic_elements=None)
-    assert not {"road users", "share of ground out of sight", "traffic lights and signs"} & set(summary(bare))
+    assert not {"road users", "fraction of ground out of sight", "traffic lights and signs"} & set(summary(bare))
 
 
 def test_lines_of_a_map_are_counted_by_class():
@@ -57,5 +57,5 @@ def test_lines_of_a_map_are_counted_by_class():
     rows = summary(fake_example().replace(map_lines=lines))
     assert (rows["map lines"]["mean"], rows["map lines"]["capacity"]) == (3, 4)
     assert [rows[f"- {name}"]["mean"] for name in ("divider", "crossing", "boundary", "centerline")] == [2, 0, 1, 0]
-    assert rows["- hidden lines"]["mean"] == 1
+    assert rows["- lines out of sight"]["mean"] == 1
     assert "map lines" not in summary(fake_example())

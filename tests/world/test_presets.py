@@ -91,7 +91,7 @@ RECORDED = {
     "width, m": 4.14,
     "painted sides": 0.57,
     "turn, degrees": 27.7,
-    "visible share": 0.615,
+    "visible fraction": 0.615,
 }
 
 

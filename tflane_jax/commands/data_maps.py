@@ -41,12 +41,15 @@ def run(options: argparse.Namespace) -> int:
         raise UserError(f"{options.root} holds maps without recordings: tflane data show --data real-maps draws those")
     as_recorded = replace(REAL_MAPS, mirrored=0.0)
     frames: list[tuple[Dataset, int]] = []
+    titles: list[str] = []
     for log in logs:
         recorded = RecordedDataset(RecordedConfig(options.root, (log,)))
         config = RealMapConfig(options.root, (log,), scenes=1, first=options.scene, world=as_recorded)
         simulated = RealMapDataset(config)
+        titles += [f"{log[:16]}, recorded", f"{log[:16]}, simulated"]
         frames += [(recorded, int(len(recorded) * options.moment)), (simulated, len(simulated) - 1)]
     example = RecordedConfig(options.root).example
-    path = show_dataset(_Chosen(tuple(frames)), len(frames), options.out, ground=example.ground, view=example.range)
+    chosen, shown = _Chosen(tuple(frames)), {"ground": example.ground, "view": example.range}
+    path = show_dataset(chosen, len(frames), options.out, titles=titles, **shown)
     print(f"written to {path}")
     return 0

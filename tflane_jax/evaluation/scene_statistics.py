@@ -36,7 +36,7 @@ LANE_QUANTITIES = (
     "unpainted sides at the road's edge",
     "turn, degrees",
     "curvature, 1/100 m",
-    "visible share",
+    "visible fraction",
 )
 """One value for each lane; the curvature is the largest along the lane, of lanes of a metre and more.
 
@@ -90,7 +90,7 @@ def lane_quantities(example: Example) -> dict[str, Float[np.ndarray, " n"]]:
         "unpainted sides at the road's edge": _at_edge(sides[bare], example.areas),
         "turn, degrees": np.degrees(np.abs(turn.sum(-1))),
         "curvature, 1/100 m": 100.0 * curvature.max(-1, initial=0.0)[length >= _SHORTEST],
-        "visible share": np.asarray(lanes.visibility, float)[valid],
+        "visible fraction": np.asarray(lanes.visibility, float)[valid],
     }
 
 

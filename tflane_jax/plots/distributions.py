@@ -39,5 +39,7 @@ def save_distributions(path: Path, values: Mapping[str, Mapping[str, Float[np.nd
         ax.grid(alpha=0.3, lw=0.5)
     if names:
         axes.flat[0].legend(fontsize=6, frameon=False)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("fraction", fontsize=7)
     hide_unused(axes, len(names))
     return save_figure(figure, path)

@@ -92,11 +92,27 @@ def save_examples(
 
 
 def show_dataset(
-    dataset: Dataset, count: int, out: Path, *, ground: PerceptionRange = GROUND, view: PerceptionRange = VIEW
+    dataset: Dataset,
+    count: int,
+    out: Path,
+    *,
+    titles: Sequence[str] | None = None,
+    ground: PerceptionRange = GROUND,
+    view: PerceptionRange = VIEW,
 ) -> Path:
     """Write a contact sheet of `count` examples spread evenly over the dataset (all of them if it has fewer).
 
-    Each has two panels: the truth, and evidence with traffic. Raises UserError for an empty dataset or a count of 0.
+    Each has two panels: the truth, and evidence with traffic.
+
+    Args:
+        dataset: the examples.
+        count: how many are drawn.
+        out: .png, .pdf, .svg or .jpg.
+        titles: of all examples of the dataset; None: their numbers and scenes.
+        ground: range of evidence and line of sight in the examples.
+        view: range that is shown.
+
+    Returns the path. Raises UserError for an empty dataset or a count of 0, or where the file cannot be written.
     """
     if len(dataset) == 0 or count < 1:
         raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} examples, {count} asked for")
@@ -113,7 +129,7 @@ def show_dataset(
             layers=("hidden", *true, "elements"),
             ground=ground,
             view=view,
-            title=f"{index}: {info.scene[:16]}, truth",
+            title=f"{f'{index}: {info.scene[:16]}' if titles is None else titles[index]}, truth",
         )
         draw_scene(
             seen, example, layers=("evidence", "traffic"), ground=ground, view=view, title="evidence and traffic"
@@ -164,8 +180,8 @@ def _visibility_entries() -> list:
     from matplotlib.lines import Line2D
 
     return [
-        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in view"),
-        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane hidden"),
+        Line2D([], [], color=style.LANE_CLEAR, lw=2, label="lane in sight"),
+        Line2D([], [], color=style.LANE_HIDDEN, lw=2, label="lane out of sight"),
     ]
 
 

@@ -93,9 +93,19 @@ def save_drive_frame(
         number = int(detected.marker_id[k])
         x, y = detected.pose[k, :2, 3].tolist()
         above.plot([x], [y], "s", color=OUTCOMES[outcomes[number]], markersize=6, zorder=6.0)
-        above.annotate(
-            _label(number, outcomes, confidence), (x, y), color=OUTCOMES[outcomes[number]], fontsize=6, zorder=6.1
-        )
+        if view.contains(np.array([x, y])):  # beside the board, towards the middle
+            side, up = (-1 if x > np.mean(view.x) else 1), (-1 if y > np.mean(view.y) else 1)
+            above.annotate(
+                _label(number, outcomes, confidence),
+                (x, y),
+                xytext=(5 * side, 5 * up),
+                textcoords="offset points",
+                ha="left" if side > 0 else "right",
+                va="bottom" if up > 0 else "top",
+                color=OUTCOMES[outcomes[number]],
+                fontsize=6,
+                zorder=6.1,
+            )
     draw_ego(above)
     return save_figure(figure, path)
 

@@ -19,15 +19,15 @@ def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[
 
     Args:
         arrays: examples stacked along a leading axis.
-        hidden_below: a lane or line with a smaller visibility counts as hidden.
+        hidden_below: a lane or line with a smaller visibility counts as out of sight.
     """
     lanes, areas, flow = arrays.lanes, arrays.areas, arrays.traffic_flow
     links = lanes.successor & lanes.valid[:, :, None] & lanes.valid[:, None]
     rows = [
         _slots("lanes", lanes.valid),
-        _subset("- hidden", lanes.valid & (lanes.visibility < hidden_below)),
+        _subset("- out of sight", lanes.valid & (lanes.visibility < hidden_below)),
         _subset("- in intersections", lanes.valid & lanes.is_connector),
-        _row("- share in line of sight", _mean_of(lanes.visibility, lanes.valid)),
+        _row("- fraction in line of sight", _mean_of(lanes.visibility, lanes.valid)),
         _row("- topology links", links.sum((1, 2))),
         _slots("lane segments", arrays.segments.valid),
         _slots("areas", areas.valid),
@@ -38,18 +38,18 @@ def dataset_summary(arrays: Example, *, hidden_below: float = 0.5) -> list[dict[
         rows.append(_slots("map lines", lines.valid))
         rows += [_subset(f"- {kind.name.lower()}", lines.valid & (lines.category == kind)) for kind in LineClass]
         if lines.visibility is not None:
-            rows.append(_subset("- hidden lines", lines.valid & (lines.visibility < hidden_below)))
+            rows.append(_subset("- lines out of sight", lines.valid & (lines.visibility < hidden_below)))
     if flow is not None:
         known = flow.valid.any(-1)
         rows += [
             _slots("road users", known),
             _row("- frames of each", _mean_of(flow.valid.sum(-1), known)),
-            _row("- share of boxes not seen", _mean_of(flow.occluded, flow.valid)),
+            _row("- fraction of boxes not seen", _mean_of(flow.occluded, flow.valid)),
         ]
     if arrays.traffic_elements is not None:
         rows.append(_slots("traffic lights and signs", arrays.traffic_elements.valid))
     if arrays.hidden is not None:
-        rows.append(_row("share of ground out of sight", arrays.hidden.mean((1, 2))))
+        rows.append(_row("fraction of ground out of sight", arrays.hidden.mean((1, 2))))
     return rows
 
 

@@ -15,7 +15,9 @@ def data(commands) -> None:
     )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
     show = command(inner, "show", "draw samples of a dataset and count their content", module="data", function="show")
-    show.add_argument("--config", metavar="FILE", help="config file whose data to show (default: the built-in world)")
+    show.add_argument(
+        "--config", metavar="FILE[:NAME]", help="config file whose data to show (default: the built-in world)"
+    )
     split_arguments(show, "train")
     show.add_argument("--count", type=int, default=8, help="examples (default 8)")
     show.add_argument(

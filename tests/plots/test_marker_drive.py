@@ -1,0 +1,64 @@
+"""The picture of a drive's frame: boards from above, with labels that can be read."""
+
+import numpy as np
+import pytest
+
+from tflane_jax.geometry import PerceptionRange
+from tflane_jax.markers.detection import DetectedMarkers
+from tflane_jax.plots import marker_drive
+from tflane_jax.priors.marker_memory import MarkerGuidance
+from tflane_jax.scene import CameraViews
+
+pytest.importorskip("matplotlib")
+
+NO_LANES = MarkerGuidance(
+    points=np.zeros((0, 2, 2)),
+    weight=np.zeros(0),
+    confidence=np.zeros(0),
+    gate=np.zeros(()),
+    successor=np.zeros((0, 0), bool),
+    valid=np.zeros(0, bool),
+)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (49.5, -24.5), (49.5, 24.5), (-49.5, -24.5), (-49.5, 24.5)])
+def test_the_label_of_a_board_lies_beside_it_and_in_the_panel(place, tmp_path, monkeypatch):
+    found = DetectedMarkers.empty(1)
+    found.valid[:], found.marker_id[:], found.size[:], found.pose[0, :2, 3] = True, 98, 1.0, place
+    front = np.array([[0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]], np.float32)[None]
+    size, intrinsics = np.array([[64, 48]]), np.array([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]])
+    views = CameraViews(np.zeros((1, 48, 64, 3), np.uint8), size, intrinsics, front, np.ones(1, bool))
+    drawn = []
+    monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: drawn.append(figure))
+    marker_drive.save_drive_frame(
+        tmp_path / "x.png", views, found, {98: "used"}, {98: 0.51}, NO_LANES, view=PerceptionRange()
+    )
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    panel = figure.axes[1]
+    (label,) = (text for text in panel.texts if text.get_text() == "98: 0.51")
+    box, frame = label.get_window_extent(), panel.get_window_extent()
+    assert frame.x0 <= box.x0 <= box.x1 <= frame.x1
+    assert frame.y0 <= box.y0 <= box.y1 <= frame.y1
+    board = panel.transData.transform(place)
+    half = 3.0 * figure.dpi / 72.0  # of the square
+    outside = np.maximum([box.x0 - board[0], box.y0 - board[1]], [board[0] - box.x1, board[1] - box.y1])
+    assert outside.max() >= half
+
+
+def test_boards_out_of_the_panel_have_no_label(tmp_path, monkeypatch):
+    found = DetectedMarkers.empty(1)
+    found.valid[:], found.marker_id[:], found.size[:], found.pose[0, :2, 3] = True, 98, 1.0, (70.0, 0.0)
+    views = CameraViews(
+        np.zeros((1, 48, 64, 3), np.uint8),
+        np.array([[64, 48]]),
+        np.eye(3)[None],
+        np.eye(4, dtype=np.float32)[None],
+        np.ones(1, bool),
+    )
+    drawn = []
+    monkeypatch.setattr(marker_drive, "save_figure", lambda figure, path: drawn.append(figure))
+    marker_drive.save_drive_frame(
+        tmp_path / "x.png", views, found, {98: "used"}, {98: 0.51}, NO_LANES, view=PerceptionRange()
+    )
+    assert [text.get_text() for text in drawn[0].axes[1].texts if "98" in text.get_text()] == []

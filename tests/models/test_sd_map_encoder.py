@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.models.cases import BASELINE, make_example
 from tests.models.test_bevformer import CONFIG, levels, ring
 from tests.parameters import random_params
 from tflane_jax.geometry import BevGrid, PerceptionRange
@@ -19,8 +20,10 @@ from tflane_jax.layers.polyline_encoder import (
 )
 from tflane_jax.models.bevformer import BevFormer, BevFormerConfig
 from tflane_jax.models.evidence_encoder import EvidenceEncoder, EvidenceEncoderConfig
+from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SdMapEncoder, SdMapFusion, SdMapModuleConfig
 from tflane_jax.scene import SdMap
+from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
 @pytest.mark.parametrize("layout", ["blocks", "interleaved"])
@@ -214,3 +217,16 @@ def test_map_coordinates_are_normalised_by_the_range_of_the_host():
     tokens, _ = jax.jit(encoder.apply)(params, half)
     scaled, _ = jax.jit(double.apply)(params, half.replace(points=2 * half.points))
     np.testing.assert_allclose(tokens, scaled, atol=1e-5)
+
+
+@pytest.mark.parametrize("absent", ["nothing", "reference"])
+def test_a_host_of_any_number_of_points_reads_examples_without_a_map(absent):
+    """As a map whose lines are all invalid; the parameters depend on the number of points."""
+    sd_map = replace(MODULE, absent=absent, radius=5.0)
+    task = LaneGraphTask(replace(BASELINE, priors=PriorsConfig(sd_map=sd_map)))
+    example = make_example()
+    nothing = example.replace(sd_map=SdMap.empty(3, 21))
+    params = random_params(task.init, nothing)
+    predict = jax.jit(task.predict)
+    expected, found = (predict(params, one).centerlines for one in (nothing, example))
+    jax.tree.map(np.testing.assert_array_equal, expected, found)

@@ -99,8 +99,8 @@ class SdMapPrior(Prior):
         return {"sd_map_tokens": self.sd_map_tokens}
 
     def observe(self, example: Example, memory: None) -> tuple[SdMap, None]:
-        """Return the SD map; without one, a map whose lines are all invalid."""
-        sd_map = SdMap.empty(1, POINTS) if example.sd_map is None else example.sd_map
+        """Return the SD map; without one, a map without lines."""
+        sd_map = SdMap.empty(0, POINTS) if example.sd_map is None else example.sd_map
         return jax.tree.map(jnp.asarray, sd_map), None
 
     def encode(self, observation: SdMap, *, deterministic: bool) -> FusedSdMap:
@@ -135,6 +135,9 @@ class SdMapEncoder(nn.Module):
             deterministic: no dropout. False needs the random key `dropout`.
         """
         lines = sd_map_tokens(jax.tree.map(jnp.asarray, sd_map), self.config.prior, self.range)
+        if not len(lines.valid) and not self.is_initializing():
+            # Parameters for any number of points fit a map without lines.
+            return jnp.zeros((0, self.config.lines.dim)), lines.valid
         encoder = PolylineEncoder(self.config.lines, self.config, name="lines")
         return encoder(lines.points, lines.labels, lines.valid, deterministic=deterministic), lines.valid
 

@@ -28,7 +28,9 @@ def drive(frames: int, positions: np.ndarray, on_route: int = 10_000) -> Traffic
     xy = np.arange(frames * 4, dtype=float).reshape(frames, 2, 2)
     signals = Signals(np.array([[9.0, 12.0]]), np.array([2.0]))
     ego = np.pad(positions, ((0, 0), (0, 1)))
-    return Traffic(xy, xy[..., 0], present, np.arange(6.0).reshape(2, 3), np.array([0, 5]), ego, on_route, signals)
+    return Traffic(
+        xy, xy[..., 0], present, np.arange(6.0).reshape(2, 3), np.array([0, 5]), ego, on_route, signals, frames
+    )
 
 
 @pytest.fixture(scope="module")

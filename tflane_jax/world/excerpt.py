@@ -55,6 +55,7 @@ def excerpt(
         traffic.ego[shown],
         min(max(traffic.on_route - start, 0), frames),
         replace(traffic.signals, offset=traffic.signals.offset + start / rate_hz),
+        min(max(traffic.on_roads - start, 0), frames),
     )
 
 

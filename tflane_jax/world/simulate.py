@@ -311,7 +311,7 @@ def _traffic(
     traffic = simulate_traffic(stream, network, amounts, frames=config.frames + longer, rate_hz=config.rate_hz)
     if not longer:
         return traffic
-    return excerpt(cut, network.map, traffic, frames=config.frames, history=history, rate_hz=config.rate_hz)
+    return excerpt(cut, network.traffic_lanes, traffic, frames=config.frames, history=history, rate_hz=config.rate_hz)
 
 
 def _spaced(xy: Float[np.ndarray, "n 2"], config: WorldConfig) -> Int[np.ndarray, " k"]:

@@ -28,30 +28,32 @@ def drive(frames: int, positions: np.ndarray, on_route: int = 10_000) -> Traffic
     xy = np.arange(frames * 4, dtype=float).reshape(frames, 2, 2)
     signals = Signals(np.array([[9.0, 12.0]]), np.array([2.0]))
     ego = np.pad(positions, ((0, 0), (0, 1)))
-    return Traffic(xy, xy[..., 0], present, np.arange(6.0).reshape(2, 3), np.array([0, 5]), ego, on_route, signals)
+    return Traffic(
+        xy, xy[..., 0], present, np.arange(6.0).reshape(2, 3), np.array([0, 5]), ego, on_route, signals, frames
+    )
 
 
 @pytest.fixture(scope="module")
 def roads():
-    return build_road_network(np.random.default_rng(3), FOUR_WAY).map
+    return build_road_network(np.random.default_rng(3), FOUR_WAY).traffic_lanes
 
 
 def through(roads, frames: int, first: int, last: int) -> np.ndarray:
     """Positions far away, but on a connector from frame `first` to `last`."""
-    lane = next(s for s in roads.segments.values() if s.is_intersection)
+    lane = next(s for s in roads.values() if s.is_intersection)
     xy = np.full((frames, 2), 1e4)
     xy[first : last + 1] = lane.centerline[len(lane.centerline) // 2, :2]
     return xy
 
 
 def test_places_on_connectors(roads):
-    lanes = list(roads.segments.values())
+    lanes = list(roads.values())
     middles = np.stack([s.centerline[len(s.centerline) // 2, :2] for s in lanes])
     found = on_connector(roads, middles)
     assert found[[s.is_intersection for s in lanes]].mean() > 0.9  # connectors of bicycles and vehicles may cross
     assert not found[[not s.is_intersection for s in lanes]].any()
     assert on_connector(roads, np.zeros((0, 2))).shape == (0,)
-    assert not on_connector(replace(roads, segments={}), middles).any()
+    assert not on_connector({}, middles).any()
 
 
 def test_an_excerpt_is_frames_in_a_row_and_lights_keep_their_time(roads):
@@ -98,11 +100,19 @@ def test_a_longer_drive_is_seen_inside_junctions_more_often():
     )
     shares = []
     for logs in (usual, longer):
-        places = [(log.map, np.stack([k.global_from_ego[:2, 3] for k in log.keyframes])) for log in logs]
+        places = [(log.map.segments, np.stack([k.global_from_ego[:2, 3] for k in log.keyframes])) for log in logs]
         shares.append(np.mean([on_connector(*place).mean() for place in places]))
         assert {len(log.timestamps_ns) for log in logs} == {LONGER.frames}
         assert {log.keyframes[0].track_frame for log in logs} == {HISTORY}
     assert shares[1] > shares[0] + 0.1
+
+
+@pytest.mark.parametrize("scene", [1, 9, 33])
+def test_an_excerpt_shows_a_junction_and_no_border_of_the_roads(scene):
+    """The map of these scenes has access roads near the end of the drive."""
+    log = simulate(scene, LONGER, HISTORY)
+    middle = np.stack([moment.global_from_ego[:2, 3] for moment in log.keyframes])
+    assert np.hypot(*middle.T).max() < LONGER.roads.reach - 56.0
 
 
 def test_an_excerpt_is_a_scene_like_any_other():

@@ -239,6 +239,15 @@ def test_key_frames_see_complete_map_and_enough_history():
         assert log.name == f"crossroads-{seed:09d}"
 
 
+def test_no_key_frame_follows_the_end_of_the_route():
+    longer = replace(SHORT, duration_s=60.0, traffic=replace(SHORT.traffic, vehicles_per_metre=0.0))
+    for seed in range(4):
+        log = simulate(seed, longer, 20, Place(MAP, SEES))
+        xy = log.global_from_ego[:, :2, 3]
+        assert np.hypot(*np.diff(xy, axis=0).T).max() < 2.0
+        assert all(np.hypot(*(xy[moment.track_frame] - xy[-1])) > 0.0 for moment in log.keyframes)
+
+
 def test_vehicles_stay_on_lanes_and_do_not_collide():
     lanes = lane_points(MAP.map.segments.values())
     moving = 0

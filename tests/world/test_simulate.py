@@ -9,7 +9,7 @@ from tests.world.perfect_tracker import PERFECT
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import pose_yaw, transform_points
 from tflane_jax.scene import RoadUser
-from tflane_jax.world.roads.networks import build_road_network
+from tflane_jax.world.roads.networks import RoadConfig, build_road_network
 from tflane_jax.world.simulate import ROOT, Stream, WorldConfig, simulate
 from tflane_jax.world.traffic.simulation import TrafficConfig, simulate_traffic
 from tflane_jax.world.traffic.tracker import TrackerConfig
@@ -17,6 +17,7 @@ from tflane_jax.world.traffic.tracker import TrackerConfig
 EMPTY = TrafficConfig(
     vehicles_per_metre=0.0, bicycles_per_metre=0.0, parked_share=0.0, pedestrians_per_metre=0.0, crossers_per_minute=0.0
 )
+SMALL = WorldConfig(roads=RoadConfig(reach=100.0, ego_reach=50.0), traffic=EMPTY)
 
 
 def test_same_number_same_bits():
@@ -130,11 +131,24 @@ def test_lights_show_the_state_at_the_start():
         (WorldConfig(duration_s=2.0), "raise duration_s"),
         (WorldConfig(duration_s=2.3), "raise duration_s"),
         (WorldConfig(severity=1.5), "severity"),
+        (replace(SMALL, duration_s=60.0, keyframes=25, rate_hz=2.0), "Raise roads.reach and roads.ego_reach"),
     ],
 )
 def test_errors_name_the_remedy(config, message):
     with pytest.raises(UserError, match=message):
         simulate(0, config)
+
+
+@pytest.mark.parametrize("scene", [1, 2, 3])
+def test_a_drive_that_is_longer_than_its_roads_ends_with_them(scene):
+    log = simulate(scene, replace(WorldConfig(), duration_s=20.0), history=100)
+    place = log.global_from_ego[:, :2, 3]
+    step = np.hypot(*np.diff(place, axis=0).T)
+    assert step.max() < 1.5  # 14 m/s: it never jumps
+    assert step[-1] == 0.0  # it is at the end
+    moments = np.array([moment.track_frame for moment in log.keyframes])
+    assert (np.diff([99, *moments]) > 0).all()
+    assert (np.hypot(*(place[moments] - place[-1]).T) > 0.0).all()
 
 
 def test_other_rates_and_a_single_key_frame():

@@ -193,6 +193,16 @@ def test_no_traffic_leaves_the_ego_vehicle_alone():
     assert (np.diff(traffic.ego[:, 0]) > 0.0).all()
 
 
+def test_steps_are_short_whatever_the_rate_of_frames():
+    network, _ = scene("crossroads yield")
+    seldom, often = (
+        simulate_traffic(np.random.default_rng([7]), network, BUSY, frames=frames, rate_hz=rate)
+        for frames, rate in ((8, 0.5), (71, 5.0))
+    )
+    np.testing.assert_allclose(seldom.ego, often.ego[::10], atol=1e-9)
+    assert np.hypot(*np.diff(seldom.ego[:, :2], axis=0).T).max() > 3.0
+
+
 @pytest.mark.parametrize("frames", [0, 1, 2])
 def test_very_short_recordings(frames):
     traffic = simulate_traffic(

@@ -6,13 +6,14 @@ happens in them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from tflane_jax.scene.logs import VectorMap
+from tflane_jax.scene.logs import LaneSegment
 from tflane_jax.world.traffic.simulation import Traffic
 
 # When the vehicle is on a connector, as a fraction of the time from the first key frame to the end of the scene: it
@@ -23,7 +24,7 @@ _NEAR = 3.0
 
 
 def excerpt(
-    rng: np.random.Generator, roads: VectorMap, traffic: Traffic, *, frames: int, history: int, rate_hz: float
+    rng: np.random.Generator, lanes: Mapping[int, LaneSegment], traffic: Traffic, *, frames: int, history: int, rate_hz: float
 ) -> Traffic:
     """Return consecutive frames of a drive, while the vehicle is on its route.
 
@@ -32,13 +33,13 @@ def excerpt(
 
     Args:
         rng: stream.
-        roads: the map.
+        lanes: that vehicles drive; a map may have connectors at access roads, too, up to the border of the roads.
         traffic: the whole drive, of at least `frames` frames.
         frames, history: wanted, and those of them that come before the first key frame.
         rate_hz: frames a second.
     """
     spare = max(min(len(traffic.ego), traffic.on_route) - frames, 0)
-    crossing = np.flatnonzero(on_connector(roads, traffic.ego[: spare + frames, :2]))
+    crossing = np.flatnonzero(on_connector(lanes, traffic.ego[: spare + frames, :2]))
     crossing = crossing[crossing >= history]
     start = 0
     if len(crossing):
@@ -55,15 +56,16 @@ def excerpt(
         traffic.ego[shown],
         min(max(traffic.on_route - start, 0), frames),
         replace(traffic.signals, offset=traffic.signals.offset + start / rate_hz),
+        min(max(traffic.on_roads - start, 0), frames),
     )
 
 
-def on_connector(roads: VectorMap, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Return at which places, in metres, the nearest lane of a map is one inside an intersection."""
-    lanes = list(roads.segments.values())
+def on_connector(lanes: Mapping[int, LaneSegment], xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Return at which places, in metres, the nearest lane is one inside an intersection."""
     if not lanes or not len(xy):
         return np.zeros(len(xy), bool)
-    vertices = np.concatenate([lane.centerline[:, :2] for lane in lanes])
-    inside = np.repeat([lane.is_intersection for lane in lanes], [len(lane.centerline) for lane in lanes])
+    vertices = np.concatenate([lane.centerline[:, :2] for lane in lanes.values()])
+    sizes = [len(lane.centerline) for lane in lanes.values()]
+    inside = np.repeat([lane.is_intersection for lane in lanes.values()], sizes)
     distance, nearest = KDTree(vertices).query(xy)
     return inside[nearest] & (distance < _NEAR)

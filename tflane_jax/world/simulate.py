@@ -36,7 +36,7 @@ from tflane_jax.world.warp import Warp, WarpConfig, warped, warped_map
 ROOT = 20_250_711
 # Frames that a scene has before its first key frame, unless its examples look back farther.
 HISTORY = 20
-# Drives that are tried on a recorded map, and frames that it must offer for each key frame.
+# Drives that are tried for a scene, and frames that one must offer for each key frame.
 _DRIVES, _LEAST_STEP = 40, 4
 # Where key frames are spaced by distance, a vehicle that stands counts as moving so far in each frame, metres.
 _CREEP = 0.01
@@ -138,8 +138,9 @@ def simulate(
 ) -> Log:
     """Return the scene with this number (not negative).
 
-    On a recorded map, key frames are spread over the frames in which the map is complete around the ego vehicle. Where
-    it has left-hand traffic, the scene is simulated on its mirror image and mirrored back.
+    Key frames are spread over the frames before the ego vehicle comes to the end of the roads. On a recorded map, it is
+    those in which the map is complete around it; where it has left-hand traffic, the scene is simulated on its mirror
+    image and mirrored back.
 
     Args:
         scene_id: its number.
@@ -147,7 +148,8 @@ def simulate(
         history: frames before the first key frame.
         place: a recorded map; None generates roads.
 
-    Raises UserError if the scene is too short for its key frames or the severity is not between 0 and 1.
+    Raises UserError if the scene is too short for its key frames, if its drive comes to the end of the roads too soon,
+    or if the severity is not between 0 and 1.
     """
     frames = config.frames
     if not 0.0 <= config.severity <= 1.0:
@@ -166,10 +168,7 @@ def simulate(
     density = 0.8 + 0.4 * config.severity
     amounts = replace(config.traffic, vehicles_per_metre=density * config.traffic.vehicles_per_metre)
     if place is None:
-        network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
-        stream, cut = (_stream(scene_id, one) for one in (Stream.TRAFFIC, Stream.EXCERPT))
-        traffic = _traffic(stream, cut, network, amounts, config, history)
-        eligible = np.arange(history, frames)
+        network, traffic, eligible = _drive(scene_id, config, amounts, history)
     else:
         network, traffic, eligible = _drive_on(place, scene_id, config, amounts, history)
     moments = eligible[_spaced(traffic.ego[eligible, :2], config)]
@@ -229,6 +228,42 @@ def _driven_on_right(road_map: RoadMap) -> tuple[RoadMap, bool]:
     return (mirrored_road_map(road_map), True) if drives_on_left(road_map.map) else (road_map, False)
 
 
+def _drive(
+    scene_id: int, config: WorldConfig, amounts: TrafficConfig, history: int
+) -> tuple[RoadNetwork, Traffic, Int[np.ndarray, " k"]]:
+    """Return the roads and the traffic of a scene on generated roads, and the frames that may become key frames.
+
+    Of a drive that comes to the end of the roads, these are the frames on its route, beyond which an example may see
+    the border of the map; all frames before the end if those are too few; and if these are too few, it is drawn again.
+
+    Raises UserError if no drive is long enough.
+    """
+    network = build_road_network(_stream(scene_id, Stream.ROADS), config.roads)
+    for attempt in range(_DRIVES):
+        traffic = _traffic(*_attempt(scene_id, attempt), network, amounts, config, history)
+        on_roads, on_route = (np.arange(history, end) for end in (traffic.on_roads, traffic.on_route))
+        if traffic.on_roads < config.frames and len(on_route) >= _needed(config, history):
+            return network, traffic, on_route
+        if len(on_roads) >= _needed(config, history):
+            return network, traffic, on_roads
+    raise UserError(
+        f"the roads of scene {scene_id} are too short: in {_DRIVES} drives, the vehicle was at their end before "
+        f"{config.keyframes} key frames with {history} frames of history. Raise roads.reach and roads.ego_reach, or "
+        "lower duration_s or traffic.ego_top_speed"
+    )
+
+
+def _needed(config: WorldConfig, history: int) -> int:
+    """Return how many frames a drive must offer for key frames."""
+    return min(config.keyframes * _LEAST_STEP, config.frames - history)
+
+
+def _attempt(scene_id: int, attempt: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Return the streams of a drive and of its excerpt; those of the first attempt are those of `_stream`."""
+    drive, cut = (np.random.default_rng([ROOT, scene_id, one, attempt]) for one in (Stream.TRAFFIC, Stream.EXCERPT))
+    return drive, cut
+
+
 def _drive_on(
     place: Place, scene_id: int, config: WorldConfig, amounts: TrafficConfig, history: int
 ) -> tuple[RoadNetwork, Traffic, Int[np.ndarray, " k"]]:
@@ -242,7 +277,7 @@ def _drive_on(
     if passes is None:
         passes = 0.5 * (history / config.rate_hz + config.duration_s + config.longer_s)
     amounts = replace(amounts, ego_passes_s=passes)
-    needed = min(config.keyframes * _LEAST_STEP, config.frames - history)
+    needed = _needed(config, history)
     for attempt in range(_DRIVES):
         network = build_map_network(
             np.random.default_rng([ROOT, scene_id, Stream.ROADS, attempt]),
@@ -251,12 +286,9 @@ def _drive_on(
             sees=place.sees,
             leads_s=passes + EGO_JOINS,
         )
-        stream, cut = (
-            np.random.default_rng([ROOT, scene_id, one, attempt]) for one in (Stream.TRAFFIC, Stream.EXCERPT)
-        )
-        traffic = _traffic(stream, cut, network, amounts, config, history)
+        traffic = _traffic(*_attempt(scene_id, attempt), network, amounts, config, history)
         assert network.drive is not None
-        complete = history + np.flatnonzero(network.drive.covers(traffic.ego[history:, :2]))
+        complete = history + np.flatnonzero(network.drive.covers(traffic.ego[history : traffic.on_roads, :2]))
         if len(complete) >= needed:
             return network, traffic, complete
     raise UserError(
@@ -279,7 +311,7 @@ def _traffic(
     traffic = simulate_traffic(stream, network, amounts, frames=config.frames + longer, rate_hz=config.rate_hz)
     if not longer:
         return traffic
-    return excerpt(cut, network.map, traffic, frames=config.frames, history=history, rate_hz=config.rate_hz)
+    return excerpt(cut, network.traffic_lanes, traffic, frames=config.frames, history=history, rate_hz=config.rate_hz)
 
 
 def _spaced(xy: Float[np.ndarray, "n 2"], config: WorldConfig) -> Int[np.ndarray, " k"]:

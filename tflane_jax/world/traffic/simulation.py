@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tflane_jax.limits import SOME_WEIGHT, Fraction, Positive, PositiveOrZero
+from tflane_jax.limits import SOME_WEIGHT, Fraction, Positive, PositiveOrZero, above_at_most
 from tflane_jax.scene import RoadUser
 from tflane_jax.world.roads.networks import RoadNetwork
 from tflane_jax.world.traffic.demand import Trips, draw_trips
@@ -47,7 +48,8 @@ class TrafficConfig:
         warm_up_s: time for which traffic settles before the log begins, seconds: at least 3.2, when the ego vehicle
             joins.
         early_s: time before the warm-up from which vehicles are on their way, seconds: a slow drive through the map.
-        step_s: largest time step, seconds; frames within a step assume constant acceleration.
+        step_s: largest time step, seconds; frames within a step assume constant acceleration. Drivers who decide less
+            often than once a second run into each other.
     """
 
     vehicles_per_metre: PositiveOrZero = 0.032
@@ -68,7 +70,7 @@ class TrafficConfig:
     range: Positive = 90.0
     warm_up_s: PositiveOrZero = 20.0
     early_s: PositiveOrZero = 40.0
-    step_s: Positive = 0.2
+    step_s: Annotated[float, above_at_most(0, 1)] = 0.2
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class Traffic:
         ego: (F, 3) x, y, yaw of the ego vehicle, which is not among the N.
         on_route: number of frames until the ego vehicle comes to the end of its route.
         signals: traffic lights; t = 0 is the first frame.
+        on_roads: number of frames until the ego vehicle comes to the end of the roads, where it then stays.
     """
 
     xy: Float[np.ndarray, "f n 2"]
@@ -94,6 +97,7 @@ class Traffic:
     ego: Float[np.ndarray, "f 3"]
     on_route: int
     signals: Signals
+    on_roads: int
 
 
 def simulate_traffic(
@@ -131,23 +135,38 @@ def simulate_traffic(
     road.put_ego(_ego_starts(rng, road, stop + EGO_JOINS, config.ego_passes_s, None if drive is None else drive.aim))
     road.drive(-EGO_JOINS, _WARM_UP_STEP, round(EGO_JOINS / _WARM_UP_STEP), 1)
 
-    substeps = max(1, int(config.step_s * rate_hz + 1e-9))
-    position, progress = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
-    position = position[:frames]
+    position, progress = _driven_frames(road, frames, rate_hz, config.step_s)
     # Most trips end before the log begins or start after it ends; the ego vehicle's is the first.
     here = ((position >= 0.0) & (position <= road.trips.routes.length)).any(0)
     rows = np.flatnonzero(here | (np.arange(position.shape[1]) == 0))
     driven = _driven(road.trips.take(rows), road.table, position[:, rows])
     walking = [walk_sidewalks(rng, network.sidewalks, times, config.pedestrians_per_metre)]
-    walking.append(crossers.paths(progress[:frames]))
-    return _assemble(rng, network, config, driven, walking, _on_route(road, len(way), position[:, 0]), signals)
+    walking.append(crossers.paths(progress))
+    return _assemble(rng, network, config, driven, walking, _on_way(road, len(way), position[:, 0]), signals)
 
 
-def _on_route(road: Rollout, legs: int, position: Float[np.ndarray, " f"]) -> int:
-    """Return for how many frames the ego vehicle is on the first legs of its route; the rest leads to the border."""
-    start = road.trips.routes.start[0]
-    end = start[legs] if legs < len(start) and np.isfinite(start[legs]) else road.trips.routes.length[0]
-    return int(np.append(np.flatnonzero(position >= end), len(position))[0])
+def _driven_frames(
+    road: Rollout, frames: int, rate_hz: float, step_s: float
+) -> tuple[Float[np.ndarray, "f n"], Float[np.ndarray, "f p"]]:
+    """Return positions and the pedestrians' progress in every frame, with steps of at most `step_s` seconds."""
+    substeps = int(step_s * rate_hz + 1e-9)
+    if substeps:
+        found = road.drive(0.0, substeps / rate_hz, -(-frames // substeps), substeps)
+        return found[0][:frames], found[1][:frames]
+    steps = math.ceil(1.0 / (step_s * rate_hz) - 1e-9)
+    position, progress = road.drive(0.0, 1.0 / (steps * rate_hz), frames * steps, 1)
+    return position[::steps], progress[::steps]
+
+
+def _on_way(road: Rollout, legs: int, position: Float[np.ndarray, " f"]) -> tuple[int, int]:
+    """Return for how many frames the ego vehicle is on the first legs of its route, and for how many on all of it.
+
+    What follows the first legs leads to the border.
+    """
+    start, length = road.trips.routes.start[0], road.trips.routes.length[0]
+    end = start[legs] if legs < len(start) and np.isfinite(start[legs]) else length
+    on_legs, on_all = (int(np.append(np.flatnonzero(position >= x), len(position))[0]) for x in (end, length))
+    return on_legs, on_all
 
 
 def _varied(rng: np.random.Generator, config: TrafficConfig) -> TrafficConfig:
@@ -221,6 +240,8 @@ def _driven(trips: Trips, table: LaneTable, position: Float[np.ndarray, "f n"]) 
     routes, drivers = trips.routes, trips.drivers
     present = (position >= 0.0) & (position <= routes.length)
     at = np.where(present, position, 0.0)
+    # Others leave the scene at the end of their routes; the ego vehicle stays there.
+    at[:, 0] = np.clip(position[:, 0], 0.0, routes.length[0])
     wheelbase = 0.6 * drivers.size[:, 0]
     axles = at[..., None] + wheelbase[:, None] * np.array([-0.5, 0.5])
     segment, station = routes.place(axles.transpose(1, 0, 2))
@@ -240,7 +261,7 @@ def _assemble(
     config: TrafficConfig,
     driven: _Driven,
     walking: list[Walkers],
-    on_route: int,
+    on_way: tuple[int, int],
     signals: Signals,
 ) -> Traffic:
     """Join vehicles, parked vehicles and pedestrians; drop those that never come near the ego vehicle."""
@@ -266,4 +287,6 @@ def _assemble(
     present = present & (np.hypot(*(xy - ego[:, None, :2]).transpose(2, 0, 1)) < config.range)
     present[:, 0] = False
     seen = present.any(0)
-    return Traffic(xy[:, seen], yaw[:, seen], present[:, seen], size[seen], category[seen], ego, on_route, signals)
+    on_route, on_roads = on_way
+    moving = xy[:, seen], yaw[:, seen], present[:, seen]
+    return Traffic(*moving, size[seen], category[seen], ego, on_route, signals, on_roads)

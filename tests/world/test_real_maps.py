@@ -172,6 +172,12 @@ def test_cars_park_where_there_is_room_and_where_they_were_seen():
     assert len(parking_places(lanes, [kerb + np.array([0.0, 1.5])], [], seen[:0])) == 0
 
 
+def test_a_place_where_two_vehicles_were_seen_one_after_the_other_holds_one():
+    lanes = lane_map(segment(1, [(0, 0), (50, 0), (100, 0)])).segments
+    seen = np.array([[30.0, 8.0, 1.0], [30.1, 8.0, 1.0 + np.pi], [33.0, 8.0, 1.0]])
+    np.testing.assert_array_equal(parking_places(lanes, [], [], seen), seen[[0, 2]])
+
+
 def test_each_road_is_one_line_that_ends_in_the_middle_of_the_crossroads():
     segments = crossroads(split=0.4).map.segments
     lanes = traffic_lanes(segments)

@@ -34,6 +34,8 @@ _LEAST_ROOM, _MOST_ROOM, _TO_KERB = 2.1, 4.5, 1.2
 _CLEAR_BEFORE, _CLEAR_AFTER, _CLEAR_OF_CROSSING, _CLEAR_OF_LANE = 12.0, 7.0, 7.0, 2.6
 # Recorded parked vehicles stand nearer to centerlines: a lane may include the strip on which they park.
 _PARKED_OFF_LANE = 1.6
+# Two of them nearer than this to each other were never there at one time, metres: no vehicle is narrower.
+_ONE_PLACE = 1.7
 _SLOT = 6.5
 
 
@@ -148,6 +150,7 @@ def parking_places(
 
     lanes = KDTree(lane_points(segments.values()))
     parked = parked[lanes.query(parked[:, :2])[0] > _PARKED_OFF_LANE]
+    parked = parked[_first_of_each(parked[:, :2], _ONE_PLACE)]
     slots = [np.zeros((0, 3))]
     if kerbs:
         tree = KDTree(np.concatenate(kerbs))
@@ -159,7 +162,7 @@ def parking_places(
     found = found[np.linalg.norm(found[:, None, :2] - rings, axis=-1).min(1) > _CLEAR_OF_CROSSING]
     if len(parked):
         found = found[KDTree(parked[:, :2]).query(found[:, :2])[0] > _SLOT]
-    return np.concatenate([parked, found[_first_of_each(found[:, :2])]])
+    return np.concatenate([parked, found[_first_of_each(found[:, :2], 0.95 * _SLOT)]])
 
 
 def _slots(segment: LaneSegment, side: str, kerbs: KDTree) -> Float[np.ndarray, "p 3"]:
@@ -177,9 +180,9 @@ def _slots(segment: LaneSegment, side: str, kerbs: KDTree) -> Float[np.ndarray, 
     return np.column_stack([xy, np.arctan2(ahead[:, 1], ahead[:, 0])])[fits]
 
 
-def _first_of_each(xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Return which slots to keep where two lanes offer the same one."""
-    near = np.linalg.norm(xy[:, None] - xy, axis=-1) < 0.95 * _SLOT
+def _first_of_each(xy: Float[np.ndarray, "n 2"], apart: float) -> Bool[np.ndarray, " n"]:
+    """Return which places to keep: of those nearer than `apart` metres to each other, the first."""
+    near = np.linalg.norm(xy[:, None] - xy, axis=-1) < apart
     keep = np.ones(len(xy), bool)
     for i in range(len(xy)):
         keep[i] = not (near[i, :i] & keep[:i]).any()

@@ -24,7 +24,13 @@ _NEAR = 3.0
 
 
 def excerpt(
-    rng: np.random.Generator, lanes: Mapping[int, LaneSegment], traffic: Traffic, *, frames: int, history: int, rate_hz: float
+    rng: np.random.Generator,
+    lanes: Mapping[int, LaneSegment],
+    traffic: Traffic,
+    *,
+    frames: int,
+    history: int,
+    rate_hz: float,
 ) -> Traffic:
     """Return consecutive frames of a drive, while the vehicle is on its route.
 

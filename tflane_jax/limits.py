@@ -97,6 +97,7 @@ ASCENDING = Limit("in ascending order", lambda pair: list(pair) == sorted(pair))
 INCREASING = Limit("each above the one before", lambda items: all(a < b for a, b in itertools.pairwise(items)))
 DIFFERENT = Limit("all different", lambda items: len(set(items)) == len(items))
 NOT_EMPTY = Limit("at least one of them", lambda items: len(items) > 0)
+SOME_SHARE = Limit("not all 0", lambda items: sum(items) > 0)
 SOME_WEIGHT = Limit("with a weight above 0", lambda pairs: sum(weight for _, weight in pairs) > 0)
 
 Count = Annotated[int, at_least(1)]
@@ -114,6 +115,11 @@ Interval = Annotated[tuple[float, float], INCREASING]
 """(low, high) with something between."""
 Range = Annotated[tuple[PositiveOrZero, PositiveOrZero], ASCENDING]
 """(low, high) of a quantity that is not negative, from which a value is drawn; both may be equal."""
+
+PositiveRange = Annotated[tuple[Positive, Positive], ASCENDING]
+"""(low, high) of a quantity that is never 0."""
+Shares = Annotated[tuple[PositiveOrZero, PositiveOrZero, PositiveOrZero, PositiveOrZero], SOME_SHARE]
+"""Relative frequencies of four kinds."""
 
 
 def splits(setting: str, parts: int, name: str, whole: int) -> tuple[str, bool, str]:

@@ -10,14 +10,14 @@ import enum
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import yaw_pose
-from tflane_jax.limits import Count, Fraction, Positive, PositiveOrZero
+from tflane_jax.limits import Count, Fraction, Positive, PositiveOrZero, within
 from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
 from tflane_jax.world.cameras.marker_sites import visible_places
 from tflane_jax.world.excerpt import excerpt
@@ -94,7 +94,7 @@ class WorldConfig:
     terrain: TerrainConfig | None = None
     mirrored: Fraction = 0.0
     warp: WarpConfig | None = None
-    view_turn: PositiveOrZero = 0.0
+    view_turn: Annotated[float, within(0, 180)] = 0.0
     view_turned: Fraction = 1.0
 
     @property

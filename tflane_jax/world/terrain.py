@@ -8,15 +8,19 @@ and from the evidence sensor.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, transform_points
+from tflane_jax.limits import ASCENDING, Count, at_least, within
 from tflane_jax.scene.logs import KeyFrame, Log, Relief, Tracks
 from tflane_jax.scene.terrain import Terrain
 from tflane_jax.world.moving import moved_boxes, moved_map, with_vertices
+
+_Hill = Annotated[float, at_least(50)]
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,9 @@ class TerrainConfig:
         waves: how many waves are added up.
     """
 
-    grade: float = 0.05
-    wavelength: tuple[float, float] = (150.0, 400.0)
-    waves: int = 6
+    grade: Annotated[float, within(0, 0.2)] = 0.05
+    wavelength: Annotated[tuple[_Hill, _Hill], ASCENDING] = (150.0, 400.0)
+    waves: Count = 6
 
     def draw(self, rng: np.random.Generator) -> Terrain:
         """Return random ground; raises UserError for settings that give none."""

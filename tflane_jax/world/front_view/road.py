@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tflane_jax.world.roads.config import Range
+from tflane_jax.limits import Fraction, PositiveOrZero, PositiveRange, Range, Shares
 from tflane_jax.world.roads.cross_sections import ExtraLane, Place
 from tflane_jax.world.roads.curves import ReferenceLine, clothoid_line
 
@@ -56,16 +56,16 @@ class HighwayConfig:
         opposite: distance between the edge lines of the two carriageways.
     """
 
-    lanes: tuple[float, float, float, float] = (0.16, 0.32, 0.32, 0.2)
-    lane_width: Range = (3.3, 3.8)
-    between: float = 0.35
-    straight: float = 0.35
-    radius: Range = (260.0, 4000.0)
-    curvature_change: float = 1.0 / 900.0
-    sway: float = 0.22
-    lane_change: float = 0.06
-    two_way: float = 0.12
-    extra_lane: float = 0.1
+    lanes: Shares = (0.16, 0.32, 0.32, 0.2)
+    lane_width: PositiveRange = (3.3, 3.8)
+    between: Fraction = 0.35
+    straight: Fraction = 0.35
+    radius: PositiveRange = (260.0, 4000.0)
+    curvature_change: PositiveOrZero = 1.0 / 900.0
+    sway: PositiveOrZero = 0.22
+    lane_change: Fraction = 0.06
+    two_way: Fraction = 0.12
+    extra_lane: Fraction = 0.1
     inner_shoulder: Range = (0.5, 3.2)
     outer_shoulder: Range = (0.6, 3.4)
     opposite: Range = (3.0, 22.0)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from tflane_jax.limits import Fraction, Range, Shares
 from tflane_jax.scene import RoadUser
 from tflane_jax.world.front_view.road import Highway
-from tflane_jax.world.roads.config import Range
 from tflane_jax.world.traffic.vehicles import draw_drivers
 
 _CATEGORIES = (RoadUser.CAR, RoadUser.TRUCK, RoadUser.BUS, RoadUser.MOTORCYCLE)
@@ -28,10 +28,10 @@ class FrontTrafficConfig:
         categories: relative frequencies of cars, trucks, buses and motorcycles.
     """
 
-    empty: float = 0.06
+    empty: Fraction = 0.06
     density: Range = (0.003, 0.03)
     clear_ahead: Range = (6.0, 50.0)
-    categories: tuple[float, float, float, float] = (0.8, 0.14, 0.03, 0.03)
+    categories: Shares = (0.8, 0.14, 0.03, 0.03)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from tflane_jax.errors import UserError
+from tflane_jax.limits import Fraction, Positive
 from tflane_jax.scene import LaneLines, RoadImage
 from tflane_jax.world.front_view.ground import look_at_ground
 from tflane_jax.world.front_view.lines import label_lines
@@ -57,8 +58,8 @@ class FrontWorldConfig:
     road: HighwayConfig = HighwayConfig()
     traffic: FrontTrafficConfig = FrontTrafficConfig()
     weather: FrontWeatherConfig = FrontWeatherConfig()
-    severity: float = 0.5
-    reach: float = 90.0
+    severity: Fraction = 0.5
+    reach: Positive = 90.0
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from tflane_jax.geometry.cameras import ground_points
 from tflane_jax.geometry.poses import invert_pose
-from tflane_jax.world.roads.config import Range
+from tflane_jax.limits import PositiveOrZero, PositiveRange, Range, at_least
 
 # Image size to which focal lengths and rows refer: TuSimple's, pixels.
 REFERENCE_WIDTH, REFERENCE_HEIGHT = 1280, 720
@@ -35,14 +36,14 @@ class FrontCameraConfig:
         centre: largest shift of the principal point at 1280 pixels of width, pixels.
     """
 
-    width: int = 640
-    height: int = 360
-    focal: Range = (900.0, 1100.0)
-    above_ground: Range = (1.45, 1.75)
+    width: Annotated[int, at_least(16)] = 640
+    height: Annotated[int, at_least(16)] = 360
+    focal: PositiveRange = (900.0, 1100.0)
+    above_ground: PositiveRange = (1.45, 1.75)
     pitch: Range = (4.6, 7.6)
-    yaw: float = 3.0
-    roll: float = 1.0
-    centre: float = 12.0
+    yaw: PositiveOrZero = 3.0
+    roll: PositiveOrZero = 1.0
+    centre: PositiveOrZero = 12.0
 
 
 @dataclass(frozen=True)

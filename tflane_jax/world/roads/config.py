@@ -6,13 +6,27 @@ import enum
 from dataclasses import dataclass
 from typing import Annotated
 
-from tflane_jax.limits import ASCENDING, SOME_WEIGHT, Count, Fraction, Positive, PositiveOrZero, Range, Rules
+from tflane_jax.limits import (
+    ASCENDING,
+    SOME_WEIGHT,
+    Count,
+    Fraction,
+    Positive,
+    PositiveOrZero,
+    PositiveRange,
+    Range,
+    Rules,
+    above_at_most,
+    at_least,
+)
 from tflane_jax.scene import LineType
 
 CLOSEST_JUNCTIONS = 60.0
 """Two four-way intersections take up nearly this much of the street between them, metres."""
-
-
+LEAST_DEPTH = 6.0
+"""A vehicle that is parked in a driveway of this depth does not reach the kerb, metres."""
+Bends = Annotated[tuple[Annotated[float, at_least(20)], Annotated[float, at_least(20)]], ASCENDING]
+"""Radii of streets; the inner edge of a street would fold on tighter ones."""
 Markings = Annotated[tuple[tuple[LineType, PositiveOrZero], ...], SOME_WEIGHT]
 """Markings of lines with their relative frequencies."""
 
@@ -115,30 +129,30 @@ class RoadConfig:
     )
     reach: Positive = 130.0
     ego_reach: Positive = 70.0
-    vertex_spacing: Positive = 1.6
-    lane_width: Range = (2.9, 3.8)
-    single_lane_width: Range | None = None
-    ring_lane_width: Range = (4.2, 5.2)
+    vertex_spacing: Annotated[float, above_at_most(0, 5)] = 1.6
+    lane_width: PositiveRange = (2.9, 3.8)
+    single_lane_width: PositiveRange | None = None
+    ring_lane_width: PositiveRange = (4.2, 5.2)
     bike_width: Range = (1.5, 1.9)
     parking_width: Range = (2.2, 2.5)
     gutter: Range = (0.25, 0.6)
     wide_median: Range = (5.0, 6.5)
     narrow_median: Range = (1.6, 2.6)
-    urban_speed: Range = (8.3, 14.0)
-    fast_speed: Range = (16.0, 25.0)
-    ramp_speed: Range = (11.0, 16.0)
+    urban_speed: PositiveRange = (8.3, 14.0)
+    fast_speed: PositiveRange = (16.0, 25.0)
+    ramp_speed: PositiveRange = (11.0, 16.0)
     comfortable_lateral_acceleration: Positive = 2.2
-    bend_radius: Range = (45.0, 200.0)
-    fast_bend_radius: Range = (180.0, 600.0)
-    corner_radius: Range = (4.5, 9.0)
+    bend_radius: Bends = (45.0, 200.0)
+    fast_bend_radius: Bends = (180.0, 600.0)
+    corner_radius: PositiveRange = (4.5, 9.0)
     crossing_width: Range = (2.6, 4.2)
     inner_marking: Markings = ((LineType.SOLID, 1.0),)
     outer_marking: Markings = ((LineType.SOLID, 1.0),)
     divider_marking: Markings = ((LineType.DASHED, 1.0),)
     kerb_marking: Markings | None = None
     solid_before_stop: PositiveOrZero = 25.0
-    taper: Range = (18.0, 26.0)
-    fast_taper: Range = (30.0, 45.0)
+    taper: PositiveRange = (18.0, 26.0)
+    fast_taper: PositiveRange = (30.0, 45.0)
     pocket: Range = (38.0, 46.0)
     skew: PositiveOrZero = 25.0
     arm_offset: PositiveOrZero = 2.0
@@ -172,7 +186,7 @@ class RoadConfig:
     building_setback: Range = (4.0, 10.0)
 
     def limits(self) -> Rules:
-        """Junctions have room, and lanes a number."""
+        """Junctions have room, lanes a number, and what stands in a driveway is off the road."""
         least, most = self.least_junction_lanes, self.junction_lanes
         yield "least_junction_lanes", least <= most, f"at most junction_lanes ({most})"
         near = self.junction_distance[0]
@@ -181,3 +195,8 @@ class RoadConfig:
             near >= CLOSEST_JUNCTIONS,
             f"at least {CLOSEST_JUNCTIONS:g} m: intersections have room",
         )
+        yield "ego_reach", self.ego_reach <= self.reach, f"at most reach ({self.reach:g})"
+        widest = self.taper[1]
+        yield "pocket", self.pocket[0] >= widest, f"at least the longest taper ({widest:g} m), which is a part of it"
+        shallow = self.driveway_depth[0]
+        yield "driveway_depth", shallow >= LEAST_DEPTH, f"at least {LEAST_DEPTH:g} m: vehicles stand off the road"

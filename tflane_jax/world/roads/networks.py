@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.scene.logs import LaneSegment, VectorMap
 from tflane_jax.world.roads import roadside
 from tflane_jax.world.roads.access_roads import with_access_roads
@@ -104,7 +105,10 @@ class RoadNetwork:
 
 
 def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetwork:
-    """Draw a road network; the same stream and config give the same bits."""
+    """Draw a road network; the same stream and config give the same bits.
+
+    Raises UserError for settings that leave no room for streets or routes.
+    """
     kinds, weights = zip(*config.kinds, strict=True)
     kind = kinds[rng.choice(len(kinds), p=np.array(weights) / np.sum(weights))]
     network = LaneNetwork()
@@ -118,6 +122,9 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         site.driveways = draw_driveways(rng, site, _stop_lines(network), config)
     if config.car_parks and site.urban:
         site.car_parks = draw_car_parks(rng, site, config)
+    routes = network.routes(_SHORTEST_ROUTE)
+    if not routes:
+        raise UserError(f"roads: no route of {_SHORTEST_ROUTE:g} m ({kind.value}): raise ego_reach and reach")
     lanes = network.segments()
     mapped = _as_mapped(rng, lanes, site, config)
     density = rng.uniform(0.55, 0.95) if site.urban else rng.uniform(0.0, 0.3)
@@ -137,7 +144,7 @@ def build_road_network(rng: np.random.Generator, config: RoadConfig) -> RoadNetw
         sidewalks=tuple(roadside.sidewalks(site.kerbs, config.sidewalk)) if site.urban else (),
         walk_across=tuple(crossing_walk(ring, config.sidewalk) for ring in site.crossings),
         parking=np.concatenate([parking_beside(roadside.parking_slots(site), site.driveways), site.car_parks]),
-        ego_routes=network.routes(_SHORTEST_ROUTE),
+        ego_routes=routes,
         kind=kind,
         lanes=None if mapped is lanes else lanes,
     )

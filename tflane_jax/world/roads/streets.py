@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
+from tflane_jax.errors import UserError
 from tflane_jax.scene import LineType
 from tflane_jax.world.roads.cross_sections import SAME_STATION, ExtraLane, Place, SidePlan
 from tflane_jax.world.roads.curves import ReferenceLine, clothoid_line, grid_with
@@ -19,6 +20,8 @@ from tflane_jax.world.roads.lane_network import Draft, LaneEnd, LaneNetwork
 
 # Smallest distance between two cuts, metres: it avoids very short segments.
 _CLOSEST_CUTS = 6.0
+# No street is shorter, and its median has room for round noses, metres.
+_SHORTEST = 6.0
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,16 @@ def build_street(plan: StreetPlan, network: LaneNetwork, solid_before_stop: floa
         network: receives the segments.
         solid_before_stop: length of the solid divider before a stop line, metres.
         spacing: largest distance between vertices, metres.
+
+    Raises UserError if intersections leave no room for it.
     """
     length = plan.stop - plan.start
+    least = _SHORTEST + plan.forward.inner + plan.backward.inner
+    if length < least:
+        raise UserError(
+            f"roads: a street needs {least:.1f} m, and intersections leave {max(length, 0.0):.1f} m: raise reach or "
+            "junction_distance, or lower corner_radius, crossing_width, wide_median or side_lean"
+        )
     forward = plan.forward.over(length)
     backward = plan.backward.over(length)
     low, high = max(plan.ego[0] - plan.start, 0.0), min(plan.ego[1] - plan.start, length)

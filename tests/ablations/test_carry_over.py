@@ -74,6 +74,24 @@ def test_the_models_see_every_log_but_the_one_that_they_are_tested_on(folder):
     assert train.without == ("scene-1",)
 
 
+def test_folds_leave_out_several_logs_at_a_time(folder):
+    """Scenes 1 and 3 share a fold of two: one training for both, which is tested on each alone."""
+
+    def planned(**other):
+        wanted = settings(folder, **other)
+        return subject._planned(subject._logs(wanted), wanted, subject._configs(wanted), folder, {"cores": 1})
+
+    plan, alone = planned(folds=2), planned()
+    assert [len(alone.flat()), len(plan.flat())] == [5, 3]
+    assert {job.config.data.test_logs for job in plan.flat()} == {(), ("scene-1", "scene-3")}
+    (job,) = plan.of("mixed", "scene-1")
+    assert plan.of("mixed", "scene-3") == [job]
+    assert job.config.data.source("train").without == ("scene-1", "scene-3")
+    tested = subject._tested(job.config, "scene-3").data
+    assert tested.source("test").logs == ("scene-3",)
+    assert tested.source("train") == job.config.data.source("train")
+
+
 def test_tables_have_every_model_with_own_without_and_with_other_traffic(folder):
     written = json.loads((folder / "out" / "carry_over.json").read_text())
     assert [row["model"] for row in written["rows"]] == [
@@ -132,6 +150,9 @@ def test_the_same_command_trains_nothing_again(folder, monkeypatch, capsys):
         ({"logs": ("scene-1",), "steps": 8}, r"another declaration \(generated: training\.steps: 4 there, 8 here\)"),
         ({"logs": ("scene-1",), "scenes": 5}, r"another declaration \(generated: data\.train: 2000 there, 5 here\)"),
         ({"logs": ("scene-1", "scene-2")}, "log scene-2 was not declared"),
+        ({"logs": ("scene-1", "scene-3"), "folds": 2}, r"another declaration \(content of folds: .* 2 here\)"),
+        ({"folds": 1}, "--folds 1: .* has 3 logs, so 2 to 3 folds"),
+        ({"folds": 4}, "--folds 4: .* has 3 logs, so 2 to 3 folds"),
         ({"logs": ("scene-1", "scene-3"), "seeds": (0, 1)}, "seed 1 was not declared"),
     ],
 )

@@ -3,7 +3,8 @@
 Every model is trained on the built-in world: on generated roads (of the preset `real-like`; as controls, of `city`, and
 of `real-like` with right-hand traffic alone), on the maps of the other logs, or on both. It is tested on the key frames
 of the log that was left out, with that log's recorded tracks as traffic flow: as they are, without them, and with the
-tracks of another log. Models that see no map are trained once and tested on every log.
+tracks of another log. Models that see no map are trained once and tested on every log. With folds, several logs are
+left out of one training, which needs fewer of them.
 
 <out>/runs/KEY              the runs; the same command resumes what was stopped
 <out>/declaration.json      claims and primary measure, written before the trainings
@@ -87,6 +88,8 @@ class Settings:
         rows: of `ROWS`; empty for all.
         seeds: of training.
         steps, scenes: updates and training scenes of each run; None for those of the configurations.
+        folds: number of groups into which all logs of the folder are divided; a training leaves a whole group out. None
+            leaves each log out alone, which costs more trainings and leaves more maps in each.
         jobs: trainings at a time.
         cores: of each training; None shares all between the trainings.
         quick: few updates on few scenes: a smoke test, no result.
@@ -98,6 +101,7 @@ class Settings:
     seeds: tuple[int, ...] = (0,)
     steps: int | None = None
     scenes: int | None = None
+    folds: int | None = None
     jobs: int = 1
     cores: int | None = None
     quick: bool = False
@@ -106,6 +110,8 @@ class Settings:
 @dataclass
 class _Plan:
     """The trainings: by model, by the log that it leaves out ("" for none), one for each seed.
+
+    Logs of one fold share their trainings.
 
     Attributes:
         logs: that are left out and tested on.
@@ -121,6 +127,10 @@ class _Plan:
     def of(self, row: str, log: str) -> list[Job]:
         """Return the runs of a model that have not seen a log."""
         return self.jobs[row].get(log) or self.jobs[row][""]
+
+    def fold(self, log: str, folds: int | None) -> tuple[str, ...]:
+        """Return the logs that are left out with a log: every `folds`-th by name, whichever of them are tested."""
+        return (log,) if folds is None else self.every[self.every.index(log) % folds :: folds]
 
     def flat(self) -> list[Job]:
         """Return every run once, log by log, so that an experiment stopped early has whole logs."""
@@ -139,8 +149,9 @@ def carry_over(settings: Settings, out: Path) -> Path:
         The file of the main table.
 
     Raises:
-        UserError: fewer than two logs, an unknown log or row, another declaration in `out` (further logs or seeds,
-            other maps, steps, scenes or models), or trainings that failed, after the tables of the others were written.
+        UserError: fewer than two logs, an unknown log or row, a number of folds that the logs do not allow, another
+            declaration in `out` (further logs or seeds, other maps, steps, scenes, folds or models), or trainings that
+            failed, after the tables of the others were written.
     """
     out = out / "quick" if settings.quick else out
     configs = _configs(settings)
@@ -148,10 +159,11 @@ def carry_over(settings: Settings, out: Path) -> Path:
     declaration = Declaration(PRIMARY, claims)
     check(declaration, configs)
     folder = _logs(settings)
+    content = folder.content | ({} if settings.folds is None else {"folds": str(settings.folds)})
     plan = _planned(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
     by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
     check_rows(by_row)
-    declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=plan.content)
+    declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=content)
     complete = sum(job.is_complete() for job in plan.flat())
     seconds, guesses = remaining_seconds(by_row, dict.fromkeys(by_row, _MINUTES))
     basis = "a guess" if guesses else "by the runs so far"
@@ -208,6 +220,8 @@ def _logs(settings: Settings) -> _Plan:
     names = tuple(one.name for one in maps if one.recorded)
     if len(names) < 2:
         raise UserError(f"{settings.maps} has {len(names)} recorded logs: to leave one out, there must be two or more")
+    if settings.folds is not None and not 2 <= settings.folds <= len(names):
+        raise UserError(f"--folds {settings.folds}: {settings.maps} has {len(names)} logs, so 2 to {len(names)} folds")
     if unknown := set(settings.logs) - set(names):
         raise UserError(f"{settings.maps} has no recorded log {min(unknown)}, only {', '.join(names)}")
     return _Plan(tuple(sorted(settings.logs or names)), names, {one.name: one.content() for one in maps})
@@ -221,18 +235,23 @@ def _planned(
     content = hashlib.sha256(json.dumps(plan.content, sort_keys=True).encode()).hexdigest()
     for row, config in configs.items():
         data = _data(config)
-        logs = ("",) if data.generated == 1.0 else plan.logs
-        left = {log: replace(config, data=replace(data, test_logs=(log,) if log else ())) for log in logs}
-        labelled = {log: f"{row}, without {log[:12]}" if log else row for log in logs}
-        named = {labelled[log]: left[log] for log in logs}
+        left_out = {"": ()} if data.generated == 1.0 else {log: plan.fold(log, settings.folds) for log in plan.logs}
+        named = {_label(row, logs): replace(config, data=replace(data, test_logs=logs)) for logs in left_out.values()}
         jobs = stored_jobs(named, settings.seeds, store, threads=threads, content=content)
-        plan.jobs[row] = {log: jobs[labelled[log]] for log in logs}
+        plan.jobs[row] = {log: jobs[_label(row, logs)] for log, logs in left_out.items()}
     return plan
+
+
+def _label(row: str, left_out: Sequence[str]) -> str:
+    return f"{row}, without {', '.join(log[:12] for log in left_out)}" if left_out else row
 
 
 def _tested(config: RunConfig, log: str, traffic: str = "") -> RunConfig:
     """Return the configuration tested on a log, with the traffic of another one if it is named."""
-    return replace(config, data=replace(_data(config), test_logs=(log,), test_on="recordings", test_traffic=traffic))
+    data = _data(config)
+    fold = tuple(other for other in data.test_logs if other != log)  # no training maps either
+    data = replace(data, test_logs=(log,), without=fold, test_on="recordings", test_traffic=traffic)
+    return replace(config, data=data)
 
 
 def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, set[int]], str]:

@@ -165,7 +165,7 @@ def declare(
         seeds: of the comparison; fewer than were declared are an interim look.
         out: folder of the comparison.
         logs: recorded logs that it is about, fewer as for seeds.
-        content: hashes of files that the runs depend on beyond their configurations, by name.
+        content: what the runs depend on beyond their configurations, by name: hashes of files, the number of folds.
 
     Raises:
         UserError: the folder holds another declaration, or one of other models or configurations, or without some of

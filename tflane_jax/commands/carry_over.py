@@ -24,6 +24,7 @@ def run(options: argparse.Namespace) -> int:
         seeds=tuple(range(options.seeds)),
         steps=options.steps,
         scenes=options.scenes,
+        folds=options.folds,
         jobs=options.jobs,
         cores=options.cores,
         quick=options.quick,

@@ -155,6 +155,9 @@ def carry_over(commands) -> None:
     parser.add_argument("--seeds", metavar="N", type=int, default=1, help="number of seeds (default 1)")
     parser.add_argument("--steps", metavar="N", type=int, help="updates of each run (default: the configuration's)")
     parser.add_argument("--scenes", metavar="N", type=int, help="training scenes (default: the configuration's)")
+    parser.add_argument(
+        "--folds", metavar="N", type=int, help="leave the logs out in N groups (default: each log alone)"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="number of trainings at a time (default 1)")
     parser.add_argument(
         "--cores", metavar="N", type=int, help="cores of each training (default: all, shared between --jobs)"

@@ -16,6 +16,7 @@ from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.cli import main
 from tflane_jax.config import RealMapData, RunConfig, load_config
+from tflane_jax.datasets.real_maps import RealMapConfig
 from tflane_jax.errors import UserError
 from tflane_jax.world.presets import CITY, REAL_LIKE
 
@@ -83,13 +84,15 @@ def test_folds_leave_out_several_logs_at_a_time(folder):
 
     plan, alone = planned(folds=2), planned()
     assert [len(alone.flat()), len(plan.flat())] == [5, 3]
-    assert {job.config.data.test_logs for job in plan.flat()} == {(), ("scene-1", "scene-3")}
+    assert {subject._data(job.config).test_logs for job in plan.flat()} == {(), ("scene-1", "scene-3")}
     (job,) = plan.of("mixed", "scene-1")
     assert plan.of("mixed", "scene-3") == [job]
-    assert job.config.data.source("train").without == ("scene-1", "scene-3")
-    tested = subject._tested(job.config, "scene-3").data
-    assert tested.source("test").logs == ("scene-3",)
-    assert tested.source("train") == job.config.data.source("train")
+    training = subject._data(job.config).source("train")
+    assert isinstance(training, RealMapConfig)
+    assert training.without == ("scene-1", "scene-3")
+    tested = subject._data(subject._tested(job.config, "scene-3"))
+    assert tested.test_logs == ("scene-3",)
+    assert tested.source("train") == training
 
 
 def test_tables_have_every_model_with_own_without_and_with_other_traffic(folder):

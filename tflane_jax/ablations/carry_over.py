@@ -159,7 +159,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     declaration = Declaration(PRIMARY, claims)
     check(declaration, configs)
     folder = _logs(settings)
-    content = folder.content | ({} if settings.folds is None else {"folds": str(settings.folds)})
+    content = {**folder.content, **({} if settings.folds is None else {"folds": str(settings.folds)})}
     plan = _planned(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
     by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
     check_rows(by_row)

@@ -10,7 +10,9 @@ from tests.datasets.test_nuscenes_scenes import content
 from tests.test_cli import CONFIG as TINY
 from tests.test_cli import fakes  # noqa: F401 (a fixture that is used by itself)
 from tflane_jax.ablations import carry_over as subject
-from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, ROWS, Settings, carry_over
+from tflane_jax.ablations import carry_over_plan as plans
+from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, carry_over
+from tflane_jax.ablations.carry_over_plan import ROWS, Settings
 from tflane_jax.ablations.declaration import Declaration, check
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.recorded import Measured
@@ -54,7 +56,7 @@ def folder(tmp_path_factory):
     tiny.write_text(TINY + ON_MAPS)
     rows = {"generated": f"{tiny}:generated", "mixed": f"{tiny}:mixed", "mixed without traffic": f"{tiny}:plain"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(subject, "ROWS", rows)
+        patch.setattr(plans, "ROWS", rows)
         carry_over(settings(root), root / "out")
         yield root
 
@@ -80,17 +82,19 @@ def test_folds_leave_out_several_logs_at_a_time(folder):
 
     def planned(**other):
         wanted = settings(folder, **other)
-        return subject._planned(subject._logs(wanted), wanted, subject._configs(wanted), folder, {"cores": 1})
+        return plans.with_trainings(
+            plans.recorded_logs(wanted), wanted, plans.model_configs(wanted), folder, {"cores": 1}
+        )
 
     plan, alone = planned(folds=2), planned()
     assert [len(alone.flat()), len(plan.flat())] == [5, 3]
-    assert {subject._data(job.config).test_logs for job in plan.flat()} == {(), ("scene-1", "scene-3")}
+    assert {plans.map_data(job.config).test_logs for job in plan.flat()} == {(), ("scene-1", "scene-3")}
     (job,) = plan.of("mixed", "scene-1")
     assert plan.of("mixed", "scene-3") == [job]
-    training = subject._data(job.config).source("train")
+    training = plans.map_data(job.config).source("train")
     assert isinstance(training, RealMapConfig)
     assert training.without == ("scene-1", "scene-3")
-    tested = subject._data(subject._tested(job.config, "scene-3"))
+    tested = plans.map_data(plans.on_log(job.config, "scene-3"))
     assert tested.test_logs == ("scene-3",)
     assert tested.source("train") == training
 
@@ -169,11 +173,11 @@ def test_other_generated_roads_are_no_part_of_an_earlier_comparison(folder, monk
     wanted, out = settings(folder), folder / "out"
 
     def planned():
-        plan = subject._planned(subject._logs(wanted), wanted, subject._configs(wanted), out, {"cores": 1})
+        plan = plans.with_trainings(plans.recorded_logs(wanted), wanted, plans.model_configs(wanted), out, {"cores": 1})
         return {job.folder for job in plan.flat()}
 
     before = planned()
-    monkeypatch.setattr(subject, "ROWS", {**subject.ROWS, "generated": f"{folder / 'tiny.py'}:closer"})
+    monkeypatch.setattr(plans, "ROWS", {**plans.ROWS, "generated": f"{folder / 'tiny.py'}:closer"})
     assert len(before & planned()) == len(before) - 1  # all others are the same runs
     with pytest.raises(UserError, match=r"holds another declaration \(generated: data\.generated_world\."):
         carry_over(wanted, out)
@@ -210,9 +214,9 @@ def test_other_files_of_the_maps_are_other_runs(folder):
     try:
         with pytest.raises(UserError, match=r"another declaration \(content of scene-2: \w+ there, \w+ here\)"):
             carry_over(settings(folder), folder / "out")
-        configs = subject._configs(settings(folder))
-        plan = subject._planned(
-            subject._logs(settings(folder)), settings(folder), configs, folder / "out", {"cores": 1}
+        configs = plans.model_configs(settings(folder))
+        plan = plans.with_trainings(
+            plans.recorded_logs(settings(folder)), settings(folder), configs, folder / "out", {"cores": 1}
         )
         assert not any(job.exists() for job in plan.flat())
     finally:
@@ -256,7 +260,7 @@ def test_models_are_compared_on_the_seeds_that_all_of_them_have(tmp_path, monkey
         return Measured(4, "a protocol", {"": {PRIMARY: float(job.config.training.seeds[0])}}, {"": {}})
 
     monkeypatch.setattr(subject, "measure", measured)
-    plan = subject._Plan(("a", "b"), ("a", "b"), {}, {"mixed": jobs("mixed"), "maps": jobs("maps")})
+    plan = plans.Plan(("a", "b"), ("a", "b"), {}, {"mixed": jobs("mixed"), "maps": jobs("maps")})
     means, seeds, _ = subject._evaluated(plan, [Failure(plan.of("maps", "a")[2], "it diverged")])
     assert seeds == {"a": {0, 1}, "b": {0, 1}}
     assert {row: [means[row][log][PRIMARY] for log in "ab"] for row in means} == {

@@ -16,43 +16,27 @@ left out of one training, which needs fewer of them.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tflane_jax.ablations.carry_over_plan import Plan, Settings, model_configs, on_log, recorded_logs, with_trainings
 from tflane_jax.ablations.compare import draw_models, summary_of
 from tflane_jax.ablations.comparison import Scores, Variant, compact
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
 from tflane_jax.ablations.jobs import Failure, Job, check_rows
-from tflane_jax.ablations.paper.table import shortened
 from tflane_jax.ablations.scores import measure
 from tflane_jax.ablations.statistics import holm, paired_difference
-from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere, stored_jobs
+from tflane_jax.ablations.store import remaining_seconds, runs_elsewhere
 from tflane_jax.ablations.workers import noted, train_all, worker_threads
-from tflane_jax.config import RunConfig, load_config
-from tflane_jax.datasets.real_maps import RealMapData
-from tflane_jax.datasets.road_maps import find_maps
 from tflane_jax.errors import UserError
 from tflane_jax.plots.tables import format_table, save_table
 from tflane_jax.progress import progress_bar
 from tflane_jax.runs import open_run
 from tflane_jax.tasks import Model
 
-ROWS: Mapping[str, str] = {
-    "generated": "real_maps:generated",
-    "generated, right-hand traffic": "real_maps:generated_right_hand",
-    "generated on city": "real_maps:generated_city",
-    "maps": "real_maps",
-    "mixed": "real_maps:mixed",
-    "generated without traffic": "real_maps:generated_no_traffic",
-    "mixed without traffic": "real_maps:mixed_no_traffic",
-}
-"""Models by name: roads that they are trained on, and whether they see traffic flow."""
 NONE, OTHER = "no traffic flow at inference", "traffic of another log"
 PRIMARY = "all/recall"
 COLUMNS = ("all/recall", "all/DET_l", "all/TOP_ll", "occluded/recall")
@@ -78,70 +62,6 @@ ByLog = dict[str, dict[str, Scores]]
 """Scores by row and log, means over seeds; rows are models, or "model, intervention"."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is left out, trained and tested.
-
-    Attributes:
-        maps: folder of logs.
-        logs: names of those to leave out, one after the other; empty for all.
-        rows: of `ROWS`; empty for all.
-        seeds: of training.
-        steps, scenes: updates and training scenes of each run; None for those of the configurations.
-        folds: number of groups into which all logs of the folder are divided; a training leaves a whole group out. None
-            leaves each log out alone, which costs more trainings and leaves more maps in each.
-        jobs: trainings at a time.
-        cores: of each training; None shares all between the trainings.
-        quick: few updates on few scenes: a smoke test, no result.
-    """
-
-    maps: Path
-    logs: tuple[str, ...] = ()
-    rows: tuple[str, ...] = ()
-    seeds: tuple[int, ...] = (0,)
-    steps: int | None = None
-    scenes: int | None = None
-    folds: int | None = None
-    jobs: int = 1
-    cores: int | None = None
-    quick: bool = False
-
-
-@dataclass
-class _Plan:
-    """The trainings: by model, by the log that it leaves out ("" for none), one for each seed.
-
-    Logs of one fold share their trainings.
-
-    Attributes:
-        logs: that are left out and tested on.
-        every: all recorded logs.
-        content: hash of the files of each map in the folder, on which every run depends.
-    """
-
-    logs: tuple[str, ...]
-    every: tuple[str, ...]
-    content: Mapping[str, str]
-    jobs: dict[str, dict[str, list[Job]]] = field(default_factory=dict)
-
-    def of(self, row: str, log: str) -> list[Job]:
-        """Return the runs of a model that have not seen a log."""
-        return self.jobs[row].get(log) or self.jobs[row][""]
-
-    def fold(self, log: str, folds: int | None) -> tuple[str, ...]:
-        """Return the logs that are left out with a log: every `folds`-th by name, whichever of them are tested."""
-        return (log,) if folds is None else self.every[self.every.index(log) % folds :: folds]
-
-    def flat(self) -> list[Job]:
-        """Return every run once, log by log, so that an experiment stopped early has whole logs."""
-        order = [job for log in ("", *self.logs) for by_log in self.jobs.values() for job in by_log.get(log, ())]
-        return list({job.folder: job for job in order}.values())
-
-    def other(self, log: str) -> str:
-        """Return the log whose traffic a log gets: the next one by name."""
-        return self.every[(self.every.index(log) + 1) % len(self.every)]
-
-
 def carry_over(settings: Settings, out: Path) -> Path:
     """Train what is missing, test on every log, and write tables, tests and pictures.
 
@@ -154,13 +74,13 @@ def carry_over(settings: Settings, out: Path) -> Path:
             failed, after the tables of the others were written.
     """
     out = out / "quick" if settings.quick else out
-    configs = _configs(settings)
+    configs = model_configs(settings)
     claims = tuple(claim for claim in CLAIMS if {claim.treatment, str(claim.control).split(",")[0]} <= set(configs))
     declaration = Declaration(PRIMARY, claims)
     check(declaration, configs)
-    folder = _logs(settings)
+    folder = recorded_logs(settings)
     content = {**folder.content, **({} if settings.folds is None else {"folds": str(settings.folds)})}
-    plan = _planned(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
+    plan = with_trainings(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
     by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
     check_rows(by_row)
     declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=content)
@@ -174,7 +94,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     )
 
     def replan(threads: Mapping[str, Any]) -> list[Job]:
-        return _planned(folder, settings, configs, out, threads).flat()
+        return with_trainings(folder, settings, configs, out, threads).flat()
 
     for line in runs_elsewhere(plan.flat(), out / "runs", replan):
         print(line, flush=True)
@@ -190,71 +110,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     return path
 
 
-def _configs(settings: Settings) -> dict[str, RunConfig]:
-    """Return the configuration of each model; its data leave nothing out yet."""
-    if unknown := set(settings.rows) - set(ROWS):
-        raise UserError(f"there is no model {min(unknown)}: choose of {', '.join(ROWS)}")
-    configs = {}
-    for row, reference in ROWS.items():
-        if settings.rows and row not in settings.rows:
-            continue
-        config = load_config(reference)
-        data = replace(_data(config), maps=settings.maps, test_on="recordings")
-        if settings.scenes is not None:
-            data = replace(data, train=settings.scenes)
-        config = replace(config, data=data)
-        if settings.steps is not None:
-            config = replace(config, training=replace(config.training, steps=settings.steps))
-        configs[row] = shortened(config) if settings.quick else config
-    return configs
-
-
-def _data(config: RunConfig) -> RealMapData:
-    assert isinstance(config.data, RealMapData)
-    return config.data
-
-
-def _logs(settings: Settings) -> _Plan:
-    """Return the plan without trainings; raise UserError where logs are missing."""
-    maps = find_maps(settings.maps)
-    names = tuple(one.name for one in maps if one.recorded)
-    if len(names) < 2:
-        raise UserError(f"{settings.maps} has {len(names)} recorded logs: to leave one out, there must be two or more")
-    if settings.folds is not None and not 2 <= settings.folds <= len(names):
-        raise UserError(f"--folds {settings.folds}: {settings.maps} has {len(names)} logs, so 2 to {len(names)} folds")
-    if unknown := set(settings.logs) - set(names):
-        raise UserError(f"{settings.maps} has no recorded log {min(unknown)}, only {', '.join(names)}")
-    return _Plan(tuple(sorted(settings.logs or names)), names, {one.name: one.content() for one in maps})
-
-
-def _planned(
-    folder: _Plan, settings: Settings, configs: Mapping[str, RunConfig], out: Path, threads: Mapping[str, Any]
-) -> _Plan:
-    """Return the plan of a folder with its trainings."""
-    plan, store = replace(folder, jobs={}), out / "runs"
-    content = hashlib.sha256(json.dumps(plan.content, sort_keys=True).encode()).hexdigest()
-    for row, config in configs.items():
-        data = _data(config)
-        left_out = {"": ()} if data.generated == 1.0 else {log: plan.fold(log, settings.folds) for log in plan.logs}
-        named = {_label(row, logs): replace(config, data=replace(data, test_logs=logs)) for logs in left_out.values()}
-        jobs = stored_jobs(named, settings.seeds, store, threads=threads, content=content)
-        plan.jobs[row] = {log: jobs[_label(row, logs)] for log, logs in left_out.items()}
-    return plan
-
-
-def _label(row: str, left_out: Sequence[str]) -> str:
-    return f"{row}, without {', '.join(log[:12] for log in left_out)}" if left_out else row
-
-
-def _tested(config: RunConfig, log: str, traffic: str = "") -> RunConfig:
-    """Return the configuration tested on a log, with the traffic of another one if it is named."""
-    data = _data(config)
-    fold = tuple(other for other in data.test_logs if other != log)  # no training maps either
-    data = replace(data, test_logs=(log,), without=fold, test_on="recordings", test_traffic=traffic)
-    return replace(config, data=data)
-
-
-def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, set[int]], str]:
+def _evaluated(plan: Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, set[int]], str]:
     """Return the scores of all finished runs on the logs that they have not seen, seeds by log, and the protocol.
 
     The seeds of a log are those of which every model was tested on it. Means are over these alone, so that models are
@@ -268,11 +124,11 @@ def _evaluated(plan: _Plan, failures: list[Failure]) -> tuple[ByLog, dict[str, s
             if job.folder in failed:
                 continue
             with noted(job, failures):
-                own = measure(job, _tested(job.config, log), "last")
+                own = measure(job, on_log(job.config, log), "last")
                 assert own is not None
                 protocol, ways = own.protocol, {row: own.ways[""]}
                 if NONE in own.ways:  # the model reads traffic
-                    swapped = measure(job, _tested(job.config, log, plan.other(log)), "last")
+                    swapped = measure(job, on_log(job.config, log, plan.other(log)), "last")
                     assert swapped is not None
                     ways |= {f"{row}, {NONE}": own.ways[NONE], f"{row}, {OTHER}": swapped.ways[""]}
                 for name, scores in ways.items():
@@ -353,7 +209,7 @@ def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[s
     return rows
 
 
-def _draw(plan: _Plan, failures: Sequence[Failure], out: Path) -> None:
+def _draw(plan: Plan, failures: Sequence[Failure], out: Path) -> None:
     """Draw frames of each log with its truth and the predictions of two models that have not seen it."""
     failed = {failure.job.folder for failure in failures}
     for log in plan.logs:
@@ -365,5 +221,5 @@ def _draw(plan: _Plan, failures: Sequence[Failure], out: Path) -> None:
                 models[row] = Model(run.config.task, run.params[0])
         if models:
             pair = [row for row in ("mixed", "generated") if row in models] or list(models)
-            first = _tested(plan.of(next(iter(models)), log)[0].config, log)
+            first = on_log(plan.of(next(iter(models)), log)[0].config, log)
             draw_models(first, models, pair, out / f"{log}.png")

@@ -15,7 +15,8 @@ def run(options: argparse.Namespace) -> int:
         if value is not None and value < 1:
             raise UserError(f"--{name} {value}: at least one")
     configure_jax()
-    from tflane_jax.ablations.carry_over import Settings, carry_over
+    from tflane_jax.ablations.carry_over import carry_over
+    from tflane_jax.ablations.carry_over_plan import Settings
 
     settings = Settings(
         maps=options.maps,

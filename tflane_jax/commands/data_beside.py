@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.commands.data_stats import example_stats
 from tflane_jax.commands.sources import chosen_source
 from tflane_jax.config import RunConfig
 from tflane_jax.datasets import argoverse2, sources
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.recorded_logs import RECORDED_EXAMPLE
 from tflane_jax.errors import UserError
+from tflane_jax.evaluation.example_statistics import example_stats
 from tflane_jax.evaluation.scene_statistics import frame_quantities, lane_quantities, pooled
 from tflane_jax.files.atomic import check_stem
 from tflane_jax.plots import format_table, save_table

@@ -23,7 +23,7 @@ FRAME_QUANTITIES = (
     "vehicle on a connector",
     "oblique fraction of lane length",
 )
-"""One value for each frame; those of road users follow, see `commands.data_stats`.
+"""One value for each frame; those of road users follow, see `evaluation.example_statistics`.
 
 Lanes beside the vehicle go its way, or against it, up to 45 degrees aside, where they pass it; its own counts too.
 The vehicle is on a connector (1, else 0) if that is the nearest lane. Oblique are pieces of lanes at 15 to 75 degrees

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from tflane_jax.config import RealMapData, RunConfig, load_config
 from tflane_jax.models.toponet import TopoNetConfig
+from tflane_jax.models.traffic_raster import TrafficRasterConfig
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 from tflane_jax.world.presets import CITY, REAL_LIKE
 
@@ -31,6 +32,8 @@ def get_config() -> RunConfig:
 def ablations() -> dict[str, RunConfig]:
     """Return `mixed`, every second scene on generated roads; `generated`, all of them; and the three without traffic.
 
+    `mixed_bev` is `mixed` with the tracks written into the BEV features as well, which is ours.
+
     `generated` has seen no recorded map: a control with the same capacities, steps and test data. Its own controls:
     `generated_right_hand`, where all traffic keeps to the right, and `generated_city`, on the preset `city`.
     """
@@ -40,6 +43,7 @@ def ablations() -> dict[str, RunConfig]:
     sources["generated_right_hand"] = replace(MAPS, generated=1.0, generated_world=right_hand)
     sources["generated_city"] = replace(MAPS, generated=1.0, generated_world=CITY)
     with_traffic = {name: _on(data, "tf_lane/toponet_tfm") for name, data in sources.items()}
+    with_traffic["mixed_bev"] = _with_bev(with_traffic["mixed"])
     return with_traffic | {f"{name}_no_traffic": config for name, config in without.items()}
 
 
@@ -51,3 +55,13 @@ def _on(data: RealMapData, host: str) -> RunConfig:
     assert decoder.proposals is not None
     decoder = replace(decoder, queries=QUERIES, proposals=replace(decoder.proposals, count=PROPOSALS))
     return replace(config, data=data, task=replace(config.task, model=replace(config.task.model, decoder=decoder)))
+
+
+def _with_bev(config: RunConfig) -> RunConfig:
+    assert isinstance(config.task, LaneGraphTask)
+    assert isinstance(config.task.model, TopoNetConfig)
+    model = config.task.model
+    assert model.priors.traffic_flow is not None
+    traffic_flow = replace(model.priors.traffic_flow, bev=TrafficRasterConfig())
+    model = replace(model, priors=replace(model.priors, traffic_flow=traffic_flow))
+    return replace(config, task=replace(config.task, model=model))

@@ -48,6 +48,9 @@ CLAIMS = (
     Claim("mixed", "mixed without traffic", "traffic flow helps a model that is trained with it"),
     Claim("mixed", f"mixed, {NONE}", "this model uses the traffic"),
     Claim("mixed", f"mixed, {OTHER}", "it uses what the traffic tells of this place"),
+    Claim("mixed + BEV", "mixed", "traffic in the BEV features helps beside that in the queries"),
+    Claim("mixed + BEV", f"mixed + BEV, {NONE}", "this model uses the traffic"),
+    Claim("mixed + BEV", f"mixed + BEV, {OTHER}", "it uses what the traffic tells of this place"),
 )
 FITTED = (
     "The settings of generated roads (preset real-like) and of traffic were fitted to mean statistics of nine logs "

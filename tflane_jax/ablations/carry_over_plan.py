@@ -23,10 +23,12 @@ ROWS: Mapping[str, str] = {
     "generated on city": "real_maps:generated_city",
     "maps": "real_maps",
     "mixed": "real_maps:mixed",
+    "mixed + BEV": "real_maps:mixed_bev",
     "generated without traffic": "real_maps:generated_no_traffic",
     "mixed without traffic": "real_maps:mixed_no_traffic",
 }
-"""Models by name: roads that they are trained on, and whether they see traffic flow."""
+"""Models by name: roads that they are trained on, and whether traffic flow enters the queries, the BEV features too
+(+ BEV), or neither."""
 
 
 @dataclass(frozen=True)

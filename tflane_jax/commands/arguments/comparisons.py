@@ -149,8 +149,8 @@ def carry_over(commands) -> None:
         metavar="NAME",
         nargs="+",
         default=[],
-        help="of: generated, 'generated, right-hand traffic', 'generated on city', maps, mixed, 'generated without "
-        "traffic', 'mixed without traffic' (default: all)",
+        help="of: generated, 'generated, right-hand traffic', 'generated on city', maps, mixed, 'mixed + BEV', "
+        "'generated without traffic', 'mixed without traffic' (default: all)",
     )
     parser.add_argument("--seeds", metavar="N", type=int, default=1, help="number of seeds (default 1)")
     parser.add_argument("--steps", metavar="N", type=int, help="updates of each run (default: the configuration's)")

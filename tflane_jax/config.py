@@ -192,7 +192,7 @@ def _checked(path: Path, config: RunConfig) -> RunConfig:
 
 
 def _lines_of(path: Path, error: SettingError) -> str:
-    """Return where a file gives a setting its value, in words; "" where it does so in no way that can be read."""
+    """Return the lines of a file that set a setting, in words for an error; "" if none can be identified."""
     name = re.sub(r"\[\d+\]$", "", error.setting).rpartition(".")[2]
     given = [k for k in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(k, ast.keyword) and k.arg == name]
     written = [k for k in given if ast.unparse(k.value) == repr(error.value)] or given

@@ -47,7 +47,7 @@ class TrafficFlowModuleConfig:
         fusions: which of the four fusion modules are used, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
         depth: temporal self-attention layers, "Dep." in Table 5 as we read it.
         spatial_depth: how often the spatial encoder repeats the fusion modules, each time with separate parameters;
-            Eq. (3) follows once. The other reading of "Dep.": the text speaks of cross-attention layers.
+            Eq. (3) follows once. The other reading of "Dep.", because the text names cross-attention layers.
         residual: "fusion" adds to each fusion module its input; "none" leaves the original features to Eq. (3) alone,
             and only a query without a valid key keeps its own.
         token: an instance's token is computed from the mean of its valid frames after self-attention ("mean") and, in

@@ -174,7 +174,7 @@ class Log:
         paint_wear: 0 (fresh) to 1 (gone); weakens lane paint.
         seed: of all random numbers in rendering this log.
         markers: fiducial markers beside the road; None if there are none.
-        area: place, such as a city, in whose coordinates the log is; "" if the source does not tell.
+        area: place, such as a city, in whose coordinates the log is; "" if it is unknown.
         relief: hilly ground of a simulated drive; None on level ground and for recorded logs.
     """
 

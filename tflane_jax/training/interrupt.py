@@ -33,7 +33,7 @@ class StopRequest:
             raise Interrupted(self.signal)
 
     def after_the_step(self) -> None:
-        """Let a signal only be noted. One may have come that raised its error where Python ignores it."""
+        """Only set `signal` from now on. It may be set already: Python ignores errors raised in some places."""
         self._at_once = False
 
     def _ask(self, number: int, frame: FrameType | None) -> None:

@@ -26,7 +26,7 @@ def devices_of_task(environment: Mapping[str, str]) -> list[int] | None:
         environment: variables of the process.
 
     Returns:
-        None where the variables do not tell; JAX then takes one for each process.
+        None if the variables do not determine them; JAX then takes one GPU for each process.
     """
     if (visible := environment.get(_VISIBLE)) is None:
         return None

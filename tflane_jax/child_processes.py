@@ -10,8 +10,8 @@ import threading
 def end_with_parent() -> None:
     """Let this process, which `multiprocessing` started, end at once when its parent is gone; returns immediately.
 
-    A parent that is killed (SIGKILL, out of memory) cannot tell its workers. Without this, one that waits for work
-    would wait forever, and one that trains would go on and keep its run locked.
+    A parent that is killed (SIGKILL, out of memory) cannot stop its workers. Without this, a waiting worker would wait
+    forever, and a training one would go on and keep its run locked.
     """
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 

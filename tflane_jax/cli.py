@@ -31,13 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if rest and not options.takes_overrides:
         parser.error(f"unknown argument {rest[0]}: see tflane {options.command} --help")
     with _ending_on_sigterm():
-        code = _called(options, rest)
+        code = _run_command(options, rest)
     if arguments is None:  # the program itself
         leave(code)
     return code
 
 
-def _called(options: argparse.Namespace, rest: Sequence[str]) -> int:
+def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
     try:
         command = getattr(importlib.import_module(f"tflane_jax.commands.{options.module}"), options.function)
         return (command(options, rest) if options.takes_overrides else command(options)) or 0

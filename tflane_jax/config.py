@@ -100,7 +100,7 @@ def load_config(reference: str) -> RunConfig:
     """
     name, ablation = split_reference(reference)
     if not ablation:
-        config = _called(find_config(name), "get_config", RunConfig)
+        config = _run_function(find_config(name), "get_config", RunConfig)
         return _checked(find_config(name), _with_reference_batch(config, config))
     ablations = load_ablations(name)
     if ablation not in ablations:
@@ -124,7 +124,7 @@ def load_ablations(name: str) -> dict[str, RunConfig]:
 
     Their settings are not checked; `load_config` does that for one of them.
     """
-    return _called(find_config(name), "ablations", dict)
+    return _run_function(find_config(name), "ablations", dict)
 
 
 def with_priors_of(other: RunConfig, config: RunConfig) -> RunConfig:
@@ -148,7 +148,7 @@ def with_remat(config: RunConfig, precision: Precision = "float32") -> RunConfig
     return dataclasses.replace(config, task=dataclasses.replace(config.task, model=model))
 
 
-def _called(path: Path, function: str, kind: type[T]) -> T:
+def _run_function(path: Path, function: str, kind: type[T]) -> T:
     """Run a config file and return the result of one of its functions."""
     spec = importlib.util.spec_from_file_location(f"tflane_config_{path.stem}", path)
     if spec is None or spec.loader is None:
@@ -192,7 +192,7 @@ def _checked(path: Path, config: RunConfig) -> RunConfig:
 
 
 def _lines_of(path: Path, error: SettingError) -> str:
-    """Return where a file gives a setting its value, in words; "" where it does so in no way that can be read."""
+    """Return the lines of a file that set a setting, in words for an error; "" if none can be identified."""
     name = re.sub(r"\[\d+\]$", "", error.setting).rpartition(".")[2]
     given = [k for k in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(k, ast.keyword) and k.arg == name]
     written = [k for k in given if ast.unparse(k.value) == repr(error.value)] or given

@@ -1,8 +1,8 @@
 """Data parallelism: each batch is divided among the devices by examples, parameters are on every device.
 
-A program stays one program over all devices of all processes (GSPMD): XLA divides what is done for each example, and
-adds up gradients and batch statistics. A loss is therefore that of the whole batch, and equal on one device and on many
-up to rounding. With one device nothing here changes anything.
+A program stays one program over all devices of all processes (GSPMD): XLA divides the work on single examples, and adds
+up gradients and batch statistics. A loss is therefore that of the whole batch, and equal on one device and on many up
+to rounding. With one device nothing here changes anything.
 """
 
 from __future__ import annotations

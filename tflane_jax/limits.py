@@ -9,8 +9,8 @@
         def limits(self) -> Rules:                # limits that concern several settings
             yield "drops", self.drops is None or not self.epoch_steps, "None where epoch_steps is set"
 
-Types count as limits, and numbers are finite where nothing else is said. The types here are those that many settings
-share; others are written as `Annotated[float, above(1)]`.
+Types count as limits, and numbers must be finite unless their limit allows more. The types here are those that many
+settings share; others are written as `Annotated[float, above(1)]`.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from tflane_jax.errors import UserError
 
 
 class SettingError(UserError):
-    """A setting that cannot be.
+    """A setting that breaks a limit.
 
     Attributes:
         setting: its dotted name.
-        value: what it is.
-        allowed: what it must be, in words.
+        value: its value.
+        allowed: the allowed values, in words.
     """
 
     def __init__(self, setting: str, value: Any, allowed: str):

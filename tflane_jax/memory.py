@@ -22,8 +22,8 @@ def keep_freed_memory() -> None:
     more than 1 GiB.
 
     Heaps of threads other than the first cannot hold more than 64 MiB, and would still do so: a third of a step of a
-    small host with 64 queries. The first heap should stay free of gaps: compiling leaves a hundred thousand, and to
-    find blocks among them took 38 of 205 ms of a step of LaneSegNet. Programs therefore run in the thread that calls
+    small host with 64 queries. The first heap should stay free of gaps: compiling leaves a hundred thousand, and
+    searching them for blocks took 38 of 205 ms of a step of LaneSegNet. Programs therefore run in the thread that calls
     them (`training.runtime`) and are compiled in another one, with a heap of its own (`startup.compiled`).
     """
     if (mallopt := _of_glibc("mallopt")) is None:

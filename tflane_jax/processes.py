@@ -1,10 +1,9 @@
 """Several processes that train one model, on one machine or on many: joining them, and what only the first one does.
 
-All processes run the same program on the same data; each feeds its own devices (`devices`). Only the first one reads
-and writes the run folder. What it finds there, the others are told, also if it is an error. What goes wrong in one
-process alone, before the first step, all are told too (`agreed`); later, that process ends at once (`leaving`), and the
-others, which wait for it, are ended by JAX. A process on its own is the first of one, and nothing here costs it
-anything.
+All processes run the same program on the same data; each feeds its own devices (`devices`). Only the first process
+reads and writes the run folder; it sends the content, or its error, to the others (`from_first`). An error in one
+process before the first step is raised in all of them (`agreed`). After that, the process with the error ends at once
+(`leaving`), and JAX ends the others, which wait for it. A single process is the first of one, at no cost.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from tflane_jax.errors import UserError
 
 T = TypeVar("T")
 AGREE_EVERY = 10
-"""Steps between two looks of several processes at whether any of them is to stop."""
+"""Several processes agree every so many steps on whether to stop."""
 
 HEARTBEAT_SECONDS = 30
-"""After so long without a sign of one process, JAX ends the others."""
+"""If a process sends no heartbeat for so long, JAX ends the others."""
 
 _apart = contextvars.ContextVar("apart", default=False)
 
@@ -42,8 +41,8 @@ class AgreedError(UserError):
 def join(coordinator: str | None, processes: int | None, process: int | None) -> None:
     """Join this process to the others; call it before JAX is used.
 
-    A process that is given its place uses all devices that it sees, one that asks the cluster its own
-    (`accelerators.devices_of_task`); JAX_LOCAL_DEVICE_IDS says otherwise.
+    With explicit arguments, a process uses all devices that it sees; in a cluster's job, those of its task
+    (`accelerators.devices_of_task`). JAX_LOCAL_DEVICE_IDS overrules both.
 
     Args:
         coordinator: host:port of the first process. None, together with the others: JAX asks the cluster (Slurm, Open
@@ -86,7 +85,7 @@ def is_first() -> bool:
 
 @contextlib.contextmanager
 def apart() -> Iterator[None]:
-    """Let this process work on its own inside the block, with its first device: the others do not run it."""
+    """Let this process work alone inside the block, on its first device; the others do not run the block."""
     token = _apart.set(True)
     try:
         yield
@@ -105,7 +104,7 @@ def from_first(make: Callable[[], T]) -> T:
             answer = {"value": make()}
         except Exception as caught:
             answer, error = {"error": _in_words(caught)}, caught
-    answer = json.loads(_told(json.dumps(answer).encode()))
+    answer = json.loads(_sent(json.dumps(answer).encode()))
     if "error" in answer:
         raise _own(error) or AgreedError(answer["error"])
     return answer["value"]
@@ -113,9 +112,9 @@ def from_first(make: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def agreed() -> Iterator[None]:
-    """Let an error that one process raises inside the block end it in all: each waits for the others at its end.
+    """Raise an error of one process inside the block in all processes, at the end of the block.
 
-    The block itself may not wait for other processes.
+    The processes wait for each other there; the block itself may not wait for other processes.
     """
     if count() == 1:
         yield
@@ -131,15 +130,15 @@ def agreed() -> Iterator[None]:
     if not failed.any():
         return
     number = int(failed.argmax())
-    told = _told(b"" if error is None else _in_words(error).encode(), source=number).decode()
-    raise _own(error) or AgreedError(f"process {number}: {told}")
+    message = _sent(b"" if error is None else _in_words(error).encode(), source=number).decode()
+    raise _own(error) or AgreedError(f"process {number}: {message}")
 
 
 @contextlib.contextmanager
 def leaving() -> Iterator[None]:
-    """End this process at once after an error inside the block that the others do not know of.
+    """End this process at once after an error inside the block that is not agreed between the processes.
 
-    Otherwise it would wait for them at its end, as they wait for its part of the next step.
+    A normal exit would wait for the others, which wait for this process's part of the next step.
     """
     try:
         yield
@@ -158,7 +157,7 @@ def leaving() -> Iterator[None]:
 
 
 def _own(error: Exception | None) -> Exception | None:
-    """Return what the process that had an error raises: a user's error as one that all know of."""
+    """Return the error that its own process raises: an agreed one for a user's error."""
     return AgreedError(str(error)) if isinstance(error, UserError) else error
 
 
@@ -186,9 +185,9 @@ def arrays_from_first(make: Callable[[], T], like: T) -> T:
 
 
 def all_rows(tree: Any) -> Any:
-    """Return the rows (leading axis) of all processes, in their order, of arrays (numpy) that each has a part of.
+    """Return arrays (numpy) whose rows (leading axis) are divided among the processes as whole ones, in process order.
 
-    They travel as bytes, so that no type changes.
+    They are exchanged as bytes, so that no type changes.
     """
     leaves, treedef = jax.tree.flatten(tree)
     if count() == 1 or not leaves:
@@ -207,9 +206,9 @@ def all_rows(tree: Any) -> Any:
 
 
 def stop_signal(signal: int | None, step: int) -> int | None:
-    """Return the signal by which the training is to stop after `step`, as seen by this process, or agreed by several.
+    """Return the signal that stops the training after `step`, of this process or of any of several.
 
-    Several processes look every `AGREE_EVERY` steps, so that none waits for another at every step.
+    Several processes exchange it every `AGREE_EVERY` steps, so that they do not wait for each other at every step.
     """
     if count() == 1:
         return signal
@@ -221,8 +220,8 @@ def stop_signal(signal: int | None, step: int) -> int | None:
     return asked or None
 
 
-def _told(text: bytes, source: int = 0) -> bytes:
-    """Return the text of one process in all."""
+def _sent(text: bytes, source: int = 0) -> bytes:
+    """Return the text of the process `source` in all processes."""
     size = int(_broadcast(np.int32(len(text)), source))
     padded = np.zeros(size, np.uint8)
     if jax.process_index() == source:

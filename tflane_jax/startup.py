@@ -23,10 +23,10 @@ _REFRESH_SECONDS = 0.5
 
 
 class _Display:
-    """Where stages are shown, and the seconds that each has taken."""
+    """Shows stages and counts the seconds that each takes."""
 
-    def __init__(self, tell: Callable[[str], None] | None) -> None:
-        self._tell, self._began = tell, time.perf_counter()
+    def __init__(self, show: Callable[[str], None] | None) -> None:
+        self._show, self._began = show, time.perf_counter()
         self.seconds: dict[str, float] = {}
 
     @contextlib.contextmanager
@@ -34,22 +34,22 @@ class _Display:
         began = time.perf_counter()
         with self._line(name):
             yield
-        if self._tell is not None:
-            self._tell("")
+        if self._show is not None:
+            self._show("")
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
     def _line(self, name: str) -> contextlib.AbstractContextManager[None]:
-        if self._tell is None and sys.stderr.isatty():
+        if self._show is None and sys.stderr.isatty():
             return _updated_line(name)
-        if self._tell is not None:
-            self._tell(name)
+        if self._show is not None:
+            self._show(name)
         else:
             write(f"[{time.perf_counter() - self._began:5.1f} s] {name}")
         return contextlib.nullcontext()
 
     def ready(self) -> None:
-        """Print the time since the beginning and that of each stage; begin anew."""
-        if self._tell is None and self.seconds:
+        """Print the time since the beginning and that of each stage, and reset both."""
+        if self._show is None and self.seconds:
             parts = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
             write(f"ready after {time.perf_counter() - self._began:.1f} s ({parts})")
         self.seconds, self._began = {}, time.perf_counter()
@@ -60,12 +60,11 @@ _shown: ContextVar[_Display | None] = ContextVar("shown", default=None)
 
 @contextlib.contextmanager
 def showing(show: bool | Callable[[str], None]) -> Iterator[None]:
-    """Show the stages inside the block on standard error; a block around this one that shows them goes on to do so.
+    """Show the stages inside the block on standard error; no-op inside another `showing` that shows them.
 
     Args:
-        show: whether to show them: one line with the time of the stage, updated, on a terminal; elsewhere a line for
-            each, with the time since the beginning. A function gets the name instead,
-            and "" at the end of a stage.
+        show: whether to show them: on a terminal one line with the time of the stage, updated; elsewhere a line for
+            each, with the time since the beginning. A function gets the name instead, and "" at the end of a stage.
     """
     if not show or _shown.get() is not None:
         yield
@@ -119,7 +118,7 @@ def _updated_line(name: str) -> Iterator[None]:
 # Compiling
 
 _left_running: list[threading.Event] = []
-"""For each thread that nobody waits for: set when it is done."""
+"""An event for each thread whose wait was interrupted; set when the thread is done."""
 
 
 def compiled(
@@ -128,7 +127,7 @@ def compiled(
     what: str,
     context: Callable[[], contextlib.AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> Any:
-    """Return a program of `jax.jit` compiled for given arguments, or their shapes. A later call of `program` finds it.
+    """Return a program of `jax.jit` compiled for given arguments, or their shapes. Later calls of `program` reuse it.
 
     Args:
         program: from `jax.jit`.
@@ -156,7 +155,7 @@ def in_another_thread(work: Callable[[], T]) -> T:
         return work()
     results: list[T] = []
     errors: list[BaseException] = []
-    done = threading.Event()  # an interrupted `join` takes a thread that runs for ended (Python 3.11)
+    done = threading.Event()  # an interrupted `join` marks a running thread as ended (Python 3.11)
 
     def run() -> None:
         try:
@@ -168,7 +167,7 @@ def in_another_thread(work: Callable[[], T]) -> T:
 
     try:
         threading.Thread(target=run, name="compile").start()
-        while not done.wait(_REFRESH_SECONDS):  # on Windows, a wait without limit hears no Ctrl-C
+        while not done.wait(_REFRESH_SECONDS):  # on Windows, Ctrl-C does not interrupt a wait without a timeout
             pass
     except BaseException:
         _left_running.append(done)
@@ -179,7 +178,7 @@ def in_another_thread(work: Callable[[], T]) -> T:
 
 
 def leave(code: int) -> None:
-    """End the process now if a thread that nobody waits for still compiles: a normal exit waits until it is done."""
+    """End the process at once if an abandoned thread still compiles: a normal exit would wait for it."""
     if not all(done.is_set() for done in _left_running):
         sys.stdout.flush()
         sys.stderr.flush()

@@ -91,7 +91,7 @@ def test_sines_of_coordinates_in_metres():
     prior = TrafficFlowConfig(TrafficFlowPriorConfig(coordinates="metres"), CONFIG).build(wide)
     position = np.random.default_rng(0).uniform(-50, 50, (4, 20, 3)).astype(np.float32)
     heading = np.zeros((4, 20, 2), np.float32)
-    encoded = prior.temporal_encoder.apply({}, position, heading, method="_where")
+    encoded = prior.temporal_encoder.apply({}, position, heading, method="_encode_places")
     angle = 2 * np.pi * position[..., :2, None] / [200.0, 100.0, 50.0]
     waves = [np.sin(angle).reshape(4, 20, 6), np.cos(angle).reshape(4, 20, 6)]
     np.testing.assert_allclose(encoded, np.concatenate([*waves, position, heading], -1), atol=1e-5)

@@ -52,6 +52,17 @@ def test_contact_sheet_is_limited_to_the_available_examples(tmp_path, size, coun
     assert count_colours(out) > 100
 
 
+def test_titles_and_legend_of_a_single_row_are_not_cut_off(tmp_path):
+    one = stack_examples([fake_example(0)]), {"model": stack_examples([fake_prediction(0)])}
+    for picture in (
+        show_dataset(FakeDataset(FakeConfig(size=1)), 1, tmp_path / "one.png"),
+        show_dataset(FakeDataset(FakeConfig(size=2)), 2, tmp_path / "two.png"),
+        save_examples(tmp_path / "model.png", *one),
+    ):
+        pixels = imread(picture)[..., :3]
+        assert pixels[0].min() == pixels[-1].min() == 1.0, picture.name
+
+
 @pytest.mark.parametrize(("size", "count"), [(0, 3), (3, 0)])
 def test_nothing_to_show_is_an_error(tmp_path, size, count):
     with pytest.raises(UserError, match="nothing to show"):

@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
         "source": to_json(source),
         "near_training": None if near is None else near.sentence(),
     }
-    # Published weights have no run folder: theirs are told apart by name.
+    # Published weights have no run folder: theirs are distinguished by name.
     of_weights = Path("runs") / "evaluations" / f"{Path(trained.name).stem}-{name}"
     stem = options.out or (of_weights if options.config else Path(trained.name) / "evaluations" / name)
     paths = [*save_table(stem, rows, meta, title=title), *_save_edge_types(trained, source, stem)]
@@ -116,7 +116,7 @@ def _save_edge_types(run: Run, source: Any, stem: Path) -> list[Path]:
 
 
 def _nearness(run: Run, source: Any, root: Path | None) -> Nearness | None:
-    """Return how far the examples are from the training frames; None where that cannot be told and nobody asked."""
+    """Return how far the examples are from the training frames; None if that is unknown and no `root` is given."""
     if root is not None:
         if (found := training_nearness(run.config, source, root)) is None:
             raise UserError(f"{root}: no training frame is in a city of the evaluated frames")

@@ -124,7 +124,7 @@ def _detector(options: argparse.Namespace, store: MarkerStore) -> DetectorConfig
             f"{store.source} holds marker {last}, and ids of {family.name} end at {largest}: give the family of these "
             "boards with --family"
         )
-    # Of a partly hidden board only these ids can be told apart; whole ones are read whatever their id.
+    # On a partly hidden board only these ids are searched; whole boards are read with any id.
     return DetectorConfig(family, search=options.search, ids=tuple(sorted(store.markers)))
 
 

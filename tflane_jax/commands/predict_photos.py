@@ -44,7 +44,7 @@ _SAVED_EVERY = 10.0
 def predict(trained: Run, paths: list[Path], options: argparse.Namespace) -> int:
     """Predict the lane lines in photos and videos; write a picture or video of each, and the points of all.
 
-    A file that cannot be read is recorded and told, the others are predicted, and the result is 2.
+    A file that cannot be read is recorded and reported, the others are predicted, and the exit code is 2.
     """
     inputs = list(dict.fromkeys(list_photos(paths, (*PHOTO_SUFFIXES, *VIDEO_SUFFIXES))))
     videos = [path for path in inputs if path.suffix.lower() in VIDEO_SUFFIXES]
@@ -113,8 +113,8 @@ def _photo(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     save_photo(out, photo, answer.lanes, f"{path.name}: {count} lane line{'' if count == 1 else 's'}")
     height, width = photo.shape[:2]
     size = {"file": str(path), "width": width, "height": height}
-    told = {"view": _plain_view(answer.view), "value": round(answer.value, 3), "warning": answer.warning}
-    return size | {"picture": out.name} | told | {"lanes": _plain(answer)}
+    found = {"view": _plain_view(answer.view), "value": round(answer.value, 3), "warning": answer.warning}
+    return size | {"picture": out.name} | found | {"lanes": _plain(answer)}
 
 
 def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | None) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     rows += [{"part": group, **values} for group, values in (groups or {}).items() if group != "all"]
 
     title = f"{options.predictions.name}: {scored.protocol}"
-    # A part without lanes and detections has DET_l 1: without their number, nobody could tell.
+    # A part without lanes and detections has DET_l 1, so the numbers of both are shown.
     counted = () if options.by is None else _COUNTED
     shown = [name for name in ("part", *protocol.columns, *counted, "frames") if any(name in row for row in rows)]
     print(format_table(rows, shown, title=title, digits=4))

@@ -51,8 +51,8 @@ def run(options: argparse.Namespace) -> int:
         author = Author(options.method, tuple(options.authors), options.email, options.institution, options.country)
         write_submission(options.out, found, author)
     elif isinstance(source, NuScenesConfig):
-        if told := [name for name in _OF_SERVER if getattr(options, name)]:
-            raise UserError(f"--{told[0]} is for OpenLane-V2's server: MapTR's file has no place for it, leave it out")
+        if given := [name for name in _OF_SERVER if getattr(options, name)]:
+            raise UserError(f"--{given[0]} is for OpenLane-V2's server: MapTR's file has no place for it, leave it out")
         if "lines" not in predicts:
             raise UserError("MapTR's file for nuScenes holds lines of a vector map, and this model predicts none")
         dataset = NuScenesDataset(source)

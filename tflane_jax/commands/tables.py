@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
     how["scored_by"] = "any code" if options.earlier_scores else "this code"
     seeds = {table.name: range(options.seeds or (2 if options.quick else table.seeds)) for table in chosen}
     archives = {} if options.source is None else find_archives(options.source, [table.name for table in chosen])
-    if len(chosen) > 1:  # what is wrong in the last one is told before the first one is trained
+    if len(chosen) > 1:  # errors of the last one come before the first one is trained
         for table in chosen:
             plan_table(table, seeds[table.name], options.out, archive=archives.get(table.name), **how)
     written = [run_table(t, seeds[t.name], options.out, archive=archives.get(t.name), **how) for t in chosen]

@@ -42,7 +42,7 @@ def run(options: argparse.Namespace, overrides: Sequence[str]) -> int:
 def _trained(options: argparse.Namespace, overrides: Sequence[str]) -> int:
     out = options.out or _default_folder(options.config)
     config = _config(options, out, overrides)
-    _tell_devices()
+    _print_devices()
     before = _saved_at(out)
     try:
         result = train_run(config, out, start=options.start)
@@ -80,8 +80,8 @@ def _config(options: argparse.Namespace, out: Path, overrides: Sequence[str]) ->
     return from_json(RunConfig, processes.from_first(lambda: to_json(resumable_config(out))))
 
 
-def _tell_devices() -> None:
-    """Say how many devices share the training, so that one that is missing is seen."""
+def _print_devices() -> None:
+    """Print how many devices share the training, so that a missing one is noticed."""
     number, devices = jax.process_count(), jax.devices()
     if processes.is_first() and (number > 1 or len(devices) > 1):
         joined = f"{number} processes, " if number > 1 else ""

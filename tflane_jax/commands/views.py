@@ -1,4 +1,4 @@
-"""Camera images for pictures of examples that a model, or nobody, reads them from."""
+"""Camera images for pictures of examples, also where the model does not read images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def with_images(
 ) -> tuple[list[int], Example]:
     """Return the rows of the examples that have camera images, and these examples with them.
 
-    Examples without images get those that lie with the data, or images of the built-in world if `rendered`.
+    Examples without images get those in the data's folder, or images of the built-in world if `rendered`.
 
     Args:
         examples: stacked.

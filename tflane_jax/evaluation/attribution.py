@@ -1,7 +1,7 @@
-"""What a predicted lane owes to single road users: the attention of its query, and its score without them.
+"""How a predicted lane depends on single road users: the attention of its query, and its score without them.
 
-Attention weights tell what the traffic-flow module reads. They do not tell what the prediction depends on: values are
-transformed and mixed later, and BEV features may hold the same traffic. Taking road users away measures that.
+Attention weights show what the traffic-flow module reads, but not what the prediction depends on: values are
+transformed and mixed later, and BEV features may hold the same traffic. Removing road users measures the dependence.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ class LaneGain(NamedTuple):
 
 
 class RoadUserEffects(NamedTuple):
-    """What one predicted lane owes to each of the T road users that the prior selects for its frame.
+    """Effect on one predicted lane of each of the T road users that the prior selects for its frame.
 
     Attributes:
         road_user: (T,) index of the track in the traffic flow.
         attention: (T,) of the lane's query to the road user, mean over heads; the sum is 1.
         driven: (T,) fraction of the lane's length that the road user drove along, see `driven_fraction`.
-        without: (T,) score of the lane when only this road user is taken away.
+        without: (T,) score of the lane when only this road user is removed.
     """
 
     road_user: Int[np.ndarray, " t"]
@@ -90,8 +90,8 @@ def lanes_by_gain(
 ) -> list[LaneGain]:
     """Return the true lanes of a group (`evaluation.lane_groups`), those that gain most from traffic first.
 
-    A model that was trained with traffic relies on it, so that taking all traffic away costs more than a model that was
-    trained without lacks. With a baseline, a lane gains only what both lack.
+    A model that was trained with traffic relies on it: without any, it is behind a model that was trained without. With
+    a baseline, the gain is therefore counted against the better of the two, see `LaneGain.gain`.
 
     Args:
         task, params: a model of centerlines or lane segments without memory.

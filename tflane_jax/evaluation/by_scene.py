@@ -24,7 +24,7 @@ def scene_weights(scenes: int, samples: int, *, seed: int = 0) -> Int[np.ndarray
     """Return bootstrap samples of scenes: how often each scene is drawn when as many are drawn with replacement.
 
     Scenes, not frames: frames of one drive are alike, so intervals over frames would be far too narrow. Records of
-    scores depend on these numbers, which a test holds fast.
+    scores depend on these numbers, so a test pins them.
     """
     return np.random.default_rng(seed).multinomial(scenes, np.full(scenes, 1.0 / scenes), samples)
 
@@ -56,7 +56,7 @@ def shared_samples(
     Args:
         resampled: returns the scores of each group in samples of the frames.
         scene: number of each frame's scene.
-        ratios: scores that are ratios; the recall of each group tells what its scenes hold.
+        ratios: scores that are ratios; the recall of each group gives the number of lanes in each scene.
     """
     scenes = int(scene.max(initial=-1)) + 1
     if scenes < 2:

@@ -123,7 +123,7 @@ def frames_of_difference(
     """Return the frames in which the first model is ahead the most, and those in which the second is.
 
     A model's lead is the number of lanes that only it finds, less those that only the other finds. The models share
-    the `count` frames in the ratio of all lanes that only they find; one that leads anywhere gets a frame at least.
+    the `count` frames in the ratio of all lanes that only they find; a model that leads in any frame gets at least one.
     Of a scene, each list has only the frame of the largest lead.
 
     Args:

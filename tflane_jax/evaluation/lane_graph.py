@@ -176,7 +176,7 @@ class LaneGraphMetrics:
 
     @property
     def _prefix(self) -> str:
-        """What tells the groups of segments from those of centerlines."""
+        """Prefix of the names of groups of segments, to distinguish them from groups of centerlines."""
         return "segments " if "centerlines" in self._measured else ""
 
     def _applied(self) -> list[Any]:
@@ -194,7 +194,7 @@ def _of_devkit(values: Mapping[str, T]) -> dict[str, T]:
 
 
 def line_labels(lines: MapLines | None) -> tuple[LineLabel, ...]:
-    """Return what labelled lines tell beside their shapes."""
+    """Return the labels that lines have beside shape and class."""
     known = () if lines is None else (("visibility", lines.visibility), ("identity", lines.identity))
     return tuple(name for name, values in known if values is not None)  # pyright: ignore[reportReturnType]
 

@@ -19,7 +19,7 @@ from tflane_jax.metrics.vector_map import GroupedMapMetrics, VectorMapMetrics
 from tflane_jax.scene import Example, LinePrediction
 
 LineLabel = Literal["visibility", "identity"]
-"""What the labels of lines tell beside their shapes and classes."""
+"""Labels of lines beside shape and class."""
 
 
 class MapLineMetrics:
@@ -35,7 +35,7 @@ class MapLineMetrics:
 
     Args:
         measures: "chamfer", always measured, and "iou".
-        labels: what the labels of lines tell.
+        labels: that the true lines have.
         groups: names of further groups of lines, see `evaluation.lane_groups`.
         dims: 3 measures heights, too; only labelled lines have them.
         frame_groups: names of groups of frames.

@@ -97,17 +97,17 @@ def predicted_batches(
     memory = task.start() if task.streams else None
     for indices, batch in ordered_batches(arrays, batch_size, part):
         if task.streams:
-            memory, answers = _called(predict_stream, task, params, memory, batch)
+            memory, answers = _run_compiled(predict_stream, task, params, memory, batch)
         else:
             rows = divided(batch, mesh) if mesh is not None else batch
-            answers = _called(predict_batch, task, params, rows, mesh)
+            answers = _run_compiled(predict_batch, task, params, rows, mesh)
             if part[1] > 1:
                 batch = all_rows(batch if needed is None else needed(batch))
         answers, kept = jax.device_get(answers), slice(len(indices))
         yield indices, batch, jax.tree.map(lambda leaf, kept=kept: leaf[kept], answers)
 
 
-def _called(program: Any, task: Predictor, *arguments: Any) -> Any:
+def _run_compiled(program: Any, task: Predictor, *arguments: Any) -> Any:
     """Return `program(task, *arguments)`; what it has to compile first is shown, and can be interrupted."""
     leaves, tree = jax.tree.flatten(arguments)
     kinds = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves if not isinstance(leaf, Mesh))

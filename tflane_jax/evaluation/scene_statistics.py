@@ -1,4 +1,4 @@
-"""What a frame is like: quantities of its lanes, areas and road users, to lay datasets beside each other."""
+"""Quantities of a frame's lanes, areas and road users, by which datasets are compared."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def _gradients(query, key, value, weights, out, gradient):
     """Return the gradients of query, key and value.
 
     Args:
-        query, key, value: with 0 in the slots that nobody sees.
+        query, key, value: 0 for queries that see no key, and in slots that no query sees.
         weights: exp(logits) up to a factor per row.
         out: the result of attention.
         gradient: of the result, divided by the sum of the row's weights.

@@ -48,8 +48,8 @@ class DeformableAttention(nn.Module):
         dim: channels in and out.
         heads, points: sampling points per head and level.
         levels: number of value levels.
-        initial: initial offsets. "compass": each head looks in its own direction (Deformable DETR); "star": each head
-            looks in all directions around its own reference point (LaneSegNet's LaneAttention).
+        initial: initial offsets. "compass": each head samples in its own direction (Deformable DETR); "star": each head
+            samples in all directions around its own reference point (LaneSegNet's LaneAttention).
     """
 
     dim: int

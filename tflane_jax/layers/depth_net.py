@@ -1,6 +1,6 @@
 """Depth of image cells as a distribution over bins, and features to be lifted by it (BEVDepth, Li et al. 2023).
 
-The network knows the cameras: their parameters gate its channels.
+The parameters of the cameras are inputs too: they gate the channels.
 """
 
 from __future__ import annotations

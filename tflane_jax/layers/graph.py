@@ -65,7 +65,7 @@ class ElementGraphConvolution(nn.Module):
 
     @nn.compact
     def __call__(self, elements: ElementNodes) -> Float[Array, "q d"]:
-        """Return what every lane receives."""
+        """Return the sum of messages to every lane."""
         (_, c), classes = elements.features.shape, elements.logits.shape[-1]
         init = nn.initializers.xavier_uniform(batch_axis=0)
         kernel = self.param("kernel", init, (classes, c, self.dim))

@@ -114,7 +114,7 @@ def _slope(offset, several):
 
 
 def _neighbours(shapes, heads, points) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each sample (J,) how many rows of the table further its right and its lower cells stand."""
+    """Return for each sample (J,) the offsets, in rows of the table, to the cell on its right and to that below."""
     right, lower = ([heads * (w > 1) for _, w in shapes], [heads * w * (h > 1) for h, w in shapes])
     return np.repeat(right, points), np.repeat(lower, points)
 

@@ -102,7 +102,7 @@ class Partition(Protocol):
         ...
 
     def members(self, group: str, truth: TrueLanes) -> Bool[np.ndarray, " g"]:
-        """Return which of the true lanes belong to a group; raise UserError if the truth does not tell."""
+        """Return which of the true lanes belong to a group; raise UserError if the truth lacks what decides it."""
         ...
 
 
@@ -174,7 +174,7 @@ class GroupedMetrics(Generic[FrameT]):
         partition: of the lanes; its groups are reported.
         groups: which of "all" and the groups of the partition to report; default all of them.
         frame_groups: names of groups of frames, which are measured like `all` on these frames alone.
-        lane_groups: names of further groups of lanes, which may overlap; the caller tells their members.
+        lane_groups: names of further groups of lanes, which may overlap; the caller gives their members.
     """
 
     def __init__(

@@ -162,7 +162,7 @@ def _nearest_of_all(
     far: Bool[np.ndarray, " p"],
     nearest: Int[np.ndarray, " p"],
 ) -> Int[np.ndarray, " p"]:
-    """Return the nearest true line of every detection, also of the `far` ones, which the measure does not tell."""
+    """Return the nearest true line of every detection, also of the `far` ones, for which `nearest` is arbitrary."""
     i, j = np.nonzero(same & far)
     rough_true, rough_found = (
         PaddedLines(points, np.full(len(points), points.shape[1]))

@@ -125,7 +125,7 @@ def _range(rows: Float[np.ndarray, " h"]) -> str:
 
 def _checked(x: Float[np.ndarray, "l h"], rows: int, what: str) -> Float[np.ndarray, "l h"]:
     x = np.asarray(x, np.float64)
-    if x.ndim and len(x) == 0:  # no lanes: an empty list does not know its rows
+    if x.ndim and len(x) == 0:  # no lanes: an empty list has no number of rows
         return np.zeros((0, rows))
     if x.ndim != 2 or x.shape[1] != rows:
         raise UserError(

@@ -57,8 +57,8 @@ class BevFormerConfig:
             `bevformer.check_capacity` checks it against a frame.
         memory: "previous": temporal attention reads the BEV features of the previous frame; "off": every frame stands
             alone, as in a host that was trained on single frames. The parameters are the same.
-        motion: "moved": the queries know the motion since the previous frame, none without one. "can_bus": they know
-            heading, acceleration, rates and velocity, as published weights do (`VehicleState.can_bus`), and no motion
+        motion: what is embedded in the queries. "moved": the motion since the previous frame, 0 without one. "can_bus":
+            heading, acceleration, rates and velocity, as for published weights (`VehicleState.can_bus`), and no motion
             since the previous frame.
         align: how previous features are brought into the present frame, see the module docstring.
         rotation_center: centre of the rotation as (column, row), in cells from the grid's corner, unless `align` is

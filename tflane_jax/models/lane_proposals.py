@@ -1,9 +1,9 @@
-"""Dense lane proposals: BEV cells vote for lanes whose middle they hold, and the best become queries of the decoder.
+"""Dense lane proposals: BEV cells predict lanes whose middle lies in them; the best become queries of the decoder.
 
-Not part of the lane papers. A heat map tells for every BEV cell whether the middle of a lane lies there, in bins of its
-heading. A shape head gives the lane's points relative to the cell, in the frame of the bin. The best cells after
-suppression are the decoder's reference lanes, and their features its queries. Every cell learns from every
-frame, where a learned query learns from the lanes that it is matched with only: small models need that.
+Not part of the lane papers. A heat map scores every BEV cell: does the middle of a lane lie there, in bins of its
+heading? A shape head gives the lane's points relative to the cell, in the frame of the bin. The best cells after
+suppression are the decoder's reference lanes, and their features its queries. Every cell learns from every frame,
+whereas a learned query learns only from the lanes that it is matched with: small models need that.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ are the same. The map-element-bucket variant has decoders of their own for areas
 Source: docs/reference/lanesegnet.md.
 
 Read from top to bottom: `Host.__call__` encodes, `decode_example` adds the truth that training may use, `decode` calls
-`lane_denoising.decode_lanes`, and this calls `decode_queries`, the decoder layer by layer. In between stands only what
-makes the queries: the paper's learned ones (`LaneQueries`) and, in small models, proposals and noised segments.
+`lane_denoising.decode_lanes`, and this calls `decode_queries`, the decoder layer by layer. Between these calls, only
+queries are made: the paper's learned ones (`LaneQueries`) and, in small models, proposals and noised segments.
 """
 
 from __future__ import annotations

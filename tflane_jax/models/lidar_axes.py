@@ -37,7 +37,7 @@ def raster_in_ego_axes(raster: Float[Array, "*b y x"]) -> Float[Array, "*b x y"]
 
 
 def lidar_from_ego(example: Example) -> Float[Array, "4 4"]:
-    """Return the lidar's pose in which cameras are seen; for data that do not tell it, a quarter turn."""
+    """Return the lidar's pose, to which cameras are moved; for data without one, a quarter turn."""
     vehicle = None if example.cameras is None else example.cameras.vehicle
     if vehicle is None:
         return invert_pose(yaw_pose(*jnp.array([0.0, 0.0, -math.pi / 2])))

@@ -43,8 +43,8 @@ class LiftConfig:
         depth: first, last (excluded) and size of the depth bins, metres.
         pyramid: channels of each branch of the dilated convolutions in the depth network.
         dropout: probability in the depth network.
-        image_scale: of the images, relative to the camera's own. The depth network knows the cameras' native
-            intrinsics and this scale.
+        image_scale: of the images, relative to the camera's own. Inputs of the depth network are the cameras'
+            native intrinsics and this scale.
         supervised: whether the network learns the depth of image cells, for which the training data must have it.
         precision: dtype of convolutions, see `layers.precision`; parameters, depth and BEV features are float32.
         remat: recompute the activations of depth network and convolutions for the gradient instead of keeping them.
@@ -167,7 +167,7 @@ class LiftEncoder(nn.Module):
         points = jnp.where(valid[..., None, None], points, jnp.nan)
         features = jnp.where(valid[..., None], features, 0.0)
         if cameras.vehicle is not None:
-            # The depth network knows the cameras' poses in the vehicle's own frame.
+            # The depth network gets the cameras' poses in the vehicle's own frame.
             with jax.default_matmul_precision("highest"):
                 own = pose @ invert_pose(jnp.asarray(cameras.vehicle.vehicle_from_ego))[None]
             pose = jnp.where(valid, own, eye)
@@ -227,7 +227,7 @@ def ray_points(
 def camera_vector(
     native: Float[Array, "v 2 3"], affine: Float[Array, "v 2 3"], camera_from_ego: Float[Array, "v 4 4"]
 ) -> Float[Array, "v 22"]:
-    """Return the parameters that the depth network knows of each camera.
+    """Return the parameters of each camera that are inputs of the depth network.
 
     Focal lengths and centre of the native image, the rows of the affine map, and the camera's pose in the ego frame
     (3 x 4).

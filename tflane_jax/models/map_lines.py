@@ -130,7 +130,7 @@ class NoisedLines(nn.Module):
     """Queries placed on noised map lines, for training (`models.lane_denoising`).
 
     Attributes:
-        config: sizes and forms, with anchors "spread": only then do the queries tell where their points are.
+        config: sizes and forms, with anchors "spread": only then do the queries encode where their points are.
         noise: added to the lines.
         range: the box that normalised coordinates span.
     """

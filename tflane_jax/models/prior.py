@@ -72,7 +72,7 @@ class HostQueries(NamedTuple):
     Attributes:
         features: (Q, D).
         position: (Q, D) position encoding.
-        reference: (Q, P, 2 or 3) the line, or single point, at which each query looks, in [0, 1] of
+        reference: (Q, P, 2 or 3) reference line, or single reference point, of each query, in [0, 1] of
             `HostSpec.bev_range`.
         mask: (Q, Q) [i, j] query i may attend to query j; None: all to all. A host with groups of
             queries that must not exchange information (MapTRv2's one-to-one and one-to-many groups) masks them here.

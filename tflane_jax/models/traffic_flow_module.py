@@ -47,7 +47,7 @@ class TrafficFlowModuleConfig:
         fusions: which of the four fusion modules are used, "Pipe." in Table 5: `ALL_FUSIONS` or `LANE_FUSIONS`.
         depth: temporal self-attention layers, "Dep." in Table 5 as we read it.
         spatial_depth: how often the spatial encoder repeats the fusion modules, each time with separate parameters;
-            Eq. (3) follows once. The other reading of "Dep.": the text speaks of cross-attention layers.
+            Eq. (3) follows once. The other reading of "Dep.", because the text names cross-attention layers.
         residual: "fusion" adds to each fusion module its input; "none" leaves the original features to Eq. (3) alone,
             and only a query without a valid key keeps its own.
         token: an instance's token is computed from the mean of its valid frames after self-attention ("mean") and, in
@@ -221,10 +221,10 @@ class TemporalEncoder(nn.Module):
         last = weight.shape[1] - 1 - tokens.frame_valid[:, ::-1].argmax(-1)
         ends = jnp.stack([first, last], 1)[..., None]
         # Select frames before encoding them: otherwise XLA would encode all frames a second time.
-        located = self._where(*(jnp.take_along_axis(x, ends, 1) for x in (tokens.position, tokens.heading)))
+        located = self._encode_places(*(jnp.take_along_axis(x, ends, 1) for x in (tokens.position, tokens.heading)))
         return Mlp((self.dim, self.dim), name="token")(jnp.concatenate([mean, located.reshape(len(mean), -1)], -1))
 
-    def _where(self, position: Float[Array, "t n 3"], heading: Float[Array, "t n 2"]) -> Float[Array, "t n e"]:
+    def _encode_places(self, position: Float[Array, "t n 3"], heading: Float[Array, "t n 2"]) -> Float[Array, "t n e"]:
         """Encode position and heading."""
         if self.config.position_encoding == "sine":
             plane = position[..., :2] / SINE_METRES if self.coordinates == "metres" else position[..., :2]
@@ -234,7 +234,7 @@ class TemporalEncoder(nn.Module):
     def _embed(self, tokens: TrafficFlowTokens) -> Float[Array, "t n c"]:
         """Encode position, heading, size, category and age of every frame."""
         width, (instances, frames) = self.config.width, tokens.frame_valid.shape
-        x = nn.Dense(width, name="frame")(self._where(tokens.position, tokens.heading))
+        x = nn.Dense(width, name="frame")(self._encode_places(tokens.position, tokens.heading))
         category = nn.Embed(len(RoadUser), width, name="category")(tokens.category)
         size = nn.Dense(width, use_bias=False, name="size")(tokens.size)
         age = self.param("age", nn.initializers.normal(0.02), (frames, width))

@@ -1,4 +1,4 @@
-"""Pictures of what a lane owes to road users: bands along lanes, numbered tracks, bars, scores while users go."""
+"""Pictures of how a lane depends on road users: bands along lanes, numbered tracks, bars, scores without road users."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def draw_bars(
 
 
 def draw_removal(ax: Axes, scores: Mapping[str, Float[Array, " n"]], *, title: str) -> None:
-    """Draw scores of a lane after 0, 1, 2, ... road users were taken away, a curve for each order by name."""
+    """Draw scores of a lane after 0, 1, 2, ... road users were removed, a curve for each order by name."""
     for name, curve in scores.items():
         ax.plot(np.arange(len(curve)), np.asarray(curve), marker="o", ms=3, lw=1.4, label=name)
     ax.set_ylim(bottom=0.0)

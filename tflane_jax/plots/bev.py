@@ -157,10 +157,10 @@ def draw_traffic(ax: Axes, flow: TrafficFlow) -> None:
         return
     colours = to_rgba_array([style.ROAD_USER[RoadUser(c)] for c in category])
     frames = valid.shape[1]
-    who, when = np.nonzero(valid[:, 1:] & valid[:, :-1])
-    trail = np.stack([position[who, when, :2], position[who, when + 1, :2]], 1)
-    fading = colours[who]
-    fading[:, 3] = 0.08 + 0.8 * (when + 1) / max(frames - 1, 1)
+    user, frame = np.nonzero(valid[:, 1:] & valid[:, :-1])
+    trail = np.stack([position[user, frame, :2], position[user, frame + 1, :2]], 1)
+    fading = colours[user]
+    fading[:, 3] = 0.08 + 0.8 * (frame + 1) / max(frames - 1, 1)
     ax.add_collection(LineCollection(list(trail), colors=fading, linewidths=1.4, zorder=4.0))
 
     each, last = np.arange(len(valid)), frames - 1 - np.argmax(valid[:, ::-1], axis=1)

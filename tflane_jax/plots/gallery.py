@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from tflane_jax.datasets.base import Dataset
 
 _PANEL_WIDTH = 4.8  # inches
+# Of a contact sheet with two examples side by side: text stays readable where a page shows the whole sheet.
+_SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI = 3.4, 150
+# Room for the legend: with less, the titles of a single row are cut off.
+_FOOTER = 0.9
 # More panels than this are wrapped to the next line.
 _MOST_COLUMNS = 7
 
@@ -67,7 +71,7 @@ def save_examples(
     true = truth_layers(next(iter(predictions.values()), None))
     panels = 2 + len(predictions)
     lines = -(-panels // _MOST_COLUMNS)
-    figure, axes = new_figure(count * lines, -(-panels // lines), panel=panel_size(view), footer=0.5)
+    figure, axes = new_figure(count * lines, -(-panels // lines), panel=panel_size(view), footer=_FOOTER)
     for row, title in enumerate(titles):
         example, (truth, seen, *places) = pick(examples, row), axes[row * lines : (row + 1) * lines].flat
         columns, unused = places[: len(predictions)], places[len(predictions) :]
@@ -117,8 +121,8 @@ def show_dataset(
     if len(dataset) == 0 or count < 1:
         raise UserError(f"nothing to show: {dataset.name} has {len(dataset)} examples, {count} asked for")
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).round().astype(int))
-    pairs = 2 if len(chosen) > 1 else 1
-    figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view), footer=0.5)
+    pairs, inches, dpi = (2, _SMALL_PANEL_WIDTH, _SMALL_PANEL_DPI) if len(chosen) > 1 else (1, _PANEL_WIDTH, 110)
+    figure, axes = new_figure(-(-len(chosen) // pairs), 2 * pairs, panel=panel_size(view, inches), footer=_FOOTER)
     true: tuple[Layer, ...] = ()
     for (truth, seen), index in zip(axes.reshape(-1, 2), chosen.tolist(), strict=False):
         example, info = dataset.example(index), dataset.info(index)
@@ -137,7 +141,7 @@ def show_dataset(
     hide_unused(axes, 2 * len(chosen))
     label_edges(axes)
     add_legend(figure, "scenes", drawn=true)
-    return save_figure(figure, out)
+    return save_figure(figure, out, dpi=dpi)
 
 
 def add_legend(

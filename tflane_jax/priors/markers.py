@@ -28,9 +28,9 @@ class MarkerPriorConfig:
         distance_scale: tau_d of Eq. (2), metres.
         residual_scale: tau_r of Eq. (2), metres.
         use_score: multiply the confidence by the detector's raw score, an addition that the paper mentions.
-        trust: "confidence" is Eq. (2). "all" gives every detected marker the confidence 1, so that nothing that depends
-            on it tells markers apart: their order (then by distance), their share in a frame, and when memory is read
-            (then only when nothing is detected).
+        trust: "confidence" is Eq. (2). "all" gives every detected marker the confidence 1, so that it no longer
+            decides their order (then by distance), their weight in a frame, or when memory is read (then only when
+            nothing is detected).
     """
 
     points: Annotated[int, at_least(2)] = 11

@@ -68,8 +68,8 @@ class VectorMap:
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks of unlimited height.
         roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
-        dividers: painted dividers (n, 3) where the source records them on their own; None where the sides of its lanes
-            are all there is.
+        dividers: painted dividers (n, 3) where the source records them on their own; None if it records only the sides
+            of lanes.
     """
 
     segments: dict[int, LaneSegment]
@@ -174,7 +174,7 @@ class Log:
         paint_wear: 0 (fresh) to 1 (gone); weakens lane paint.
         seed: of all random numbers in rendering this log.
         markers: fiducial markers beside the road; None if there are none.
-        area: place, such as a city, in whose coordinates the log is; "" if the source does not tell.
+        area: place, such as a city, in whose coordinates the log is; "" if it is unknown.
         relief: hilly ground of a simulated drive; None on level ground and for recorded logs.
     """
 

@@ -124,10 +124,10 @@ class MapLines:
         category: (L,) `LineClass`.
         closed: (L,) the line is a ring; its start is arbitrary.
         valid: (L,).
-        visibility: (L,) fraction of the line in direct line of sight, 0 to 1; None if the source cannot tell.
+        visibility: (L,) fraction of the line in direct line of sight, 0 to 1; None if it is unknown.
         identity: (L,) number of the line in its map, the same in every frame of a scene, for dividers, crossings and
             boundaries; pieces of one line share it. Paths of centerlines change with the range and have none. None if
-            the source cannot tell.
+            it is unknown.
         dense: (L, S, 3) points equally spaced along the lines as the source has them, which the evaluation measures;
             `points`, which a model learns, cut corners. None if `points` are all that is known.
     """

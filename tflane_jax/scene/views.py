@@ -54,7 +54,7 @@ class CameraViews:
         depth: (V, h, w) depth of the nearest surface in square cells of the image array, metres along the optical axis;
             only for training. None if it is not known.
         depth_valid: (V, h, w) a surface was measured in the cell.
-        vehicle: frames that published weights know; None where the data do not tell them.
+        vehicle: frames and bus signals that published weights need; None if the data have none.
     """
 
     image: UInt8[Array, "v h w 3"]

@@ -137,7 +137,7 @@ def _check_inputs(model: HostConfig, config: ExampleConfig, *, images: bool) -> 
 
 
 def _check_scale(model: HostConfig, image_scale: float | None) -> None:
-    """The lift's depth network is told by which factor images are smaller than the camera's own."""
+    """Raise UserError if the lift's depth network is configured for images of another scale."""
     encoder = model.encoder
     if image_scale is None or not isinstance(encoder, CameraEncoderConfig) or not isinstance(encoder.bev, LiftConfig):
         return

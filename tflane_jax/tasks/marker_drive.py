@@ -61,7 +61,7 @@ class DriveModel:
 
     @property
     def interval(self) -> float:
-        """Seconds between the frames of training; the paper's where the data do not tell."""
+        """Seconds between the frames of training; the paper's if the data have no fixed rate."""
         return source_of(self.source).interval(self.source) or INTERVAL
 
 

@@ -1,8 +1,8 @@
-"""Lane lines in a photo of any camera: where the camera is not known, the view is searched that suits the network.
+"""Lane lines in a photo of any camera: for an unknown camera, the view that suits the network is searched.
 
-The network knows one camera, TuSimple's. Cutting sky off the top moves the horizon to its row, and cutting the sides
-makes a wide lens its own. Which cut is right shows in the result: lanes meet in one point on the horizon, do not cross,
-and lie on paint (`evaluation.photo_lanes`).
+The network was trained on one camera, TuSimple's. Cutting sky off the top moves the horizon to its row, and cutting the
+sides gives a wide lens its field of view. With the right cut, the predicted lanes meet in one point on the horizon, do
+not cross, and lie on paint (`evaluation.photo_lanes`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tflane_jax.tasks.lane_shape import predict_curves
 _HORIZONS = (0.3, 0.36, 0.42, 0.48, 0.54, 0.6)
 _WIDTHS = (1.0, 0.75, 0.55)
 _FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
-# The value from which a photo is seen whole without a search (TuSimple's ten frames at hand have 0.23 or more), and the
+# The value from which a whole photo is taken without a search (TuSimple's ten frames at hand have 0.23 up), and the
 # ranks from which a view is taken without a warning, and taken at all.
 _SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
 _POINTS = 100
@@ -61,7 +61,9 @@ class PhotoLanes:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _ViewLanes:
+    """Lanes that the network finds in a view, fractions of the view, and how plausible they are."""
+
     view: Placement
     lanes: list[Float[np.ndarray, "p 2"]]
     scores: Float[np.ndarray, " l"]
@@ -90,7 +92,7 @@ class PhotoReader:
             view = fit_photo(photo, camera).placement
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
         if camera is not None and (camera.focal is not None or camera.horizon is not None):
-            return self._checked(photo, self._see(photo, grey, camera), known=True)
+            return self._checked(photo, self._of_camera(photo, grey, camera), known=True)
         return self._checked(photo, self._search(photo, grey), known=False)
 
     def find_view(self, photos: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Placement | None:
@@ -100,15 +102,15 @@ class PhotoReader:
         return None if best is None or best.judged.rank < _LEAST else best.view
 
     def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement, *, known: bool = False) -> PhotoLanes:
-        """Return the lanes that a view of a photo shows; `known` tells that it was not searched."""
+        """Return the lanes that a view of a photo shows; `known`: the view was given, not searched."""
         grey = _grey(photo)
         if is_blank(grey):
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
-        return self._checked(photo, self._look(photo, grey, view), known=known)
+        return self._checked(photo, self._in_view(photo, grey, view), known=known)
 
-    def _search(self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"]) -> _Seen:
+    def _search(self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"]) -> _ViewLanes:
         height, width = grey.shape
-        whole = self._see(photo, grey, PhotoCamera())
+        whole = self._of_camera(photo, grey, PhotoCamera())
         if whole.judged.value >= _SURE:
             return whole
         tried = {whole.view: whole}
@@ -125,15 +127,15 @@ class PhotoReader:
                     self._try(tried, photo, grey, PhotoCamera(FOCAL * width * part, meeting[1], column))
         return max(tried.values(), key=lambda seen: seen.judged.rank)
 
-    def _try(self, tried: dict[Placement, _Seen], photo, grey, camera: PhotoCamera) -> None:
+    def _try(self, tried: dict[Placement, _ViewLanes], photo, grey, camera: PhotoCamera) -> None:
         view = fit_photo(photo, camera).placement
         if view not in tried:
-            tried[view] = self._look(photo, grey, view)
+            tried[view] = self._in_view(photo, grey, view)
 
-    def _see(self, photo, grey, camera: PhotoCamera) -> _Seen:
-        return self._look(photo, grey, fit_photo(photo, camera).placement)
+    def _of_camera(self, photo, grey, camera: PhotoCamera) -> _ViewLanes:
+        return self._in_view(photo, grey, fit_photo(photo, camera).placement)
 
-    def _look(self, photo, grey, view: Placement) -> _Seen:
+    def _in_view(self, photo, grey, view: Placement) -> _ViewLanes:
         fitted = fit_photo(photo, view)
         example = RoadImage(fitted.image, fitted.image_valid, LaneLines.empty(1, 1))
         stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], example)
@@ -147,9 +149,9 @@ class PhotoReader:
         lanes = np.stack([curve_columns(curves[:, 2:], rows), rows], -1)
         order = np.argsort(lanes[:, -1, 0], kind="stable")
         lanes, scores = list(lanes[order]), scores[chosen][order]
-        return _Seen(view, lanes, scores, judge_lanes(grey, view, lanes, scores))
+        return _ViewLanes(view, lanes, scores, judge_lanes(grey, view, lanes, scores))
 
-    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _Seen, *, known: bool) -> PhotoLanes:
+    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _ViewLanes, *, known: bool) -> PhotoLanes:
         """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing."""
         judged, (height, width) = seen.judged, photo.shape[:2]
         searched = not known and seen.view != fit_photo(photo).placement

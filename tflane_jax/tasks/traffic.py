@@ -9,7 +9,7 @@ from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 
 def limit_instances(task: LaneGraphTask, count: int) -> LaneGraphTask:
-    """Return the task with at most `count` instances of traffic flow, those with the largest weights; 0 is without.
+    """Return the task with at most `count` instances of traffic flow, those with the largest weights; 0 removes it.
 
     Parameters stay the same. Raises UserError if the model takes no traffic flow or has fewer slots.
     """

@@ -152,7 +152,7 @@ class Checkpoints:
         Raises:
             UserError: the checkpoint is damaged, or belongs to another model or optimiser.
         """
-        saved, shapes = _as_now(self.arrays(step)), jax.eval_shape(_plain_tree, template)
+        saved, shapes = _with_current_names(self.arrays(step)), jax.eval_shape(_plain_tree, template)
         expected = serialization.to_state_dict(shapes)
         if (difference := _first_difference(saved, _flat(expected))) is not None:
             raise UserError(
@@ -303,7 +303,7 @@ def _plain(state: TrainState) -> dict[str, np.ndarray]:
     return _flat(serialization.to_state_dict(tree_of(jax.device_get(words))))
 
 
-def _as_now(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _with_current_names(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the arrays of a checkpoint by the names of this version: Muon's state was that of optax's Muon."""
     old = re.compile(r"(.*/inner_states/muon/inner_state/)0/inner_states/(?:muon/inner_state/0/(count|mu/.*)|.*)")
     found = [(name, old.fullmatch(name), array) for name, array in arrays.items()]

@@ -23,7 +23,7 @@ class StopRequest:
         self._before = {}
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._ask)
+                self._before[number] = signal.signal(number, self._on_signal)
         return self
 
     def at_once(self) -> None:
@@ -33,21 +33,21 @@ class StopRequest:
             raise Interrupted(self.signal)
 
     def after_the_step(self) -> None:
-        """Let a signal only be noted. One may have come that raised its error where Python ignores it."""
+        """Only set `signal` from now on. It may be set already: Python ignores errors raised in some places."""
         self._at_once = False
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
         del frame
         self.signal = number
-        self._put_back()
+        self._restore_handlers()
         if self._at_once:
             raise Interrupted(number)
 
-    def _put_back(self) -> None:
+    def _restore_handlers(self) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._put_back()
+        self._restore_handlers()

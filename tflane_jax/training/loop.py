@@ -170,7 +170,7 @@ def train(
                         f"{folder} was started with another configuration ({difference}): "
                         "resume it as it is, or start another run"
                     )
-                _tell(notices)
+                _print_notices(notices)
 
         from_first(claim)
         if count() == 1:
@@ -207,7 +207,7 @@ def train(
         first = step = int(states[0].step)
 
         def begin() -> None:
-            _tell(add_provenance(folder, **started_from))
+            _print_notices(add_provenance(folder, **started_from))
             write_text(folder / "config.txt", resolved_text)
             write_json(folder / "config.json", resolved)  # last: from here on the folder holds a run
 
@@ -330,6 +330,6 @@ def _unchanged(saved: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     return saved, []
 
 
-def _tell(notices: Sequence[str]) -> None:
+def _print_notices(notices: Sequence[str]) -> None:
     for notice in notices:
         write(notice)

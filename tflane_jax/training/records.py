@@ -66,14 +66,14 @@ class RecordWriter:
         self._path = path = folder / "metrics.jsonl"
         self.records = [record for record in read_records(path) if record["step"] <= step]
         write_text(path, "".join(_line(record) for record in self.records))
-        with self._told():
+        with self._write_errors():
             self._board = _Board(folder / "tensorboard", step + 1 if self.records else None)
             self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115 (closed by __exit__)
 
     def write(self, record: Record) -> None:
         """Append one record and flush the files; raises UserError where that fails."""
         self.records.append(record)
-        with self._told():
+        with self._write_errors():
             self._file.write(_line(record))
             self._file.flush()
             self._board.write(record)
@@ -85,11 +85,12 @@ class RecordWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         for file in (self._file, self._board):
-            with contextlib.suppress(OSError):  # what could not be written has been told by `write`
+            with contextlib.suppress(OSError):  # `write` has raised already
                 file.close()
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _write_errors(self) -> Iterator[None]:
+        """Raise UserError for an OSError inside the block."""
         try:
             yield
         except OSError as error:

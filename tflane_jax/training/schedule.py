@@ -114,7 +114,7 @@ class OptimConfig:
     drops: DropsConfig | None = None
 
     def limits(self) -> Rules:
-        """One rule lowers the learning rate, and what it is scaled by is known."""
+        """Only one rule lowers the learning rate, and a scaled one has a reference batch."""
         known = self.lr_scaling == "none" or self.reference_batch is not None
         yield "reference_batch", known, f"the batch size that optim.lr is for, with lr_scaling {self.lr_scaling!r}"
         alone = not self.epoch_steps or self.restarts is None
@@ -205,7 +205,7 @@ def make_optimizer(
         ValueError: the learning rate is not yet that of the batch, see `scaled_to_batch`.
     """
     _check(config, steps)
-    decay = _decay_what_learns(config.weight_decay)
+    decay = _decay_trained_leaves(config.weight_decay)
     if config.decayed == "kernels":
         decay = optax.masked(decay, is_decayed)
     adam = _preconditioner(config, whole)
@@ -224,7 +224,7 @@ def _clip_by_norm(largest: float) -> optax.GradientTransformation:
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
-def _decay_what_learns(rate: float) -> optax.GradientTransformation:
+def _decay_trained_leaves(rate: float) -> optax.GradientTransformation:
     """Add `rate` times the parameters, except to leaves whose update is zero everywhere.
 
     These are the frozen parts of a backbone, which PyTorch does not pass to the optimiser at all.

@@ -1,4 +1,4 @@
-"""A drive seen in a mirror: what drove on the right drives on the left.
+"""The mirror image of a drive: right-hand traffic becomes left-hand traffic.
 
 The traffic of the built-in world keeps to the right: right of way, routes, parking and the sides of roads follow from
 it. Left-hand traffic is its mirror image, y -> -y in global coordinates.

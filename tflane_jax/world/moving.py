@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from tflane_jax.scene.logs import LaneSegment, Log, Tracks, VectorMap
 
-# Straight lines get a vertex every so many metres, to follow what becomes of the ground.
+# Straight lines get a vertex every so many metres, so that they follow a deformed ground.
 _STEP = 4.0
 Move = Callable[[Float[np.ndarray, "_ 3"]], Float[np.ndarray, "_ 3"]]
 """Lines or points, global metres -> where they are now; a line may get further vertices."""

@@ -119,7 +119,7 @@ class Place:
 def _chosen_by_sight(
     vector_map: VectorMap, scene_id: int, config: WorldConfig, warp: Warp | None, mirror: bool
 ) -> tuple[Visible, ...]:
-    """Return what a surveyor sees of a board, on the ground as it is shown: trees stand where that map lets them."""
+    """Return the visibility test by which boards are placed, on the map as it is shown, which determines the trees."""
     if config.markers.site != "clear":
         return ()
     shown = vector_map if warp is None else warped_map(vector_map, warp)
@@ -209,7 +209,7 @@ def simulate(
 
 
 def _shown(log: Log, scene_id: int, config: WorldConfig, warp: Warp | None, mirror: bool) -> Log:
-    """Return a scene, simulated on level ground with right-hand traffic, as the configuration wants it."""
+    """Return a scene, simulated level and with right-hand traffic, bent, mirrored, turned and raised as configured."""
     log = log if warp is None else warped(log, warp)
     log = mirrored(log) if mirror else log
     if config.view_turn > 0.0:

@@ -1,7 +1,7 @@
 """A drive in which the vehicle's frame does not point where the vehicle drives.
 
-Roads run along the x axis of a vehicle that drives straight on. A model that has only seen such frames knows roads at
-other angles only from junctions; in a turned frame all angles are alike.
+Roads run along the x axis of a vehicle that drives straight on. A model trained on such frames alone meets roads at
+other angles only at junctions; with turned frames, all angles are equally frequent.
 """
 
 from __future__ import annotations

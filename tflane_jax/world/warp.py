@@ -1,8 +1,8 @@
 """A drive on bent ground plans: the same roads and traffic, stretched, sheared and bent.
 
 Junctions get other angles, straight roads bend, lanes and distances get other widths and lengths. Everything moves with
-the ground: lanes, kerbs, road users, the ego vehicle. Vehicles keep their sizes. What the tracker saw stays what it saw
-before.
+the ground: lanes, kerbs, road users, the ego vehicle. Vehicles keep their sizes. Detections and occlusions of the
+tracker are those of the scene before it was bent.
 """
 
 from __future__ import annotations

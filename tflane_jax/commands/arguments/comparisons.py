@@ -70,7 +70,7 @@ def compare(commands) -> None:
         help="score on which the treatment should change nothing, for example hidden-traffic/recall",
     )
     declared.add_argument(
-        "--secondary", metavar="GROUP/SCORE", help="score that is tested as well, corrected apart from --primary"
+        "--secondary", metavar="GROUP/SCORE", help="score that is tested as well, with a correction of its own"
     )
     declared.add_argument("--alpha", type=float, help="level of the corrected tests (default 0.05)")
     parser.set_defaults(takes_overrides=True)
@@ -85,7 +85,7 @@ def tables(commands) -> None:
         module="tables",
         function="run",
     )
-    parser.add_argument("names", metavar="TABLE", nargs="*", help="tf_lane.1, say")
+    parser.add_argument("names", metavar="TABLE", nargs="*", help="name of a table, such as tf_lane.1")
     parser.add_argument("--seeds", metavar="N", type=int, help="number of seeds (default: that of the table)")
     parser.add_argument(
         "--jobs",
@@ -149,8 +149,8 @@ def carry_over(commands) -> None:
         metavar="NAME",
         nargs="+",
         default=[],
-        help="of: generated, 'generated, right-hand traffic', 'generated on city', maps, mixed, 'mixed + BEV', "
-        "'generated without traffic', 'mixed without traffic' (default: all)",
+        help="models to train, of: generated, 'generated, right-hand traffic', 'generated on city', maps, mixed, "
+        "'mixed + BEV', 'generated without traffic', 'mixed without traffic' (default: all)",
     )
     parser.add_argument("--seeds", metavar="N", type=int, default=1, help="number of seeds (default 1)")
     parser.add_argument("--steps", metavar="N", type=int, help="updates of each run (default: the configuration's)")
@@ -210,7 +210,7 @@ def score(commands) -> None:
     parser.add_argument(
         "--by",
         choices=("scene", "distance", "occlusion"),
-        help="also report parts; distance and occlusion are for centerlines, lane segments and vector maps",
+        help="also report parts of the data; distance and occlusion are for centerlines, lane segments and vector maps",
     )
     parser.add_argument(
         "--bootstrap",

@@ -39,7 +39,7 @@ def data(commands) -> None:
         metavar="NAME[=PATH]",
         action="append",
         default=[],
-        help="lay the distributions of these data beside; PATH is their folder. May be repeated",
+        help="also count these data and compare the distributions; PATH is their folder. May be repeated",
     )
     stats.add_argument("--out", metavar="STEM", type=Path, help="with --beside: write STEM.md, STEM.json and STEM.png")
     stats.set_defaults(takes_overrides=True)
@@ -52,13 +52,13 @@ def data(commands) -> None:
         metavar="NAME",
         type=SourceName(checked=True),
         default="argoverse2",
-        help="of the dataset (default argoverse2)",
+        help="format of the dataset (default argoverse2)",
     )
     check.add_argument(
         "--tracks",
         metavar="PATH",
         type=Path,
-        help="folder of the logs of which OpenLane-V2's segments are parts: count and check the traffic flow, too",
+        help="folder of the source logs of OpenLane-V2's segments: count and check the traffic flow, too",
     )
     check.add_argument(
         "--whole-images",
@@ -104,7 +104,9 @@ def data(commands) -> None:
     maps.add_argument("root", metavar="FOLDER", type=Path, help="logs of Argoverse 2 or scenes of nuScenes")
     maps.add_argument("--logs", metavar="LOG", nargs="+", default=[], help="names of logs (default: all)")
     maps.add_argument("--scene", metavar="N", type=int, default=0, help="number of the simulated scene (default 0)")
-    maps.add_argument("--moment", type=_moment, default=0.7, help="of the recorded log, 0 to below 1 (default 0.7)")
+    maps.add_argument(
+        "--moment", type=_moment, default=0.7, help="time in the recorded log, 0 to below 1 (default 0.7)"
+    )
     maps.add_argument("--out", metavar="FILE", type=Path, default=Path("maps.png"), help="picture (default maps.png)")
     overlap = command(
         inner,
@@ -140,8 +142,10 @@ def cache(commands) -> None:
     clear = command(inner, "clear", "delete entries", module="cache", function="clear", epilog=where)
     chosen = clear.add_mutually_exclusive_group(required=True)
     chosen.add_argument("names", metavar="NAME", nargs="*", default=[], help="as `tflane cache list` gives them")
-    chosen.add_argument("--older", metavar="DAYS", type=float, help="all but weights that were not used for so long")
-    chosen.add_argument("--all", action="store_true", help="all entries but weights")
+    chosen.add_argument(
+        "--older", metavar="DAYS", type=float, help="delete all entries but weights that were not used for so long"
+    )
+    chosen.add_argument("--all", action="store_true", help="delete all entries but weights")
 
 
 def _moment(text: str) -> float:

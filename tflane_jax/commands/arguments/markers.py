@@ -10,7 +10,9 @@ from tflane_jax.commands.arguments.shared import command
 def markers(commands) -> None:
     """Add `tflane markers`."""
     parser = commands.add_parser(
-        "markers", help="detect fiducial markers, and write stores of their lanes", description="Fiducial markers."
+        "markers",
+        help="detect fiducial markers, follow drives, write stores of their lanes",
+        description="Fiducial markers.",
     )
     inner = parser.add_subparsers(dest="what", required=True, metavar="COMMAND")
     _marker_store(inner)
@@ -108,7 +110,9 @@ def _drive(inner) -> None:
         "--poses", metavar="FILE", type=Path, required=True, help="cameras, times and poses (docs/markers.md)"
     )
     run.add_argument("--model", metavar="RUN", type=Path, help="run folder of a model with cameras; default none")
-    run.add_argument("--today", metavar="YYYY-MM-DD", help="day on which entries are valid (default the present day)")
+    run.add_argument(
+        "--today", metavar="YYYY-MM-DD", help="day for which entries must be valid (default the present day)"
+    )
     run.add_argument(
         "--max-age-days", metavar="DAYS", type=int, help="leave out entries surveyed longer ago; default any age"
     )

@@ -9,7 +9,7 @@ from tflane_jax.commands.arguments.shared import OVERRIDES, command, example_arg
 _PREDICT = """Lane lines in photos and videos of any size:
   tflane predict RUN photo.jpg drive.mp4 folder/                     with a model trained by tflane
   tflane predict --config gtn_lane/lstr --weights lstr photo.jpg     with the published weights (docs/gtn_lane.md)
-The part of a photo that suits the model is searched; --focal and --horizon tell it where the camera is known."""
+The part of a photo that suits the model is searched, unless --focal and --horizon describe the camera."""
 
 
 def train(commands) -> None:
@@ -18,7 +18,11 @@ def train(commands) -> None:
     parser = command(
         commands, "train", "train a model", module="train", function="run", epilog=OVERRIDES, add_help=False
     )
-    parser.add_argument("--config", metavar="FILE[:NAME]", help="config file (.py), or one of its ablations")
+    parser.add_argument(
+        "--config",
+        metavar="FILE[:NAME]",
+        help="config file: path, or name such as tf_lane/toponet; NAME of an ablation",
+    )
     parser.add_argument("--out", metavar="RUN", type=Path, help="run folder (default runs/<name of the config file>)")
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
@@ -55,13 +59,13 @@ def evaluate(commands) -> None:
     parser.add_argument(
         "--topology",
         choices=("learned", "geometric"),
-        help="which lane follows which: as predicted, or with TopoLogic's score of end and start points added "
+        help="connections of lanes: as predicted, or with TopoLogic's score of end and start points added "
         "(default: the configuration's)",
     )
     parser.add_argument(
         "--errors",
         action="store_true",
-        help="also count lanes that are found with other ends, in part, or not at all, and detections likewise",
+        help="also count the lanes that are found with other ends, in part, or not at all, and the same of detections",
     )
     parser.add_argument(
         "--training-root",
@@ -85,7 +89,8 @@ def predict(commands) -> None:
     parser.add_argument(
         "--count",
         type=int,
-        help="examples, spread evenly over the split (default 8); more than there are: all. At most 16 are drawn",
+        help="number of examples, spread evenly over the split (default 8; more than there are: all); at most 16 are "
+        "drawn",
     )
     parser.add_argument(
         "--threshold",
@@ -95,7 +100,7 @@ def predict(commands) -> None:
     parser.add_argument(
         "--cameras",
         action="store_true",
-        help="of a model that reads no images: draw its predictions into rendered camera images too (built-in world)",
+        help="also draw predictions into rendered camera images, for a model that reads no images (built-in world)",
     )
     parser.add_argument("--focal", type=float, metavar="PIXELS", help="focal length of the photos' camera")
     parser.add_argument("--horizon", type=float, metavar="ROW", help="row of the horizon in the photos, pixels")
@@ -119,11 +124,11 @@ def submit(commands) -> None:
         "--out", metavar="FILE", type=Path, required=True, help="a pickle, or MapTR's nuscmap_results.json"
     )
     about = parser.add_argument_group("what OpenLane-V2's server asks for; not needed to score the file yourself")
-    about.add_argument("--method", default="", help="its name")
-    about.add_argument("--authors", nargs="+", default=[], metavar="NAME")
-    about.add_argument("--email", default="")
-    about.add_argument("--institution", default="", help="or company")
-    about.add_argument("--country", default="", help="or region, as in ISO 3166")
+    about.add_argument("--method", default="", help="name of the method")
+    about.add_argument("--authors", nargs="+", default=[], metavar="NAME", help="names of the authors")
+    about.add_argument("--email", default="", help="address of the submitter")
+    about.add_argument("--institution", default="", help="institution or company")
+    about.add_argument("--country", default="", help="country or region, as in ISO 3166")
 
 
 def convert(commands) -> None:

@@ -65,7 +65,7 @@ def hidden_points(
         target_height: height of the points, a scalar or one value per point.
         exclude: for each point the row of `boxes` that must not hide it (the actor's own box); any other number
             excludes nothing.
-        directions: `Directions.of(points)`, for points at which one looks again and again.
+        directions: `Directions.of(points)`, if the same points are tested repeatedly.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     occluders = _occluders(boxes, buildings)

@@ -10,17 +10,17 @@ from tflane_jax.world.bev.line_of_sight import hidden_points
 from tflane_jax.world.cameras.stage import map_boxes
 from tflane_jax.world.roads.markers import Visible
 
-# Where drivers look from: distances before the board, and to its side towards the road, metres; height of a camera.
+# Viewpoints of drivers: distances before the board, and to its side towards the road, metres; height of a camera.
 VIEWS = tuple((ahead, aside) for ahead in (8.0, 14.0, 22.0, 35.0, 50.0) for aside in (3.0, 6.0))
 _EYE = 1.45
-# Points of a board that are looked at, from its middle, as fractions of the side of its black square.
+# Points of a board that are tested, from its middle, as fractions of the side of its black square.
 _ACROSS = np.linspace(-0.6, 0.6, 7)
 
 
 def visible_places(vector_map: VectorMap, seed: int, size: float = 1.0, *, on_left: bool = False) -> Visible:
-    """Return the function that says which fraction of a board drivers see, in the scene of this map and seed.
+    """Return the function that gives the fraction of a board that drivers see, in the scene of this map and seed.
 
-    The mean over `VIEWS` of the fraction of the board that no static body hides; a surveyor knows no road users.
+    It is the mean over `VIEWS` of the fraction that no static body hides; road users do not count.
 
     Args:
         vector_map: as it is shown.

@@ -48,7 +48,7 @@ class _Cut:
 def with_access_roads(
     rng: np.random.Generator, segments: dict[int, LaneSegment], site: Site, setback: float, no_left: float
 ) -> dict[int, LaneSegment]:
-    """Return lanes as a map has them that knows the access roads of a site; the given ones stay as they are.
+    """Return the lanes of a map that includes the access roads of a site; the given lanes are not changed.
 
     The piece of a cut lane that leads to the next junction keeps the lane's id. A driveway stays one without lanes
     where its street cannot be cut: near a junction, a change of lanes or another cut.
@@ -58,7 +58,7 @@ def with_access_roads(
         segments: all lanes, with paired boundary vertices.
         site: its driveways, kerbs and islands.
         setback: mean distance between the end of a corner's rounding and the lanes that are cut, metres.
-        no_left: probability that nobody may turn left there.
+        no_left: probability that left turns are forbidden there.
     """
     found = dict(segments)
     numbers = count(max(segments, default=0) + 1)

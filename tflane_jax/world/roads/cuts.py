@@ -1,7 +1,7 @@
 """Where a map cuts lanes: before and behind intersections, not always at the stop line.
 
-Traffic drives on lanes that end at stop lines. Surveyors cut them where they see fit: at the stop line, where the
-kerb starts to turn, or some metres before. The road in between is then part of the connectors, and has no markings.
+Traffic drives on lanes that end at stop lines. Annotators of maps cut them at the stop line, where the kerb starts to
+turn, or some metres before. The road in between is then part of the connectors, and has no markings.
 """
 
 from __future__ import annotations

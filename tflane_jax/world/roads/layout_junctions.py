@@ -185,7 +185,7 @@ def _plan_staggered(rng: np.random.Generator, heading: float, config: RoadConfig
         arms = [replace(arm, origin=arm.origin + center) for arm, center in zip(arms, centers, strict=True)]
         whole = JunctionPlan(np.zeros(2), _spread([ahead, back, *arms]), radius, signals, tuple(centers))
         return JunctionsPlan((whole,))
-    # Nobody walks across the short lanes between the two.
+    # No pedestrian crossing on the short lanes between the two.
     link = replace(ahead, crossing=0.0)
     least = _to_stop(link, (back, arms[0]), radius) + _to_stop(seen_from_end(link, 0.0), (ahead, arms[1]), radius)
     stagger = max(stagger, least + _SHORTEST_LINK)

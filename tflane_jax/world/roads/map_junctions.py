@@ -1,7 +1,7 @@
 """Intersections of a recorded map: which connectors belong together, who gives way, where lights could stand.
 
-Recorded maps tell where lanes lead, not who may go first. Arms, turns, priorities and signal phases follow from the
-geometry by the rules of the built-in intersections (`right_of_way`).
+Recorded maps hold the connections of lanes, but no right of way. Arms, turns, priorities and signal phases follow from
+the geometry by the rules of the built-in intersections (`right_of_way`).
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from tflane_jax.world.roads.road_map import RoadMap, traffic_lanes
 _SEGMENTS, _ROADSIDE, _TRAFFIC = 160.0, 140.0, 350.0
 # An example is made at most this far from there, metres.
 _WITHIN = 90.0
-# An example may be made this far from where somebody drove, even if the map is complete for less, metres.
+# An example may be made this far from a recorded drive, even if the map is complete for less, metres.
 _LEAST_MARGIN = 5.0
 # Route of the ego vehicle before and after the middle of its examples, metres; and its least speed limit, m/s.
 _BEFORE, _AFTER, _SLOWEST = 260.0, 120.0, 4.0

@@ -24,10 +24,10 @@ class RoadMap:
         name: unique among the maps of a folder: the name of the log.
         source: dataset name.
         map: global metres; heights are ignored. `road_boundaries` may run in either direction.
-        places: (n, 2) where somebody drove or could drive, metres.
+        places: (n, 2) where a vehicle drove or could drive, metres.
         complete: distance from each place up to which every lane is in the map, metres.
         parked: (p, 3) x, y, yaw of places where vehicles were seen parked.
-        area: place, such as a city, in whose coordinates the map is; "" if the source does not tell.
+        area: place, such as a city, in whose coordinates the map is; "" if it is unknown.
     """
 
     name: str

@@ -7,10 +7,10 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.datasets.small_argoverse2 import FRAMES, MS, POSE, box, write, write_log
+from tests.datasets.small_argoverse2 import FRAMES, MAP, MS, POSE, box, points, write, write_log
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
-from tflane_jax.datasets.argoverse2_map import line_type
+from tflane_jax.datasets.argoverse2_map import line_type, read_map
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LineType, RoadUser
@@ -45,6 +45,14 @@ def test_reads_tracks_poses_and_map(folder):
     np.testing.assert_array_equal(boundary[0], boundary[-1])
     assert np.linalg.norm(np.diff(boundary[:, :2], axis=0), axis=-1).sum() == pytest.approx(2 * (40 + 18))
     assert set(boundary[:, 2]) == {0.5}
+
+
+def test_a_crossing_reaches_from_end_to_end_of_edges_with_more_points(tmp_path):
+    edges = {"edge1": points((0, 0), (0, 2), (0, 5)), "edge2": points((3, 0), (3, 5))}
+    path = tmp_path / "log_map_archive_log-a____PIT_city_1.json"
+    path.write_text(json.dumps(MAP | {"pedestrian_crossings": {"1": {"id": 1, **edges}}}))
+    (ring,) = read_map(tmp_path).crossings
+    np.testing.assert_array_equal(ring[:, :2], [(0, 0), (0, 5), (3, 5), (3, 0), (0, 0)])
 
 
 def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, tmp_path):

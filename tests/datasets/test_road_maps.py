@@ -219,6 +219,23 @@ def test_lanes_of_a_geojson_file_have_their_places_markings_and_successors(tmp_p
     assert len(prepare_roads(town, 1.8).spots(55.0)) > 10
 
 
+def test_a_map_across_the_180th_meridian_is_the_same_elsewhere(tmp_path):
+    def there(coordinates):
+        if not isinstance(coordinates[0], list):
+            return [(coordinates[0] - 10.0 + 360.0) % 360.0 - 180.0, coordinates[1]]  # 10 degrees east becomes 180
+        return [there(one) for one in coordinates]
+
+    plain, moved = crossroads_features(), crossroads_features()
+    for feature in moved:
+        feature["geometry"]["coordinates"] = there(feature["geometry"]["coordinates"])
+    longitudes = np.concatenate([f["geometry"]["coordinates"] for f in moved if "lane" in f["properties"]])[:, 0]
+    assert (longitudes.min(), longitudes.max()) == (pytest.approx(-180, abs=0.01), pytest.approx(180, abs=0.01))
+    here, across = (read_lanes(write(tmp_path / "town.geojson", features)) for features in (plain, moved))
+    for one, other in zip(here.map.segments.values(), across.map.segments.values(), strict=True):
+        np.testing.assert_allclose(other.centerline, one.centerline, atol=1e-6)
+    np.testing.assert_allclose(across.map.road_boundaries[0], here.map.road_boundaries[0], atol=1e-6)
+
+
 def test_a_map_as_tables_are_exported(tmp_path):
     """Every geometry as Multi..., truth as 0 and 1, and what a feature does not have as null."""
     features = crossroads_features()

@@ -118,7 +118,8 @@ def _mark(record: Any, name: str, where: str) -> LineType:
 
 
 def _crossing(record: Any, where: str) -> np.ndarray:
-    (a, b), (c, d) = (_points(record, edge, where, 2)[:2] for edge in ("edge1", "edge2"))
+    """Return the ring of a crossing: its four corners, the ends of its edges, for edges of more than two points too."""
+    (a, b), (c, d) = (_points(record, edge, where, 2)[[0, -1]] for edge in ("edge1", "edge2"))
     ring = np.stack([a, b, d, c, a])
     check_steps(ring, where)
     return ring

@@ -75,7 +75,10 @@ def read_lanes(path: Path) -> RoadMap:
             crossings.append((lines[0], name))
     if not lanes:
         raise UserError(f"{path} holds no lane: a lane is a LineString with the property `lane`, its id")
-    middle = np.concatenate([line for line, _, _ in lanes.values()]).mean(0)
+    degrees = np.concatenate([line for line, _, _ in lanes.values()])
+    if np.ptp(degrees[:, 0]) > 180.0:  # the map spans the 180th meridian
+        degrees[:, 0] %= 360.0
+    middle = degrees.mean(0)
     origin = Origin(latitude=float(middle[1]), longitude=float(middle[0]), heading=90.0)
     segments = _segments(
         {key: (_metres(line, origin, name), props, name) for key, (line, props, name) in lanes.items()}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import importlib
 import os
 import signal
@@ -50,6 +51,11 @@ def _called(options: argparse.Namespace, rest: Sequence[str]) -> int:
     except BrokenPipeError:  # `tflane ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:  # pathlib raises it wherever it looks for such a file
+            raise
+        print(f"tflane: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
 
 
 @contextlib.contextmanager

@@ -55,6 +55,23 @@ def test_a_crossing_reaches_from_end_to_end_of_edges_with_more_points(tmp_path):
     np.testing.assert_array_equal(ring[:, :2], [(0, 0), (0, 5), (3, 5), (3, 0), (0, 0)])
 
 
+def test_a_log_that_links_lead_to_twice_is_found_once_and_a_copy_is_refused(tmp_path):
+    log = write_log(tmp_path / "logs" / "log-a")
+    (tmp_path / "logs" / "loop").symlink_to(tmp_path / "logs")
+    assert find_logs(tmp_path / "logs") == [log]
+    shutil.copytree(log, tmp_path / "logs" / "copies" / "log-a")
+    with pytest.raises(UserError, match=r"holds the log log-a twice: take out .*/log-a or .*/log-a"):
+        find_logs(tmp_path / "logs")
+
+
+def test_maps_of_two_logs_in_one_folder_are_refused(folder):
+    other = folder / "map" / "log_map_archive_log-b____MIA_city_1.json"
+    other.write_text(json.dumps(MAP))
+    with pytest.raises(UserError, match=r"holds two maps, log_map_archive_log-a.* and log_map_archive_log-b"):
+        load_log(folder)
+    assert len(check_log(folder)) >= 1
+
+
 def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, tmp_path):
     openlane = tmp_path / "openlane"
     (openlane / "OpenLane-V2").mkdir(parents=True)

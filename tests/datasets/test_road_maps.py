@@ -153,8 +153,16 @@ def test_a_folder_without_maps_or_with_a_name_twice_is_refused(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         write(tmp_path / name / "town.geojson", [])
-    with pytest.raises(UserError, match="two maps with the name town"):
+    with pytest.raises(UserError, match=r"two maps with the name town: take out .*a/town.geojson or .*b/town.geojson"):
         find_maps(tmp_path)
+
+
+def test_folders_that_links_lead_to_twice_are_read_once(tmp_path):
+    (tmp_path / "maps" / "town").mkdir(parents=True)
+    write(tmp_path / "maps" / "town" / "town.geojson", crossroads_features())
+    for name, target in (("again", "town"), ("loop", "."), ("ring", "other"), ("other", "ring"), ("gone", "nowhere")):
+        (tmp_path / "maps" / name).symlink_to(target)
+    assert [one.name for one in find_maps(tmp_path / "maps")] == ["town"]
 
 
 def test_the_content_tells_changed_files(tmp_path):

@@ -7,6 +7,7 @@ https://argoverse.github.io/user-guide (sensor dataset; annotations.feather, cit
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -293,13 +294,21 @@ def check_log(folder: Path) -> list[str]:
 def find_logs(root: Path) -> list[Path]:
     """Return the log folders, sorted by log id, in a dataset root, a split, a folder of logs, or one log itself.
 
-    Raises UserError if there is none.
+    A log that links lead to twice is found once.
+
+    Raises UserError if there is none, or if two have the same id.
     """
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no {root}: name a folder of Argoverse 2 logs, or one log")
     patterns = ("", "*", "*/*", "sensor/*/*")
-    found = {path.parent for p in patterns for path in root.glob(f"{p}/{ANNOTATIONS}".lstrip("/"))}
+    paths = [path.parent for p in patterns for path in sorted(root.glob(f"{p}/{ANNOTATIONS}".lstrip("/")))]
+    found = sorted({path.resolve(): path for path in reversed(paths)}.values(), key=lambda path: path.name)
     if not found:
         raise UserError(
             f"{root} holds no Argoverse 2 log: no {ANNOTATIONS} in it, in */, in */*/ or in sensor/<split>/<log>/"
         )
-    return sorted(found, key=lambda path: path.name)
+    for one, other in itertools.pairwise(found):
+        if one.name == other.name:
+            raise UserError(f"{root} holds the log {one.name} twice: take out {one} or {other}")
+    return found

@@ -231,6 +231,8 @@ def _distance(points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]) 
 def find_scene_files(root: Path) -> list[Path]:
     """Return the file itself, or the npz files of a folder by name; raises UserError if there is none."""
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no {root}: name a scene file (npz) or a folder of them")
     found = [root] if root.is_file() else sorted(root.glob("*.npz"))
     if not found:
         raise UserError(f"{root} holds no scene file (*.npz)")

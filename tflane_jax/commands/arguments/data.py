@@ -51,7 +51,6 @@ def data(commands) -> None:
         "--format",
         metavar="NAME",
         type=SourceName(checked=True),
-        default="argoverse2",
         help="of the dataset (default argoverse2)",
     )
     check.add_argument(

@@ -13,7 +13,8 @@ import pytest
 
 from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_elements, fake_prediction
 from tests.shared import ROOT
-from tflane_jax.cli import build_parser, main
+from tflane_jax.cli import OneLineWarnings, build_parser, main
+from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.scene import Prediction
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -98,6 +99,16 @@ def test_help_imports_nothing_slow():
     code = "import sys; from tflane_jax.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     assert not {"jax", "numpy", "flax", "tyro", "matplotlib"} & set(loaded.split())
+
+
+def test_warnings_are_one_line_each_and_told_once(capsys):
+    others = []
+    show = OneLineWarnings(lambda message, category, *place: others.append(str(message)))
+    for text in ("more lanes", "more lanes", "more tracks"):
+        show(TruncationWarning(text), TruncationWarning, "file.py", 7)
+    show(UserWarning("of another package"), UserWarning, "file.py", 7)
+    assert capsys.readouterr().err == "tflane: warning: more lanes\ntflane: warning: more tracks\n"
+    assert others == ["of another package"]
 
 
 def test_a_run_folder_holds_everything(trained):
@@ -259,7 +270,7 @@ def test_several_seeds_are_evaluated_with_mean_and_deviation(config, tmp_path):
         (["eval", "RUN", "--root", "logs"], "add --data argoverse2"),
         (["predict", "RUN", "--out", "RUN/config.json"], "cannot write to"),
         (["predict", "RUN", "--count", "0", "--out", "x"], "nothing to predict"),
-        (["data", "check", "nowhere"], "nowhere holds no Argoverse 2 log"),
+        (["data", "check", "nowhere"], "there is no nowhere: name a folder of Argoverse 2 logs"),
     ],
 )
 def test_errors_are_one_line_without_a_traceback(arguments, message, config, trained, tmp_path, monkeypatch, capsys):

@@ -119,7 +119,9 @@ class SourceTracks:
             )
         log = replace(log, keyframes=(KeyFrame(time, global_from_ego, nearest),))
         stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)
-        flow, dropped = traffic_flow(log, 0, history=config.history, capacity=config.tracks, stride=stride)
+        flow, dropped = traffic_flow(
+            log, 0, history=config.history, capacity=config.tracks, stride=stride, region=config.ground
+        )
         warn_dropped(config, tracks=dropped)
         return flow
 

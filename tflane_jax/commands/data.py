@@ -126,7 +126,7 @@ def overlap_of_splits(options: argparse.Namespace) -> int:
     print(format_table(found.rows(), title=title))
     if found.worst():
         print("\n" + format_table(found.worst(), title="validation drives that overlap most"))
-    if any(drive.area == "unknown" for drive in (*train, *validation)):
+    if any(not drive.area for drive in (*train, *validation)):
         print("\nThese files do not name the city, so places of different cities may coincide by chance.")
     if options.out is not None:
         sides = {"train": str(options.train), "validation": str(options.validation)}

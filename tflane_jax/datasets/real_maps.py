@@ -182,10 +182,13 @@ class RealMapData:
 
 
 def _drives(config: RealMapConfig) -> list[Drive]:
-    """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated."""
+    """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated.
+
+    GeoJSON maps have coordinates of their own, which no recording shares.
+    """
     found = chosen_maps(config.maps, config.logs, config.without) if config.generated < 1.0 else []
     maps = [_read(one) for one in found]
-    return [Drive(one.name, one.area or one.source, one.places) for one in maps]
+    return [Drive(one.name, one.area, one.places) for one in maps if one.source != "geojson"]
 
 
 # Scenes of --data real-maps where the configuration has other data.

@@ -13,8 +13,7 @@ import pytest
 
 from tests.fakes import POINTS, FakeConfig, FakeDataset, fake_elements, fake_prediction
 from tests.shared import ROOT
-from tflane_jax.cli import OneLineWarnings, build_parser, main
-from tflane_jax.datasets.base import TruncationWarning
+from tflane_jax.cli import build_parser, main
 from tflane_jax.evaluation.lane_groups import LANE_GROUPS
 from tflane_jax.scene import Prediction
 from tflane_jax.tasks.lane_graph import LaneGraphTask
@@ -99,16 +98,6 @@ def test_help_imports_nothing_slow():
     code = "import sys; from tflane_jax.cli import build_parser; build_parser().format_help(); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
     assert not {"jax", "numpy", "flax", "tyro", "matplotlib"} & set(loaded.split())
-
-
-def test_warnings_are_one_line_each_and_told_once(capsys):
-    others = []
-    show = OneLineWarnings(lambda message, category, *place: others.append(str(message)))
-    for text in ("more lanes", "more lanes", "more tracks"):
-        show(TruncationWarning(text), TruncationWarning, "file.py", 7)
-    show(UserWarning("of another package"), UserWarning, "file.py", 7)
-    assert capsys.readouterr().err == "tflane: warning: more lanes\ntflane: warning: more tracks\n"
-    assert others == ["of another package"]
 
 
 def test_a_run_folder_holds_everything(trained):

@@ -1,13 +1,16 @@
 """The Argoverse 2 reader on a hand-made log and on damaged logs."""
 
+import gc
 import json
 import pickle
 import shutil
+import weakref
 
 import numpy as np
 import pytest
 
 from tests.datasets.small_argoverse2 import FRAMES, MAP, MS, POSE, box, points, write, write_log
+from tflane_jax.datasets import argoverse2
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
 from tflane_jax.datasets.argoverse2_map import line_type, read_map
@@ -121,6 +124,30 @@ def test_dataset_orders_logs_by_name_and_survives_pickling(folder):
     example.validate()
     np.testing.assert_array_equal(example.bev, dataset.example(3).bev)
     assert example.traffic_flow.valid.sum(-1)[:3].tolist() == [5, 1, 0]
+
+
+def test_logs_are_read_when_they_are_needed_and_few_are_kept(folder, monkeypatch):
+    shutil.copytree(folder, folder.with_name("log-b"))
+    read = []
+
+    def counted(path, **options):
+        made = load_log(path, **options)
+        read.append(weakref.ref(made))
+        return made
+
+    monkeypatch.setattr(argoverse2, "load_log", counted)
+    monkeypatch.setattr(argoverse2, "_KEPT", 1)
+    dataset = Argoverse2Dataset(Argoverse2Config(folder.parent))
+    assert (len(dataset), dataset.info(3).scene, dataset.info(3).area, read) == (4, "log-b", "PIT", [])
+    alone = load_log(folder)
+    for index, moment in enumerate(alone.keyframes):
+        found = dataset.info(index)
+        assert found.timestamp_ns == moment.timestamp_ns
+        np.testing.assert_array_equal(found.global_from_ego, moment.global_from_ego)
+    for index in range(4):
+        dataset.example(index)
+    gc.collect()
+    assert [one() is not None for one in read] == [False, True]
 
 
 def test_a_log_of_one_frame_or_of_furniture_only_is_an_empty_flow(folder):

@@ -127,6 +127,17 @@ def test_frames_in_which_nobody_is_are_written(tmp_path, first):
     assert len(read.tracks.uuid) == valid.any()
 
 
+def test_places_are_told_without_reading_annotations(written, tmp_path):
+    expected = opened(*written).info(1)
+    frames = Path(shutil.copytree(written[0], tmp_path / "frames"))
+    for path in frames.glob("val/*/info/*.json"):
+        text = path.read_text()
+        path.write_text(text[: text.index('"annotation"')] + "not read")
+    found = opened(frames, written[1]).info(1)
+    np.testing.assert_array_equal(found.global_from_ego, expected.global_from_ego)
+    assert (found.scene, found.timestamp_ns) == (expected.scene, expected.timestamp_ns)
+
+
 def test_the_source_logs_tell_the_city(written, written_b, tmp_path):
     frames, tracks = written
     assert opened(frames, tracks).info(0).area == ""  # these logs have no maps

@@ -209,16 +209,6 @@ def calibrated(part, **values):
     return lambda folder: change(info(folder), lambda content: content["sensor"]["CAM_FRONT"][part].update(values))
 
 
-def test_places_are_told_without_reading_annotations(folder):
-    expected = opened(folder).info(1)
-    for path in (folder / "train" / "01000" / "info").glob("*.json"):
-        text = path.read_text()
-        path.write_text(text[: text.index('"annotation"')] + "not read")
-    found = opened(folder).info(1)
-    np.testing.assert_array_equal(found.global_from_ego, expected.global_from_ego)
-    assert (found.scene, found.timestamp_ns, found.area) == (expected.scene, expected.timestamp_ns, "")
-
-
 @pytest.mark.parametrize(
     ("damage", "said"),
     [

@@ -13,11 +13,14 @@ from tests.world.small_map import crossroads
 from tflane_jax.datasets import road_maps
 from tflane_jax.datasets.geojson_lanes import read_lanes
 from tflane_jax.datasets.nuscenes_tables import TABLES
+from tflane_jax.datasets.real_maps import check_real_maps
 from tflane_jax.datasets.road_maps import chosen_maps, find_maps, road_map_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene import LineType
+from tflane_jax.world.mirror import mirrored_map
 from tflane_jax.world.roads.map_networks import prepare_roads
+from tflane_jax.world.roads.road_map import drives_on_left, driving_side
 
 # Degrees of a metre at the equator, near (0, 10).
 EAST, NORTH = 1 / 111_319.49, 1 / 110_574.28
@@ -91,7 +94,7 @@ def test_scenes_of_the_nuscenes_folder_have_the_map_around_them(tmp_path):
     assert [(x.name, x.kind) for x in (one, other)] == [("scene-0061", "nuscenes"), ("scene-0103", "nuscenes")]
     found = one.read()
     assert found.area == "singapore-onenorth"
-    assert len(found.map.segments) == 2
+    assert (len(found.map.segments), found.map.side) == (2, "left")
     np.testing.assert_allclose(found.places[:, 1], [1100.0, 1105.0, 1110.0, 1115.0], atol=0.5)
     before = one.content()
     path = tmp_path / "maps" / "expansion" / "singapore-onenorth.json"
@@ -244,6 +247,25 @@ def test_a_map_across_the_180th_meridian_is_the_same_elsewhere(tmp_path):
     np.testing.assert_allclose(across.map.road_boundaries[0], here.map.road_boundaries[0], atol=1e-6)
 
 
+@pytest.mark.parametrize("side", ["left", "right", None])
+def test_a_map_of_one_way_streets_keeps_to_the_side_that_it_tells(tmp_path, side):
+    told = {} if side is None else {"traffic": side}
+    streets = [lane(i, (0, 20 * i), (200, 20 * i), **told) for i in range(11)]
+    found = read_lanes(write(tmp_path / "town.geojson", streets)).map
+    assert driving_side(found) == side
+    assert driving_side(mirrored_map(found)) == {"left": "right", "right": "left", None: None}[side]
+    assert drives_on_left(found) == (side == "left")
+    (row,) = check_real_maps(tmp_path).rows
+    assert row["traffic keeps"] == (side or "right, assumed")
+
+
+def test_oncoming_lanes_say_more_than_what_a_map_tells(tmp_path):
+    features = crossroads_features()
+    for feature in features:
+        feature["properties"] |= {"traffic": "left"} if "lane" in feature["properties"] else {}
+    assert driving_side(read_lanes(write(tmp_path / "town.geojson", features)).map) == "right"
+
+
 def test_a_map_as_tables_are_exported(tmp_path):
     """Every geometry as Multi..., truth as 0 and 1, and what a feature does not have as null."""
     features = crossroads_features()
@@ -307,6 +329,8 @@ ARM = [(0, 0), (80, 0)]
         ([lane(1, *ARM) | {"properties": ["lane"]}], r"feature 0: properties is \['lane'\], expected a mapping"),
         ([lane(1, *ARM) | {"geometry": [1]}], r"feature 0: geometry is \[1\], expected a mapping"),
         ([lane(1, (0, 0), (4e6, 0))], "feature 0: points 0 and 1 are .* km apart"),
+        ([lane(1, *ARM, traffic="west")], "feature 0: traffic is 'west', expected left or right"),
+        ([lane(1, *ARM, traffic="left"), lane(2, *ARM, traffic="right")], "to the left on some lanes and to the right"),
         ([lane(1, *ARM, left="blue")], "feature 0: left is 'blue', expected one of none, solid, dashed"),
         ([lane(1, (0, 0), (0, 0))], "feature 0 is a lane without length"),
         ([lane(1, *ARM)], "too small a map: .*the most is 2 m"),

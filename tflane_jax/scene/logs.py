@@ -7,11 +7,14 @@ one moment into an `Example`. Global coordinates (city frame) stay float64. Only
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from tflane_jax.scene.marker_patterns import MarkerFamily
 from tflane_jax.scene.terrain import Terrain
+
+Side = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class VectorMap:
         roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
         dividers: painted dividers (n, 3) where the source records them on their own; None where the sides of its lanes
             are all there is.
+        side: on which traffic keeps, where the source tells it; see `world.roads.road_map.driving_side`.
     """
 
     segments: dict[int, LaneSegment]
@@ -79,6 +83,7 @@ class VectorMap:
     buildings: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
     roads: tuple[np.ndarray, ...] = ()
     dividers: tuple[np.ndarray, ...] | None = None
+    side: Side | None = None
 
 
 @dataclass(frozen=True)

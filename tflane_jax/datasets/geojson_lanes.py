@@ -76,7 +76,7 @@ def read_lanes(path: Path) -> RoadMap:
             crossings.append((lines[0], name))
     if not lanes:
         raise UserError(f"{path} holds no lane: a lane is a LineString with the property `lane`, its id")
-    sides = {_side(properties, name) for _, properties, name in lanes.values() if "traffic" in properties}
+    sides: set[Side] = {_side(properties, name) for _, properties, name in lanes.values() if "traffic" in properties}
     if len(sides) > 1:
         raise UserError(f"{path}: traffic keeps to the left on some lanes and to the right on others: choose one side")
     degrees = np.concatenate([line for line, _, _ in lanes.values()])
@@ -188,9 +188,10 @@ def _marking(properties: Mapping[str, Any], side: str, name: str) -> LineType:
 
 
 def _side(properties: Mapping[str, Any], name: str) -> Side:
-    if (side := properties["traffic"]) not in ("left", "right"):
-        raise UserError(f"{name}: traffic is {side!r:.40}, expected left or right")
-    return side
+    for side in ("left", "right"):
+        if properties["traffic"] == side:
+            return side
+    raise UserError(f"{name}: traffic is {properties['traffic']!r:.40}, expected left or right")
 
 
 def _flat(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:

@@ -159,7 +159,8 @@ def scene_log(
 
 def side_of(location: str) -> Side | None:
     """Return the side on which traffic keeps in a city of nuScenes; None for any other."""
-    return {"singapore": "left", "boston": "right"}.get(location.partition("-")[0])  # pyright: ignore[reportReturnType]
+    sides: dict[str, Side] = {"singapore": "left", "boston": "right"}
+    return sides.get(location.partition("-")[0])
 
 
 def scene_tracks(

@@ -1,10 +1,11 @@
 """Small made-up examples, predictions and a dataset, for tests that need no world."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
-from tflane_jax.datasets.base import FrameInfo
+from tflane_jax.datasets.base import FrameInfo, TruncationWarning
 from tflane_jax.scene import (
     Areas,
     CameraViews,
@@ -159,6 +160,15 @@ class FakeDataset:
     def info(self, index: int) -> FrameInfo:
         pose = np.eye(4) * (1 + 1 / 3)
         return FrameInfo("fake", f"scene {index // 2}", timestamp_ns=10**18 + index, global_from_ego=pose)
+
+
+class CrowdedDataset(FakeDataset):
+    """Warns at every example but the first."""
+
+    def example(self, index: int) -> Example:
+        if index > 0:
+            warnings.warn("more lanes than room", TruncationWarning, stacklevel=2)
+        return super().example(index)
 
 
 class BrokenDataset(FakeDataset):

@@ -131,3 +131,26 @@ def test_recorded_frames_are_drawn_beside_simulated_ones(tmp_path, monkeypatch, 
     write(tmp_path / "town.geojson", crossroads_features())
     assert main(["data", "maps", str(tmp_path), "--logs", "town"]) == 2
     assert "maps without recordings" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("data check ABSENT", "or one log; name other data with --format (openlane-v2,"),
+        ("data check --format real-maps ABSENT", "there is no ABSENT: name a folder of logs"),
+        ("data check --format nuscenes-scenes ABSENT", "there is no ABSENT: name a scene file"),
+        ("data check --format nuscenes ABSENT", "there is no folder ABSENT"),
+        ("data show --data recorded --root ABSENT", "there is no ABSENT"),
+        ("data check .", "holds no Argoverse 2 log"),
+        ("data check .", "name other data with --format"),
+        (f"data check {'n' * 300}", "File name too long"),
+        (f"data show --data street --count 1 --out {'n' * 300}.png", "File name too long"),
+    ],
+)
+def test_a_folder_that_is_not_there_is_told(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments.split()) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import importlib
 import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
+from typing import Any
 
 from tflane_jax.commands.arguments import comparisons, data, markers, models
 from tflane_jax.commands.arguments.shared import CommandParser
@@ -26,6 +29,8 @@ from tflane_jax.startup import leave
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code: 0 done, 2 an error of the user's, 128 + n ended by signal n."""
     keep_freed_memory()
+    if arguments is None:  # the program itself
+        warnings.showwarning = OneLineWarnings(warnings.showwarning)
     parser = build_parser()
     options, rest = parser.parse_known_args(arguments)
     if rest and not options.takes_overrides:
@@ -50,6 +55,25 @@ def _run_command(options: argparse.Namespace, rest: Sequence[str]) -> int:
     except BrokenPipeError:  # `tflane ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + signal.SIGPIPE
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:  # pathlib raises it wherever it looks for such a file
+            raise
+        print(f"tflane: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+
+
+class OneLineWarnings:
+    """Shows the warnings of this package as one line each, and every text once; others as `show` does."""
+
+    def __init__(self, show: Callable[..., None]):
+        self._show, self._shown = show, set[str]()
+
+    def __call__(self, message: Warning | str, category: type[Warning], *place: Any, **named: Any) -> None:
+        if category.__module__.partition(".")[0] != "tflane_jax":
+            self._show(message, category, *place, **named)
+        elif str(message) not in self._shown:
+            self._shown.add(str(message))
+            print(f"tflane: warning: {message}", file=sys.stderr)
 
 
 @contextlib.contextmanager

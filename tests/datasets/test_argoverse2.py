@@ -1,16 +1,19 @@
 """The Argoverse 2 reader on a hand-made log and on damaged logs."""
 
+import gc
 import json
 import pickle
 import shutil
+import weakref
 
 import numpy as np
 import pytest
 
-from tests.datasets.small_argoverse2 import FRAMES, MS, POSE, box, write, write_log
+from tests.datasets.small_argoverse2 import FRAMES, MAP, MS, POSE, box, points, write, write_log
+from tflane_jax.datasets import argoverse2
 from tflane_jax.datasets.argoverse2 import Argoverse2Config, Argoverse2Dataset
 from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, POSES, check_log, find_logs, load_log
-from tflane_jax.datasets.argoverse2_map import line_type
+from tflane_jax.datasets.argoverse2_map import line_type, read_map
 from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.errors import UserError
 from tflane_jax.scene import LineType, RoadUser
@@ -45,6 +48,31 @@ def test_reads_tracks_poses_and_map(folder):
     np.testing.assert_array_equal(boundary[0], boundary[-1])
     assert np.linalg.norm(np.diff(boundary[:, :2], axis=0), axis=-1).sum() == pytest.approx(2 * (40 + 18))
     assert set(boundary[:, 2]) == {0.5}
+
+
+def test_a_crossing_reaches_from_end_to_end_of_edges_with_more_points(tmp_path):
+    edges = {"edge1": points((0, 0), (0, 2), (0, 5)), "edge2": points((3, 0), (3, 5))}
+    path = tmp_path / "log_map_archive_log-a____PIT_city_1.json"
+    path.write_text(json.dumps(MAP | {"pedestrian_crossings": {"1": {"id": 1, **edges}}}))
+    (ring,) = read_map(tmp_path).crossings
+    np.testing.assert_array_equal(ring[:, :2], [(0, 0), (0, 5), (3, 5), (3, 0), (0, 0)])
+
+
+def test_a_log_that_links_lead_to_twice_is_found_once_and_a_copy_is_refused(tmp_path):
+    log = write_log(tmp_path / "logs" / "log-a")
+    (tmp_path / "logs" / "loop").symlink_to(tmp_path / "logs")
+    assert find_logs(tmp_path / "logs") == [log]
+    shutil.copytree(log, tmp_path / "logs" / "copies" / "log-a")
+    with pytest.raises(UserError, match=r"holds the log log-a twice: take out .*/log-a or .*/log-a"):
+        find_logs(tmp_path / "logs")
+
+
+def test_maps_of_two_logs_in_one_folder_are_refused(folder):
+    other = folder / "map" / "log_map_archive_log-b____MIA_city_1.json"
+    other.write_text(json.dumps(MAP))
+    with pytest.raises(UserError, match=r"holds two maps, log_map_archive_log-a.* and log_map_archive_log-b"):
+        load_log(folder)
+    assert len(check_log(folder)) >= 1
 
 
 def test_openlane_timestamps_take_their_own_pose_and_the_nearest_boxes(folder, tmp_path):
@@ -96,6 +124,30 @@ def test_dataset_orders_logs_by_name_and_survives_pickling(folder):
     example.validate()
     np.testing.assert_array_equal(example.bev, dataset.example(3).bev)
     assert example.traffic_flow.valid.sum(-1)[:3].tolist() == [5, 1, 0]
+
+
+def test_logs_are_read_when_they_are_needed_and_few_are_kept(folder, monkeypatch):
+    shutil.copytree(folder, folder.with_name("log-b"))
+    read = []
+
+    def counted(path, **options):
+        made = load_log(path, **options)
+        read.append(weakref.ref(made))
+        return made
+
+    monkeypatch.setattr(argoverse2, "load_log", counted)
+    monkeypatch.setattr(argoverse2, "_KEPT", 1)
+    dataset = Argoverse2Dataset(Argoverse2Config(folder.parent))
+    assert (len(dataset), dataset.info(3).scene, dataset.info(3).area, read) == (4, "log-b", "PIT", [])
+    alone = load_log(folder)
+    for index, moment in enumerate(alone.keyframes):
+        found = dataset.info(index)
+        assert found.timestamp_ns == moment.timestamp_ns
+        np.testing.assert_array_equal(found.global_from_ego, moment.global_from_ego)
+    for index in range(4):
+        dataset.example(index)
+    gc.collect()
+    assert [one() is not None for one in read] == [False, True]
 
 
 def test_a_log_of_one_frame_or_of_furniture_only_is_an_empty_flow(folder):

@@ -15,9 +15,10 @@ import jax
 import numpy as np
 import pytest
 
-from tests.fakes import BrokenDataset, DeadlyDataset, FakeConfig, FakeDataset, UnevenDataset
+from tests.fakes import BrokenDataset, CrowdedDataset, DeadlyDataset, FakeConfig, FakeDataset, UnevenDataset
 from tests.shared import ROOT
 from tflane_jax.datasets import cache, parallel
+from tflane_jax.datasets.base import TruncationWarning
 from tflane_jax.datasets.cache import CachedDataset, cache_root, cached, fingerprint
 from tflane_jax.errors import UserError
 
@@ -155,6 +156,13 @@ def test_altered_content_is_noticed_when_it_is_loaded(tmp_path):
     CachedDataset(entry.folder).arrays(("lanes",))
     with pytest.raises(UserError, match=r"bev\.npy is corrupt: delete"):
         CachedDataset(entry.folder).arrays()
+
+
+def test_warnings_of_workers_are_those_of_the_build(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(parallel, "BLOCK", 2)
+    with pytest.warns(TruncationWarning, match="more lanes than room"):
+        build(tmp_path, CrowdedDataset(FakeConfig(size=6)), workers=2)
+    assert "more lanes" not in capfd.readouterr().err  # nothing was shown by the workers themselves
 
 
 @pytest.mark.parametrize("workers", [1, 2])

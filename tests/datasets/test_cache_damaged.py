@@ -1,5 +1,6 @@
 """Caches: damaged entries, wrong folders, scripts without a guard; listing and clearing."""
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -127,6 +128,47 @@ def test_an_entry_that_is_being_built_is_not_deleted(tmp_path, entry):
         with pytest.raises(UserError, match="being built"):
             delete_entry(one)
     assert folder.exists()
+
+
+def test_a_build_under_way_is_told_from_the_remains_of_one_and_kept(tmp_path, entry, capsys, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setenv("TFLANE_CACHE", str(tmp_path))
+    building, stopped = (tmp_path / f"{name}-0123456789abcdef.building-x" for name in ("now", "then"))
+    rebuilt = Path(shutil.copytree(entry, tmp_path / "damaged-0123456789abcdef"))
+    for folder in (building, stopped):
+        folder.mkdir()
+        (folder / "bev.npy").write_text("x")
+    with contextlib.ExitStack() as stack:
+        for name in ("now", "damaged"):
+            lock = stack.enter_context(open(tmp_path / f"{name}-0123456789abcdef.lock", "w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        assert main(["cache", "list"]) == 0
+        listed = {row.split("|")[1].strip(): row for row in capsys.readouterr().out.splitlines() if "|" in row}
+        assert "being built" in listed[building.name]
+        assert "being built" in listed[rebuilt.name]
+        assert "left by a stopped build" in listed[stopped.name]
+        assert main(["cache", "clear", "--all"]) == 0
+        assert f"kept {building}" in capsys.readouterr().out
+        assert main(["cache", "clear", building.name]) == 2
+        assert "wait for it" in capsys.readouterr().err
+    assert building.exists()
+    assert rebuilt.exists()
+    assert not stopped.exists()
+
+
+def test_a_build_that_ends_while_the_cache_is_listed_is_no_fault(tmp_path, monkeypatch):
+    folder = tmp_path / "ended-0123456789abcdef.building-x"
+    folder.mkdir()
+    (folder / "bev.npy").write_text("x")
+    listing = Path.rglob
+
+    def ended(self, pattern):
+        files = list(listing(self, pattern))
+        shutil.rmtree(self)
+        return files
+
+    monkeypatch.setattr(Path, "rglob", ended)
+    assert cache_entries(tmp_path) == []
 
 
 @pytest.mark.parametrize("named", ["~no_such_user_here/cache", "{file}", "{file}/below"])

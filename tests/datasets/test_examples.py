@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tflane_jax.datasets.base import ExampleConfig, TruncationWarning
 from tflane_jax.datasets.examples import make_example, occluder_boxes, traffic_flow
 from tflane_jax.datasets.leaves import example_from_leaves, example_leaves
 from tflane_jax.errors import UserError
-from tflane_jax.geometry import invert_pose, pose_yaw, transform_points, yaw_pose
+from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, transform_points, yaw_pose
 from tflane_jax.geometry.cameras import project
 from tflane_jax.scene import stack_examples
 from tflane_jax.scene.logs import MapElement
@@ -112,6 +113,19 @@ def test_beyond_capacity_the_nearest_stay_in_order():
     assert (flow.position[:, -1, 0].tolist(), dropped) == ([10.0, 20.0], 2)
     with pytest.warns(TruncationWarning, match=r"ExampleConfig\.tracks = 2"):
         make_example(recording, 0, ExampleConfig(history=4, tracks=2))
+
+
+def test_only_tracks_that_models_see_are_missed():
+    """Of tracks at 10 m, 20 m ahead and 90 m, one or two have no room; the last was never near."""
+    position = np.zeros((5, 3, 3))
+    position[:, :, 0] = [10.0, 20.0, 90.0]
+    recording = log(ROAD, tracks(position), [np.eye(4)] * 5, [(4, np.eye(4))])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TruncationWarning)
+        make_example(recording, 0, ExampleConfig(history=4, tracks=2))
+    region = PerceptionRange()
+    assert [traffic_flow(recording, 0, history=4, capacity=k, region=region)[1] for k in (1, 2, 3)] == [1, 0, 0]
+    assert traffic_flow(recording, 0, history=4, capacity=1)[1] == 2
 
 
 def test_occluders_are_the_actors_of_the_key_frame_in_the_pose_of_the_key_frame():

@@ -160,8 +160,11 @@ def test_what_is_no_scene_file_is_named(tmp_path):
     for name in ("array.npy", "none.npz"):
         with pytest.raises(UserError, match=name):
             read_scene_file(tmp_path / name)
-    with pytest.raises(UserError, match="holds no scene file"):
+    with pytest.raises(UserError, match="there is no"):
         find_scene_files(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match="holds no scene file"):
+        find_scene_files(tmp_path / "empty")
 
 
 def test_a_scene_without_traffic_is_empty_and_one_without_lanes_an_error(tmp_path):

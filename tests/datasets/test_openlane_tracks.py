@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,6 +125,29 @@ def test_frames_in_which_nobody_is_are_written(tmp_path, first):
     np.testing.assert_array_equal(read.timestamps_ns, made.timestamps_ns)
     np.testing.assert_array_equal(read.tracks.valid, valid[:, : len(read.tracks.uuid)])
     assert len(read.tracks.uuid) == valid.any()
+
+
+def test_places_are_told_without_reading_annotations(written, tmp_path):
+    expected = opened(*written).info(1)
+    frames = Path(shutil.copytree(written[0], tmp_path / "frames"))
+    for path in frames.glob("val/*/info/*.json"):
+        text = path.read_text()
+        path.write_text(text[: text.index('"annotation"')] + "not read")
+    found = opened(frames, written[1]).info(1)
+    np.testing.assert_array_equal(found.global_from_ego, expected.global_from_ego)
+    assert (found.scene, found.timestamp_ns) == (expected.scene, expected.timestamp_ns)
+
+
+def test_the_source_logs_tell_the_city(written, written_b, tmp_path):
+    frames, tracks = written
+    assert opened(frames, tracks).info(0).area == ""  # these logs have no maps
+    known = Path(shutil.copytree(tracks, tmp_path / "tracks"))
+    for folder in known.glob("sensor/*/*"):
+        (folder / "map").mkdir()
+        (folder / "map" / f"log_map_archive_{folder.name}____PIT_city_1.json").touch()
+    assert {opened(frames, known).info(index).area for index in range(4)} == {"PIT"}
+    assert opened(frames, None).info(0).area == ""
+    assert opened(*written_b, subset="B", example=EXAMPLE_B).info(0).area != ""
 
 
 def test_frames_are_earlier_ones_at_the_wanted_rate(written):

@@ -72,12 +72,20 @@ def test_frames_are_grouped_by_the_nearest_training_frame_of_their_city():
     assert nearness([drive("a", (0, 0), area="WDC")], frames).sentence().endswith("none is of the same city")
 
 
-def test_frames_of_a_source_without_cities_are_compared_with_each_other():
-    frames = Frames(("x", 1, 2, ""), ("z", 3, 4, "PIT"), ("x", 5, 6, ""))
+def test_a_frame_without_a_city_may_be_in_any_and_the_result_says_so():
+    frames = Frames(("x", 1, 2, ""), ("z", 300, 4, "PIT"), ("x", 500, 6, ""))
     drives = frame_drives(frames)
-    assert [(one.name, one.area) for one in drives] == [("x", "nuscenes"), ("z", "PIT")]
-    np.testing.assert_array_equal(drives[0].positions, [[1, 2], [5, 6]])
-    assert set(nearness(drives, frames).groups) == {NEAR_GROUPS[0]}
+    assert [(one.name, one.area) for one in drives] == [("x", ""), ("z", "PIT")]
+    np.testing.assert_array_equal(drives[0].positions, [[1, 2], [500, 6]])
+    train = [drive("a", (1, 3)), drive("b", (300, 4), area="MIA"), drive("c", (500, 7), (300, 8), area="")]
+    found = nearness(train, frames)
+    np.testing.assert_allclose(found.distances, [1.0, 4.0, 1.0])  # not 0: Miami is not Pittsburgh
+    assert found.assumed.tolist() == [True, True, True]
+    assert "city of 3 of them, which may be another with equal coordinates" in found.sentence()
+    named = nearness([*train[:2], drive("d", (300, 5))], frames)
+    np.testing.assert_allclose(named.distances, [1.0, 1.0, 200.0], atol=0.01)
+    assert named.assumed.tolist() == [True, False, True]
+    assert "city of 1 of them" in named.sentence()
 
 
 @settings(deadline=None, max_examples=25, derandomize=True)

@@ -116,7 +116,7 @@ def test_the_cache_key_changes_with_the_content_of_the_maps(maps, tmp_path):
         ({"generated": 1.5}, "between 0 and 1, not 1.5"),
         ({"scenes": -1}, "has scenes 0 to"),
         ({"generated_world": replace(GENERATED, keyframes=1)}, "give both the same number"),
-        ({"maps": Path("nowhere")}, "holds no map"),
+        ({"maps": Path("nowhere")}, "there is no nowhere"),
     ],
 )
 def test_impossible_configurations_are_refused(maps, change, message):

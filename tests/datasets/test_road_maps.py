@@ -13,11 +13,14 @@ from tests.world.small_map import crossroads
 from tflane_jax.datasets import road_maps
 from tflane_jax.datasets.geojson_lanes import read_lanes
 from tflane_jax.datasets.nuscenes_tables import TABLES
+from tflane_jax.datasets.real_maps import check_real_maps
 from tflane_jax.datasets.road_maps import chosen_maps, find_maps, road_map_of
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, transform_points
 from tflane_jax.scene import LineType
+from tflane_jax.world.mirror import mirrored_map
 from tflane_jax.world.roads.map_networks import prepare_roads
+from tflane_jax.world.roads.road_map import drives_on_left, driving_side
 
 # Degrees of a metre at the equator, near (0, 10).
 EAST, NORTH = 1 / 111_319.49, 1 / 110_574.28
@@ -91,7 +94,7 @@ def test_scenes_of_the_nuscenes_folder_have_the_map_around_them(tmp_path):
     assert [(x.name, x.kind) for x in (one, other)] == [("scene-0061", "nuscenes"), ("scene-0103", "nuscenes")]
     found = one.read()
     assert found.area == "singapore-onenorth"
-    assert len(found.map.segments) == 2
+    assert (len(found.map.segments), found.map.side) == (2, "left")
     np.testing.assert_allclose(found.places[:, 1], [1100.0, 1105.0, 1110.0, 1115.0], atol=0.5)
     before = one.content()
     path = tmp_path / "maps" / "expansion" / "singapore-onenorth.json"
@@ -153,8 +156,16 @@ def test_a_folder_without_maps_or_with_a_name_twice_is_refused(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         write(tmp_path / name / "town.geojson", [])
-    with pytest.raises(UserError, match="two maps with the name town"):
+    with pytest.raises(UserError, match=r"two maps with the name town: take out .*a/town.geojson or .*b/town.geojson"):
         find_maps(tmp_path)
+
+
+def test_folders_that_links_lead_to_twice_are_read_once(tmp_path):
+    (tmp_path / "maps" / "town").mkdir(parents=True)
+    write(tmp_path / "maps" / "town" / "town.geojson", crossroads_features())
+    for name, target in (("again", "town"), ("loop", "."), ("ring", "other"), ("other", "ring"), ("gone", "nowhere")):
+        (tmp_path / "maps" / name).symlink_to(target)
+    assert [one.name for one in find_maps(tmp_path / "maps")] == ["town"]
 
 
 def test_the_content_tells_changed_files(tmp_path):
@@ -217,6 +228,42 @@ def test_lanes_of_a_geojson_file_have_their_places_markings_and_successors(tmp_p
         assert (lane_.left_type, lane_.right_type) == (LineType.DASHED, LineType.SOLID)
     assert (len(town.map.crossings), len(town.map.road_boundaries)) == (1, 1)
     assert len(prepare_roads(town, 1.8).spots(55.0)) > 10
+
+
+def test_a_map_across_the_180th_meridian_is_the_same_elsewhere(tmp_path):
+    def there(coordinates):
+        if not isinstance(coordinates[0], list):
+            return [(coordinates[0] - 10.0 + 360.0) % 360.0 - 180.0, coordinates[1]]  # 10 degrees east becomes 180
+        return [there(one) for one in coordinates]
+
+    plain, moved = crossroads_features(), crossroads_features()
+    for feature in moved:
+        feature["geometry"]["coordinates"] = there(feature["geometry"]["coordinates"])
+    longitudes = np.concatenate([f["geometry"]["coordinates"] for f in moved if "lane" in f["properties"]])[:, 0]
+    assert (longitudes.min(), longitudes.max()) == (pytest.approx(-180, abs=0.01), pytest.approx(180, abs=0.01))
+    here, across = (read_lanes(write(tmp_path / "town.geojson", features)) for features in (plain, moved))
+    for one, other in zip(here.map.segments.values(), across.map.segments.values(), strict=True):
+        np.testing.assert_allclose(other.centerline, one.centerline, atol=1e-6)
+    np.testing.assert_allclose(across.map.road_boundaries[0], here.map.road_boundaries[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("side", ["left", "right", None])
+def test_a_map_of_one_way_streets_keeps_to_the_side_that_it_tells(tmp_path, side):
+    told = {} if side is None else {"traffic": side}
+    streets = [lane(i, (0, 20 * i), (200, 20 * i), **told) for i in range(11)]
+    found = read_lanes(write(tmp_path / "town.geojson", streets)).map
+    assert driving_side(found) == side
+    assert driving_side(mirrored_map(found)) == {"left": "right", "right": "left", None: None}[side]
+    assert drives_on_left(found) == (side == "left")
+    (row,) = check_real_maps(tmp_path).rows
+    assert row["traffic keeps"] == (side or "right, assumed")
+
+
+def test_oncoming_lanes_say_more_than_what_a_map_tells(tmp_path):
+    features = crossroads_features()
+    for feature in features:
+        feature["properties"] |= {"traffic": "left"} if "lane" in feature["properties"] else {}
+    assert driving_side(read_lanes(write(tmp_path / "town.geojson", features)).map) == "right"
 
 
 def test_a_map_as_tables_are_exported(tmp_path):
@@ -282,6 +329,8 @@ ARM = [(0, 0), (80, 0)]
         ([lane(1, *ARM) | {"properties": ["lane"]}], r"feature 0: properties is \['lane'\], expected a mapping"),
         ([lane(1, *ARM) | {"geometry": [1]}], r"feature 0: geometry is \[1\], expected a mapping"),
         ([lane(1, (0, 0), (4e6, 0))], "feature 0: points 0 and 1 are .* km apart"),
+        ([lane(1, *ARM, traffic="west")], "feature 0: traffic is 'west', expected left or right"),
+        ([lane(1, *ARM, traffic="left"), lane(2, *ARM, traffic="right")], "to the left on some lanes and to the right"),
         ([lane(1, *ARM, left="blue")], "feature 0: left is 'blue', expected one of none, solid, dashed"),
         ([lane(1, (0, 0), (0, 0))], "feature 0 is a lane without length"),
         ([lane(1, *ARM)], "too small a map: .*the most is 2 m"),

@@ -26,9 +26,12 @@ def show(options: argparse.Namespace) -> int:
 
 
 def clear(options: argparse.Namespace) -> int:
-    """Delete entries of the cache."""
+    """Delete entries of the cache. What a process is building stays; naming it is an error."""
     entries = cache_entries(cache_root())
     for one in _chosen(entries, options):
+        if one.building and not options.names:
+            print(f"kept {one.path}: {one.kind}")
+            continue
         delete_entry(one)
         print(f"deleted {one.path} ({_megabytes(one)} MB, {one.kind})")
     return 0

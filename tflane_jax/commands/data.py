@@ -25,6 +25,7 @@ from tflane_jax.tasks.lane_pictures import titles
 from tflane_jax.tasks.lane_shape import LaneShapeTask
 
 _PRINTED_FAULTS = 50
+_FORMAT = "argoverse2"  # of `data check`, by default
 
 
 def show(options: argparse.Namespace) -> int:
@@ -82,7 +83,7 @@ def _show_images(source: Any, config: RunConfig, options: argparse.Namespace) ->
 
 def check(options: argparse.Namespace) -> int:
     """Print counts and faults of a dataset's folder; the exit code is 2 if there are faults."""
-    source = sources.named_source(options.format)
+    source = sources.named_source(options.format or _FORMAT)
     if source.check is None:
         names = ", ".join(one.name for one in sources.SOURCES if one.check is not None)
         raise UserError(f"--format {source.name} is not read from a folder: choose one of {names}")
@@ -93,7 +94,13 @@ def check(options: argparse.Namespace) -> int:
         if not source.tracks:
             raise UserError("--whole-images belongs to --format openlane-v2")
         wanted["images"] = "whole"
-    found = source.check(Path(options.root), **wanted)
+    try:
+        found = source.check(Path(options.root), **wanted)
+    except UserError as error:
+        if options.format is not None:
+            raise
+        others = ", ".join(one.name for one in sources.SOURCES if one.check is not None and one.name != _FORMAT)
+        raise UserError(f"{error}; name other data with --format ({others})") from None
     print(format_table(found.rows, title=f"{options.root}: {found.format}"))
     if found.faults:
         print(f"\n{len(found.faults)} faults:", *(f"  - {fault}" for fault in found.faults[:_PRINTED_FAULTS]), sep="\n")
@@ -119,7 +126,7 @@ def overlap_of_splits(options: argparse.Namespace) -> int:
     print(format_table(found.rows(), title=title))
     if found.worst():
         print("\n" + format_table(found.worst(), title="validation drives that overlap most"))
-    if any(drive.area == "unknown" for drive in (*train, *validation)):
+    if any(not drive.area for drive in (*train, *validation)):
         print("\nThese files do not name the city, so places of different cities may coincide by chance.")
     if options.out is not None:
         sides = {"train": str(options.train), "validation": str(options.validation)}

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tflane_jax.datasets.argoverse2_cameras import RING, LogImages, has_images, ring_fits
-from tflane_jax.datasets.argoverse2_log import ANNOTATIONS, Keyframes, check_log, find_logs, load_log
+from tflane_jax.datasets.argoverse2_log import (
+    ANNOTATIONS,
+    Keyframes,
+    check_log,
+    city_of,
+    find_logs,
+    load_log,
+    read_keyframes,
+)
 from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
@@ -18,6 +27,7 @@ from tflane_jax.datasets.openlane_example import camera_views
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Config
 from tflane_jax.datasets.overlap import frame_drives
 from tflane_jax.datasets.photometric import PhotometricConfig
+from tflane_jax.datasets.recent import Recent
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig, ImageFit
 from tflane_jax.errors import UserError
@@ -25,6 +35,8 @@ from tflane_jax.scene import CameraViews, Example
 from tflane_jax.scene.logs import KeyFrame, Log
 from tflane_jax.world.cameras.ring import ARGOVERSE2_RING, CameraRigConfig
 
+# Logs in memory: one takes 2.4 MB with its prepared map, and a sixth of a second to read.
+_KEPT = 256
 _PICTURES = ImageConfig(scale=0.5)
 """Of images that no model reads: whole, at half the size."""
 
@@ -53,7 +65,10 @@ class Argoverse2Config:
 class Argoverse2Dataset:
     """Examples of every log below a folder, sorted by log id, then time.
 
-    Raises UserError where there is no log or one cannot be read, with `image` also where a log has no images.
+    Boxes and maps are read when an example needs them, and those of the last `_KEPT` logs are kept.
+
+    Raises UserError where there is no log, or the times and poses of one cannot be read, with `image` also where a log
+    has no images. `example` raises it for damaged boxes or a damaged map.
     """
 
     name = "argoverse2"
@@ -63,10 +78,11 @@ class Argoverse2Dataset:
         if config.image is not None and config.example.cameras is not None:
             raise UserError("image reads recorded images, example.cameras draws others: set one of them to None")
         self._folders = find_logs(config.root)
-        self.logs = tuple(
-            load_log(folder, keyframes=config.keyframes, openlane=config.openlane) for folder in self._folders
+        self._keyframes = [read_keyframes(folder, config.keyframes, config.openlane) for folder in self._folders]
+        self._frames = [(row, i) for row, moments in enumerate(self._keyframes) for i in range(len(moments))]
+        self._log: Recent[Path, Log] = Recent(
+            partial(load_log, keyframes=config.keyframes, openlane=config.openlane), _KEPT
         )
-        self._frames = [(row, i) for row, log in enumerate(self.logs) for i in range(len(log.keyframes))]
         wanted = config.image is not None
         self._images = [LogImages(folder) if wanted else None for folder in self._folders]
         self._fits = ring_fits(filter(None, self._images), config.image) if config.image is not None else ()
@@ -77,10 +93,10 @@ class Argoverse2Dataset:
     def example(self, index: int) -> Example:
         """Return one example; a camera without an image at that time is not valid."""
         config, (row, number) = self.config, self._frames[index]
-        example, images = make_example(self.logs[row], number, config.example), self._images[row]
+        example, images = make_example(self._log(self._folders[row]), number, config.example), self._images[row]
         if images is None or config.image is None:
             return example
-        cameras = images.at(self.logs[row].keyframes[number])
+        cameras = images.at(self._keyframes[row][number])
         return replace(example, cameras=camera_views(cameras, self._fits, config.image))
 
     def views(self, indices: Sequence[int]) -> list[CameraViews | None]:
@@ -93,20 +109,19 @@ class Argoverse2Dataset:
         image = self.config.image or _PICTURES
         fits = ring_fits(there.values(), image)
         return [
-            _views(there[row], self.logs[row].keyframes[number], fits, image) if row in there else None
+            _views(there[row], self._keyframes[row][number], fits, image) if row in there else None
             for row, number in places
         ]
 
     def info(self, index: int) -> FrameInfo:
         """Return log id, time and pose of one example."""
         row, number = self._frames[index]
-        log = self.logs[row]
-        keyframe = log.keyframes[number]
-        return FrameInfo(log.source, log.name, keyframe.timestamp_ns, keyframe.global_from_ego, log.area)
+        folder, moment = self._folders[row], self._keyframes[row][number]
+        return FrameInfo("argoverse2", folder.name, moment.timestamp_ns, moment.global_from_ego, city_of(folder))
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""
-        yield from self.logs
+        yield from map(self._log, self._folders)
 
 
 def _views(

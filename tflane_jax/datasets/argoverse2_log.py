@@ -7,6 +7,7 @@ https://argoverse.github.io/user-guide (sensor dataset; annotations.feather, cit
 
 from __future__ import annotations
 
+import itertools
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -105,21 +106,9 @@ def load_log(
         UserError: a file is missing or unreadable, lacks a column, or holds no frame.
     """
     folder = Path(folder)
-    pose_times, poses = read_poses(folder)
     boxes = _read_boxes(folder / ANNOTATIONS)
-    annotated = np.unique(boxes["timestamp_ns"])
-    if len(annotated) == 0:
-        raise UserError(
-            f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
-        )
-    check_interval(annotated, "nanoseconds", str(folder / ANNOTATIONS))
-    _poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
-    times = _with_empty_frames(annotated, folder)
+    times, at_frames, moments = _drive(folder, boxes["timestamp_ns"], keyframes, openlane)
     tracks = _tracks(boxes, times, categories, folder)
-    moments = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
-    if keyframes == "openlane_v2" and openlane is not None:
-        moments = openlane_timestamps(openlane).get(folder.name, moments)
-    nearest, at_frames = _nearest(times, moments), poses[_nearest(pose_times, times)]
     city = VectorMap({})
     if with_map:
         city = read_map(folder / "map")
@@ -132,12 +121,39 @@ def load_log(
         global_from_ego=at_frames,
         tracks=tracks,
         actors=tracks,
-        keyframes=tuple(
-            KeyFrame(int(t), pose, int(frame))
-            for t, pose, frame in zip(moments, _poses_at(moments, pose_times, poses, folder), nearest, strict=True)
-        ),
+        keyframes=moments,
         seed=zlib.crc32(folder.name.encode()),
         area=city_of(folder),
+    )
+
+
+def read_keyframes(folder: Path, keyframes: Keyframes, openlane: Path | None) -> tuple[KeyFrame, ...]:
+    """Return the key frames of a log as `load_log` does, without reading boxes and map; raises UserError like it."""
+    times = read_columns(folder / ANNOTATIONS, {"timestamp_ns": "integer"})["timestamp_ns"]
+    return _drive(folder, times, keyframes, openlane)[2]
+
+
+def _drive(
+    folder: Path, box_times: np.ndarray, keyframes: Keyframes, openlane: Path | None
+) -> tuple[np.ndarray, np.ndarray, tuple[KeyFrame, ...]]:
+    """Return the times (F,) of all frames, their poses (F, 4, 4), and the key frames, given the times of all boxes."""
+    pose_times, poses = read_poses(folder)
+    annotated = np.unique(box_times)
+    if len(annotated) == 0:
+        raise UserError(
+            f"{folder / ANNOTATIONS} holds no annotated frame (the test split has none): use a train or val log"
+        )
+    check_interval(annotated, "nanoseconds", str(folder / ANNOTATIONS))
+    _poses_at(annotated, pose_times, poses, folder)  # of these the file has the exact ones
+    times = _with_empty_frames(annotated, folder)
+    moments = annotated if keyframes == "annotations" else times[::_FRAMES_PER_KEYFRAME]
+    if keyframes == "openlane_v2" and openlane is not None:
+        moments = openlane_timestamps(openlane).get(folder.name, moments)
+    at_moments = zip(moments, _poses_at(moments, pose_times, poses, folder), _nearest(times, moments), strict=True)
+    return (
+        times,
+        poses[_nearest(pose_times, times)],
+        tuple(KeyFrame(int(time), pose, int(frame)) for time, pose, frame in at_moments),
     )
 
 
@@ -293,13 +309,21 @@ def check_log(folder: Path) -> list[str]:
 def find_logs(root: Path) -> list[Path]:
     """Return the log folders, sorted by log id, in a dataset root, a split, a folder of logs, or one log itself.
 
-    Raises UserError if there is none.
+    A log that links lead to twice is found once.
+
+    Raises UserError if there is none, or if two have the same id.
     """
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no {root}: name a folder of Argoverse 2 logs, or one log")
     patterns = ("", "*", "*/*", "sensor/*/*")
-    found = {path.parent for p in patterns for path in root.glob(f"{p}/{ANNOTATIONS}".lstrip("/"))}
+    paths = [path.parent for p in patterns for path in sorted(root.glob(f"{p}/{ANNOTATIONS}".lstrip("/")))]
+    found = sorted({path.resolve(): path for path in reversed(paths)}.values(), key=lambda path: path.name)
     if not found:
         raise UserError(
             f"{root} holds no Argoverse 2 log: no {ANNOTATIONS} in it, in */, in */*/ or in sensor/<split>/<log>/"
         )
-    return sorted(found, key=lambda path: path.name)
+    for one, other in itertools.pairwise(found):
+        if one.name == other.name:
+            raise UserError(f"{root} holds the log {one.name} twice: take out {one} or {other}")
+    return found

@@ -23,10 +23,13 @@ _CENTERLINE_POINTS = 10
 
 
 def read_map(folder: Path) -> VectorMap:
-    """Read the map file in `folder`; raise UserError if it is missing or damaged."""
-    path = find_map(folder)
-    if path is None:
+    """Read the map file in `folder`; raise UserError if it is missing or damaged, or there are several."""
+    found = sorted(folder.glob(MAP_PATTERN))
+    if not found:
         raise UserError(f"{folder} holds no {MAP_PATTERN}: download the log's map folder")
+    if len(found) > 1:
+        raise UserError(f"{folder} holds two maps, {found[0].name} and {found[1].name}: take out that of another log")
+    (path,) = found
     archive, where = load_json(path), str(path)
     lanes, crossings, areas = (member(archive, name, where) for name in ("lane_segments", *_AREAS))
     segments = [_lane_segment(lane, f"{where}: lane_segments.{key}") for key, lane in _entries(lanes, where)]
@@ -48,11 +51,6 @@ def _entries(records: Any, where: str) -> list[tuple[str, Any]]:
     if not isinstance(records, Mapping):
         raise UserError(f"{where} is no Argoverse 2 vector map: expected mappings from ids to records")
     return list(records.items())
-
-
-def find_map(folder: Path) -> Path | None:
-    """Return the map json in a map folder, or None."""
-    return next(iter(sorted(folder.glob(MAP_PATTERN))), None)
 
 
 def line_type(mark: str) -> LineType:
@@ -118,7 +116,8 @@ def _mark(record: Any, name: str, where: str) -> LineType:
 
 
 def _crossing(record: Any, where: str) -> np.ndarray:
-    (a, b), (c, d) = (_points(record, edge, where, 2)[:2] for edge in ("edge1", "edge2"))
+    """Return the ring of a crossing: its four corners, the ends of its edges, for edges of more than two points too."""
+    (a, b), (c, d) = (_points(record, edge, where, 2)[[0, -1]] for edge in ("edge1", "edge2"))
     ring = np.stack([a, b, d, c, a])
     check_steps(ring, where)
     return ring

@@ -6,10 +6,12 @@ Beside the datasets of `cache`, the folder holds `markers` (`marker_cache`), `pr
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from tflane_jax.errors import UserError
 
 _KINDS = {"markers": "markers found in images", "programs": "compiled programs", "weights": "published weights"}
 _DATASET = re.compile(r".+-[0-9a-f]{16}(\.building-.*)?")
+BEING_BUILT = "being built by a process"
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,11 @@ class Entry:
         return self.path.name != "weights"
 
     @property
+    def building(self) -> bool:
+        """Whether a process was building it when it was listed."""
+        return self.kind == BEING_BUILT
+
+    @property
     def days(self) -> float:
         """Days since it was last used."""
         return max(time.time() - self.used, 0.0) / 86_400.0
@@ -52,23 +60,24 @@ def cache_entries(root: Path) -> list[Entry]:
         return []
     try:
         folders = [path for path in root.iterdir() if path.is_dir() and not path.is_symlink()]
-        entries = [_entry(path, kind) for path in folders if (kind := _kind(path))]
+        found = [_entry(path, kind) for path in folders if (kind := _kind(path))]
     except OSError as error:
         raise UserError(f"cannot read the cache {root}: {error.strerror or error}") from error
-    return sorted(entries, key=lambda entry: (-entry.size, entry.path.name))
+    return sorted(filter(None, found), key=lambda entry: (-entry.size, entry.path.name))
 
 
 def delete_entry(entry: Entry) -> None:
     """Delete an entry with its lock file; raises UserError if that fails or another process builds it."""
-    lock = entry.path.with_name(f"{entry.path.name.partition('.building-')[0]}.lock")
+    lock = _lock_of(entry.path)
     try:
-        if _is_held(lock):
-            raise UserError(f"{entry.path.name} is being built by another process: wait for it")
-        # Renamed first: a reader finds the whole entry or none.
-        aside = entry.path.with_name(f"{entry.path.name.partition('.building-')[0]}.building-deleted-{os.getpid()}")
-        entry.path.rename(aside)
-        shutil.rmtree(aside)
-        lock.unlink(missing_ok=True)
+        with _holding(lock) as free:
+            if not free:
+                raise UserError(f"{entry.path.name} is being built by another process: wait for it")
+            # Renamed first: a reader finds the whole entry or none.
+            aside = lock.with_name(f"{lock.stem}.building-deleted-{os.getpid()}")
+            entry.path.rename(aside)
+            shutil.rmtree(aside)
+            lock.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"cannot delete {entry.path}: {error.strerror or error}") from error
 
@@ -78,25 +87,48 @@ def _kind(path: Path) -> str:
         return _KINDS[path.name]
     if (found := _DATASET.fullmatch(path.name)) is None:
         return ""
+    with _holding(_lock_of(path)) as free:
+        if not free:
+            return BEING_BUILT
     return "left by a stopped build" if found[1] else "examples"
 
 
-def _entry(path: Path, kind: str) -> Entry:
-    states = [each.stat() for each in path.rglob("*") if each.is_file()] or [path.stat()]
+def _entry(path: Path, kind: str) -> Entry | None:
+    """Return an entry; None for a build that ended while its files were counted."""
+    states = []
+    for each in path.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):
+            if each.is_file():
+                states.append(each.stat())
+    if not states:
+        try:
+            states = [path.stat()]
+        except FileNotFoundError:
+            return None
     size = sum(state.st_blocks * 512 if hasattr(state, "st_blocks") else state.st_size for state in states)
     return Entry(path, kind, size, max(max(state.st_atime, state.st_mtime) for state in states))
 
 
-def _is_held(lock: Path) -> bool:
+def _lock_of(path: Path) -> Path:
+    """Return the file that the builder of an entry holds, see `cache._only_builder`."""
+    return path.with_name(f"{path.name.partition('.building-')[0]}.lock")
+
+
+@contextlib.contextmanager
+def _holding(lock: Path) -> Iterator[bool]:
+    """Hold a lock file for the block if it is there and free; yield whether no other process holds it."""
     try:
         import fcntl
     except ImportError:  # Windows: builds hold no lock
-        return False
+        yield True
+        return
     if not lock.exists():
-        return False
+        yield True
+        return
     with open(lock, "a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            return True
-    return False
+            yield False
+        else:
+            yield True

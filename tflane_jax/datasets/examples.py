@@ -14,7 +14,7 @@ from tflane_jax.datasets.ground_truth import lane_graph, traffic_elements
 from tflane_jax.datasets.map_lines import crop_map_lines
 from tflane_jax.datasets.marker_observations import marker_observations
 from tflane_jax.datasets.prepared_map import prepare_map
-from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
+from tflane_jax.geometry import PerceptionRange, invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.scene import Example, TrafficFlow
 from tflane_jax.scene.logs import Log, Tracks
 from tflane_jax.world.bev.sensor import hidden_cells, render_bev
@@ -22,13 +22,16 @@ from tflane_jax.world.cameras.sensor import render_cameras, visible_elements
 from tflane_jax.world.roads.sd_map import make_sd_map
 
 
-def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int, stride: int = 1) -> tuple[TrafficFlow, int]:
+def traffic_flow(
+    log: Log, keyframe: int, *, history: int, capacity: int, stride: int = 1, region: PerceptionRange | None = None
+) -> tuple[TrafficFlow, int]:
     """Return the tracks in `history` frames before the key frame, and how many exceeded the capacity.
 
     The frames are `stride` track frames apart, the latest one `stride` before the key frame. The log holds each frame's
     boxes in the ego frame of that frame; TF-Lane Eq. (1) moves them into the ego frame of the key frame. Where the log
     starts later, the first frames of the result are invalid. Of more instances than `capacity`, those whose nearest
-    position is farthest are left out.
+    position is farthest are left out. Logs reach farther than models see: with `region`, only those are counted that
+    were inside it (x and y, ego frame of the key frame).
     """
     moment, tracks = log.keyframes[keyframe], log.tracks
     frames = np.arange(moment.track_frame - history * stride, moment.track_frame, stride)
@@ -40,7 +43,10 @@ def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int, stride
     position, yaw = _moved(tracks, frames, found, log.global_from_ego, moment.global_from_ego)
     valid = tracks.valid[frames[:, None], found]
     distance = np.where(valid, np.linalg.norm(position[..., :2], axis=-1), np.inf).min(0)
-    kept = np.sort(np.argsort(distance, kind="stable")[:capacity])
+    nearest = np.argsort(distance, kind="stable")
+    kept, beyond = np.sort(nearest[:capacity]), nearest[capacity:]
+    if region is not None:
+        beyond = beyond[(valid & region.contains(position[..., :2]))[:, beyond].any(0)]
     n, rows = len(kept), found[kept]
     window = slice(history - len(frames), history)
     flow.position[:n, window] = position[:, kept].swapaxes(0, 1)
@@ -49,7 +55,7 @@ def traffic_flow(log: Log, keyframe: int, *, history: int, capacity: int, stride
     flow.category[:n] = tracks.category[rows]
     flow.occluded[:n, window] = tracks.occluded[frames[:, None], rows].T
     flow.valid[:n, window] = valid[:, kept].T
-    return flow, len(found) - n
+    return flow, len(beyond)
 
 
 def occluder_boxes(log: Log, keyframe: int) -> Float[np.ndarray, "k 7"]:
@@ -129,7 +135,9 @@ def make_example(log: Log, keyframe: int, config: ExampleConfig) -> Example:
         seen=None if rig is None else visible_elements(log, keyframe, rig),
     )
     stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)
-    flow, tracks_dropped = traffic_flow(log, keyframe, history=config.history, capacity=config.tracks, stride=stride)
+    flow, tracks_dropped = traffic_flow(
+        log, keyframe, history=config.history, capacity=config.tracks, stride=stride, region=config.ground
+    )
     sd_map, lines_dropped = (None, 0) if config.sd_map is None else make_sd_map(log, keyframe, config.sd_map)
     warn_dropped(
         config,

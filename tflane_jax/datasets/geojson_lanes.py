@@ -7,6 +7,7 @@
 | | `width`: metres, default 3.5 |
 | | `left`, `right`: marking, "solid", "dashed" or "none" (default) |
 | | `intersection`, `bicycle`: true or false (default) |
+| | `traffic`: side on which it keeps, "left" or "right"; it counts where no lanes are oncoming (default right) |
 | LineString or Polygon, edge of the drivable area | `boundary`: true |
 | Polygon of four corners, the first two along the walk | `crossing`: true |
 
@@ -29,7 +30,7 @@ from tflane_jax.datasets.plausible import check_steps
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import as_list, shown
 from tflane_jax.scene import LineType
-from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.scene.logs import LaneSegment, Side, VectorMap
 from tflane_jax.world.roads.map_roadside import lane_points
 from tflane_jax.world.roads.road_map import RoadMap
 
@@ -75,14 +76,21 @@ def read_lanes(path: Path) -> RoadMap:
             crossings.append((lines[0], name))
     if not lanes:
         raise UserError(f"{path} holds no lane: a lane is a LineString with the property `lane`, its id")
-    middle = np.concatenate([line for line, _, _ in lanes.values()]).mean(0)
+    sides: set[Side] = {_side(properties, name) for _, properties, name in lanes.values() if "traffic" in properties}
+    if len(sides) > 1:
+        raise UserError(f"{path}: traffic keeps to the left on some lanes and to the right on others: choose one side")
+    degrees = np.concatenate([line for line, _, _ in lanes.values()])
+    if np.ptp(degrees[:, 0]) > 180.0:  # the map spans the 180th meridian
+        degrees[:, 0] %= 360.0
+    middle = degrees.mean(0)
     origin = Origin(latitude=float(middle[1]), longitude=float(middle[0]), heading=90.0)
     segments = _segments(
         {key: (_metres(line, origin, name), props, name) for key, (line, props, name) in lanes.items()}
     )
     places, complete = _places(segments, path)
     flat = [tuple(_flat(_metres(line, origin, name)) for line, name in lines) for lines in (crossings, border)]
-    return RoadMap(path.stem, "geojson", VectorMap(segments, flat[0], flat[1]), places, complete)
+    whole = VectorMap(segments, flat[0], flat[1], side=next(iter(sides), None))
+    return RoadMap(path.stem, "geojson", whole, places, complete)
 
 
 def _record(feature: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
@@ -177,6 +185,13 @@ def _marking(properties: Mapping[str, Any], side: str, name: str) -> LineType:
     if not isinstance(marking, str) or marking not in _MARKINGS:
         raise UserError(f"{name}: {side} is {marking!r:.40}, expected one of {', '.join(_MARKINGS)}")
     return _MARKINGS[marking]
+
+
+def _side(properties: Mapping[str, Any], name: str) -> Side:
+    for side in ("left", "right"):
+        if properties["traffic"] == side:
+            return side
+    raise UserError(f"{name}: traffic is {properties['traffic']!r:.40}, expected left or right")
 
 
 def _flat(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:

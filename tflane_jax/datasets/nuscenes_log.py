@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from tflane_jax.datasets.plausible import check_distance, check_interval, check_
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose, pose_yaw, relative_pose, transform_points, yaw_pose
 from tflane_jax.scene import RoadUser
-from tflane_jax.scene.logs import KeyFrame, Log, Tracks, VectorMap
+from tflane_jax.scene.logs import KeyFrame, Log, Side, Tracks, VectorMap
 
 CATEGORIES: Mapping[str, RoadUser | None] = {
     "vehicle.car": RoadUser.CAR,
@@ -143,7 +143,7 @@ def scene_log(
     return Log(
         name=scene["name"],
         source="nuscenes",
-        map=VectorMap({}) if vector_map is None else vector_map,
+        map=VectorMap({}) if vector_map is None else replace(vector_map, side=side_of(tables.location(scene))),
         timestamps_ns=frames.timestamps_ns,
         global_from_ego=frames.global_from_frame,
         tracks=tracks,
@@ -155,6 +155,12 @@ def scene_log(
         seed=zlib.crc32(scene["name"].encode()),
         area=tables.location(scene),
     )
+
+
+def side_of(location: str) -> Side | None:
+    """Return the side on which traffic keeps in a city of nuScenes; None for any other."""
+    sides: dict[str, Side] = {"singapore": "left", "boston": "right"}
+    return sides.get(location.partition("-")[0])
 
 
 def scene_tracks(

@@ -17,6 +17,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.datasets.lane_outlines import LaneOutline, boundaries
-from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user
+from tflane_jax.datasets.nuscenes_log import CATEGORIES, empty_tracks, road_user, side_of
 from tflane_jax.datasets.nuscenes_map import flat
 from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
@@ -65,7 +66,7 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
     return Log(
         name=name,
         source="nuscenes-scenes",
-        map=vector_map,
+        map=replace(vector_map, side=side_of(area)),
         timestamps_ns=times,
         global_from_ego=pose,
         tracks=tracks,
@@ -231,6 +232,8 @@ def _distance(points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"]) 
 def find_scene_files(root: Path) -> list[Path]:
     """Return the file itself, or the npz files of a folder by name; raises UserError if there is none."""
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no {root}: name a scene file (npz) or a folder of them")
     found = [root] if root.is_file() else sorted(root.glob("*.npz"))
     if not found:
         raise UserError(f"{root} holds no scene file (*.npz)")

@@ -181,6 +181,8 @@ def find_tables(root: Path, version: str | None = None) -> Path:
         UserError: there is none, or several of which none is v1.0-trainval.
     """
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no folder {root}: name the folder of nuScenes")
     if version is not None:
         if not (root / version / "sample.json").is_file():
             raise UserError(f"{root} holds no {version}/sample.json: name the data set's folder and its version")

@@ -33,6 +33,10 @@ class SceneTracks:
     def __contains__(self, name: str) -> bool:
         return name in self._scenes
 
+    def area(self, name: str) -> str:
+        """Return the city of a scene in the tables."""
+        return self.tables.location(self._scenes[name])
+
     def log(self, name: str) -> Log:
         """Return a scene with an empty map; raises UserError for one that is damaged or not in the tables."""
         if name not in self._scenes:

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from tflane_jax.datasets.base import Split
 from tflane_jax.datasets.plausible import FARTHEST, MOST_PIXELS
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, load_json, member, numbers
+from tflane_jax.files.fields import items, load_json, load_members, member, numbers
 from tflane_jax.files.openlane import FrameKey
 from tflane_jax.geometry import pose_matrix
 
@@ -194,7 +194,8 @@ def source_logs(root: Path, keys: Sequence[FrameKey], suffix: str = "") -> dict[
     for key in keys:
         if (key.split, key.segment) not in logs:
             path = info_path(root, key, suffix)
-            log = member(member(load_json(path), "meta_data", str(path)), "source_id", f"{path}: meta_data")
+            meta = member(load_members(path, ("meta_data",)), "meta_data", str(path))
+            log = member(meta, "source_id", f"{path}: meta_data")
             logs[key.split, key.segment] = str(log)
     return logs
 
@@ -224,6 +225,12 @@ def read_frame(root: Path, key: FrameKey, subset: SubsetName, suffix: str = "") 
         cameras=tuple(_camera(sensors, name, root, where) if name in sensors else None for name in names),
         annotation=content.get("annotation"),
     )
+
+
+def read_pose(root: Path, key: FrameKey, suffix: str = "") -> Float[np.ndarray, "4 4"]:
+    """Return the pose in a frame's file, parsed no further than that; raises UserError as `read_frame` does."""
+    path = info_path(root, key, suffix)
+    return frame_pose(member(load_members(path, ("pose",)), "pose", str(path)), f"{path}: pose")
 
 
 def _camera(sensors: Any, name: str, root: Path, where: str) -> FrameCamera:

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.datasets.argoverse2_log import find_logs, load_log
+from tflane_jax.datasets.argoverse2_log import city_of, find_logs, load_log
 from tflane_jax.datasets.base import ExampleConfig, MissingTracksWarning
 from tflane_jax.datasets.examples import traffic_flow, warn_dropped
 from tflane_jax.datasets.nuscenes_log import level_poses
@@ -60,6 +60,10 @@ class SourceTracks:
     def has(self, key: FrameKey) -> bool:
         """Return whether the log of a frame is at hand."""
         return self._names[key.split, key.segment] in self._logs
+
+    def area(self, key: FrameKey) -> str:
+        """Return the city of a frame; "" where its log is not at hand, or has no map, whose file names the city."""
+        return self._logs.area(self._names[key.split, key.segment]) if self.has(key) else ""
 
     def known(self, keys: Sequence[FrameKey], without: WithoutTracks) -> list[FrameKey]:
         """Return the frames to use; see `WithoutTracks`. Warns (`MissingTracksWarning`) where logs are missing.
@@ -119,7 +123,9 @@ class SourceTracks:
             )
         log = replace(log, keyframes=(KeyFrame(time, global_from_ego, nearest),))
         stride = 1 if log.rate_hz is None else config.history_stride(log.rate_hz)
-        flow, dropped = traffic_flow(log, 0, history=config.history, capacity=config.tracks, stride=stride)
+        flow, dropped = traffic_flow(
+            log, 0, history=config.history, capacity=config.tracks, stride=stride, region=config.ground
+        )
         warn_dropped(config, tracks=dropped)
         return flow
 
@@ -133,6 +139,9 @@ class _Argoverse2:
 
     def __contains__(self, name: str) -> bool:
         return name in self._folders
+
+    def area(self, name: str) -> str:
+        return city_of(self._folders[name])
 
     def log(self, name: str) -> Log:
         if name not in self._read:

@@ -31,6 +31,7 @@ from tflane_jax.datasets.openlane_frames import (
     info_path,
     list_frames,
     read_frame,
+    read_pose,
     source_logs,
     subset_of,
     without_map_changes,
@@ -172,9 +173,10 @@ class OpenLaneV2Dataset:
         )
 
     def info(self, index: int) -> FrameInfo:
-        """Return segment, time and pose of one frame."""
+        """Return segment, time and pose of one frame, and its city, which only the source logs tell."""
         key = self.keys[self._checked(index)]
-        return FrameInfo("openlane_v2", key.scene, self._time(index), self._pose(index))
+        area = "" if self._tracks is None else self._tracks.area(key)
+        return FrameInfo("openlane_v2", key.scene, self._time(index), self._pose(index), area)
 
     def scene(self, index: int) -> str:
         """Return the segment of one frame; reads no file."""
@@ -208,7 +210,9 @@ class OpenLaneV2Dataset:
         return files
 
     def _pose(self, index: int) -> Float[np.ndarray, "4 4"]:
-        return self._poses[index] if index in self._poses else self._files(index)[0].global_from_ego
+        if index not in self._poses:
+            self._poses[index] = read_pose(self.root, self.keys[index], self._suffixes[0])
+        return self._poses[index]
 
     @cached_property
     def _sizes(self) -> tuple[tuple[int, int] | None, ...]:

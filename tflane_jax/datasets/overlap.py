@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from tflane_jax.datasets.argoverse2_log import city_of, find_logs, read_poses
 from tflane_jax.datasets.base import IndexedExamples
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import load_json, member, numbers
+from tflane_jax.files.fields import load_members, member, numbers
 
 RADII = (5.0, 10.0, 20.0, 50.0)
 NEAR = 5.0
@@ -32,7 +32,8 @@ class Drive:
 
     Attributes:
         name: of the recording.
-        area: city whose coordinates the positions use; positions of different areas are never compared.
+        area: city whose coordinates the positions use; positions of different cities are never compared. "" if it is
+            not known: it may be any city, so its positions are compared with all.
         positions: (F, 2) metres.
     """
 
@@ -44,7 +45,7 @@ class Drive:
 def read_drives(root: Path) -> list[Drive]:
     """Return the drives of a folder of Argoverse 2 logs, or of OpenLane-V2 (`<segment>/info/<timestamp>.json`).
 
-    OpenLane-V2's files do not name the city: their drives all get the area "unknown".
+    OpenLane-V2's files do not name the city.
 
     Raises:
         UserError: the folder holds neither, or a file cannot be read.
@@ -54,10 +55,10 @@ def read_drives(root: Path) -> list[Drive]:
     if files:
         drives: dict[Path, list[np.ndarray]] = {}
         for file in files:
-            pose = member(load_json(file), "pose", str(file))
+            pose = member(load_members(file, ("pose",)), "pose", str(file))
             where = numbers(member(pose, "translation", f"{file}: pose"), (3,), f"{file}: pose.translation")
             drives.setdefault(file.parent.parent, []).append(where[:2])
-        return [Drive(folder.name, "unknown", np.stack(where)) for folder, where in drives.items()]
+        return [Drive(folder.name, "", np.stack(where)) for folder, where in drives.items()]
     return [_log_drive(folder) for folder in find_logs(root)]
 
 
@@ -70,14 +71,11 @@ def _log_drive(folder: Path) -> Drive:
 
 
 def frame_drives(dataset: IndexedExamples) -> list[Drive]:
-    """Return the drives of a dataset: the positions of its examples in their order.
-
-    The area of examples whose city is not known is the dataset's source.
-    """
+    """Return the drives of a dataset: the positions of its examples in their order."""
     drives: dict[tuple[str, str], list[np.ndarray]] = {}
     for index in range(len(dataset)):
         info = dataset.info(index)
-        drives.setdefault((info.scene, info.area or info.source), []).append(info.global_from_ego[:2, 3])
+        drives.setdefault((info.scene, info.area), []).append(info.global_from_ego[:2, 3])
     return [Drive(scene, area, np.stack(where)) for (scene, area), where in drives.items()]
 
 
@@ -86,10 +84,12 @@ class Nearness:
     """How far the examples of a split are from the nearest training frame.
 
     Attributes:
-        distances: (N,) metres; inf where no training frame is in the same area.
+        distances: (N,) metres; inf where no training frame can be in the same city.
+        assumed: (N,) whether the city of the example, or of the nearest training frame, is not known.
     """
 
     distances: Float[np.ndarray, " n"]
+    assumed: Bool[np.ndarray, " n"]
 
     @property
     def groups(self) -> list[str]:
@@ -98,10 +98,12 @@ class Nearness:
 
     def sentence(self) -> str:
         """Return how many examples are near, and the distance of the nearest."""
-        near = int((self.distances <= NEAR).sum())
-        nearest = self.distances.min()
+        near, nearest = self.distances <= NEAR, self.distances.min()
         least = f"the nearest is {nearest:.1f} m away" if np.isfinite(nearest) else "none is of the same city"
-        return f"{near} of {len(self.distances)} frames are within {NEAR:g} m of a training frame; {least}"
+        said = f"{near.sum()} of {len(near)} frames are within {NEAR:g} m of a training frame; {least}"
+        if not (guessed := int((near & self.assumed).sum())):
+            return said
+        return f"{said}. Files do not name the city of {guessed} of them, which may be another with equal coordinates"
 
 
 def nearness(train: Sequence[Drive], dataset: IndexedExamples) -> Nearness:
@@ -112,12 +114,12 @@ def nearness(train: Sequence[Drive], dataset: IndexedExamples) -> Nearness:
     rows: dict[tuple[str, str], list[int]] = {}
     for index in range(len(dataset)):
         info = dataset.info(index)
-        rows.setdefault((info.scene, info.area or info.source), []).append(index)
+        rows.setdefault((info.scene, info.area), []).append(index)
     found = overlap(train, frame_drives(dataset))
-    distances = np.zeros(len(dataset))
-    for indices, apart in zip(rows.values(), found.distances, strict=True):
-        distances[indices] = apart
-    return Nearness(distances)
+    distances, assumed = np.zeros(len(dataset)), np.zeros(len(dataset), bool)
+    for indices, apart, guess in zip(rows.values(), found.distances, found.assumed, strict=True):
+        distances[indices], assumed[indices] = apart, guess
+    return Nearness(distances, assumed)
 
 
 @dataclass(frozen=True)
@@ -126,13 +128,15 @@ class Overlap:
 
     Attributes:
         names: V validation drives.
-        distances: V arrays (F,), from every frame to the nearest training frame of the same area, metres; inf if the
-            area has none.
-        nearest: V names, the training drive that comes nearest; "-" if the area has none.
+        distances: V arrays (F,), from every frame to the nearest training frame that may be in the same city, metres;
+            inf if there is none.
+        assumed: V arrays (F,), whether the city of the frame, or of that training frame, is not known.
+        nearest: V names, the training drive that comes nearest; "-" if there is none.
     """
 
     names: tuple[str, ...]
     distances: tuple[Float[np.ndarray, " f"], ...]
+    assumed: tuple[Bool[np.ndarray, " f"], ...]
     nearest: tuple[str, ...]
 
     def rows(self) -> list[dict[str, float]]:
@@ -160,26 +164,30 @@ class Overlap:
 
 
 def overlap(train: Sequence[Drive], validation: Sequence[Drive]) -> Overlap:
-    """Compare positions within each area; raises UserError where one side has no drive."""
+    """Compare positions within each city, see `Drive.area`; raises UserError where one side has no drive."""
     from scipy.spatial import KDTree
 
     for what, drives in (("training", train), ("validation", validation)):
         if not sum(len(drive.positions) for drive in drives):
             raise UserError(f"the {what} split has no frames")
+    validation = [drive for drive in validation if len(drive.positions)]
     trees = {}
-    for area in {drive.area for drive in train}:
-        drives = [drive for drive in train if drive.area == area]
-        owner = np.repeat(np.arange(len(drives)), [len(drive.positions) for drive in drives])
-        trees[area] = KDTree(np.concatenate([drive.positions for drive in drives])), owner, drives
-    distances, nearest = [], []
-    drives_with_frames = [drive for drive in validation if len(drive.positions)]
-    for drive in drives_with_frames:
+    for area in {drive.area for drive in validation}:
+        drives = [drive for drive in train if len(drive.positions) and (not area or drive.area in (area, ""))]
+        if drives:
+            owner = np.repeat(np.arange(len(drives)), [len(drive.positions) for drive in drives])
+            trees[area] = KDTree(np.concatenate([drive.positions for drive in drives])), owner, drives
+    distances, assumed, nearest = [], [], []
+    for drive in validation:
         if drive.area not in trees:
             distances.append(np.full(len(drive.positions), np.inf))
+            assumed.append(np.zeros(len(drive.positions), bool))
             nearest.append("-")
             continue
         tree, owner, drives = trees[drive.area]
         distance, index = tree.query(drive.positions)
         distances.append(distance)
+        named = np.array([bool(drive.area and other.area) for other in drives])
+        assumed.append(~named[owner[index]])
         nearest.append(drives[owner[index[distance.argmin()]]].name)
-    return Overlap(tuple(drive.name for drive in drives_with_frames), tuple(distances), tuple(nearest))
+    return Overlap(tuple(drive.name for drive in validation), tuple(distances), tuple(assumed), tuple(nearest))

@@ -12,6 +12,7 @@ import itertools
 import multiprocessing
 import os
 import signal
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -135,7 +136,10 @@ def _run(job: _Job, blocks: list[range], workers: int) -> Iterator[tuple[range, 
         try:
             futures = {pool.submit(_write_block, block): block for block in blocks}
             for future in as_completed(futures):
-                yield futures[future], future.result()
+                names, warned = future.result()
+                for warning in warned:  # those of all workers, so that a text is shown once
+                    warnings.warn(warning, stacklevel=2)
+                yield futures[future], names
         except BrokenProcessPool as error:
             raise UserError(
                 "a worker process that builds the dataset died: either memory ran out (use fewer workers), or a "
@@ -198,5 +202,8 @@ def _start_worker(job: _Job) -> None:
     end_with_parent()
 
 
-def _write_block(indices: range) -> list[str]:
-    return _write_examples(_worker_job, indices)
+def _write_block(indices: range) -> tuple[list[str], list[Warning]]:
+    """Return the names of the scenes, and the warnings that this process would have shown."""
+    with warnings.catch_warnings(record=True) as caught:
+        names = _write_examples(_worker_job, indices)
+    return names, [warning.message for warning in caught if isinstance(warning.message, Warning)]

@@ -28,7 +28,7 @@ from tflane_jax.scene import Example
 from tflane_jax.scene.logs import Log
 from tflane_jax.world.presets import CITY, REAL_MAPS
 from tflane_jax.world.roads.map_networks import prepare_roads
-from tflane_jax.world.roads.road_map import RoadMap
+from tflane_jax.world.roads.road_map import RoadMap, driving_side
 from tflane_jax.world.simulate import Place, WorldConfig, simulate
 
 # Stream of a scene's number that decides between maps and generated roads.
@@ -182,10 +182,13 @@ class RealMapData:
 
 
 def _drives(config: RealMapConfig) -> list[Drive]:
-    """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated."""
+    """Return the drives of the logs on whose maps the scenes are; nothing if all roads are generated.
+
+    GeoJSON maps have coordinates of their own, which no recording shares.
+    """
     found = chosen_maps(config.maps, config.logs, config.without) if config.generated < 1.0 else []
     maps = [_read(one) for one in found]
-    return [Drive(one.name, one.area or one.source, one.places) for one in maps]
+    return [Drive(one.name, one.area, one.places) for one in maps if one.source != "geojson"]
 
 
 # Scenes of --data real-maps where the configuration has other data.
@@ -219,6 +222,7 @@ def check_real_maps(root: Path) -> FolderCheck:
                 "intersections": sum(len(junction.minor) > 2 for junction in roads.junctions),
                 "crossings": len(roads.crossings),
                 "parking places": len(roads.parking),
+                "traffic keeps": driving_side(road_map.map) or "right, assumed",
                 "complete m": road_map.complete,
                 "places for examples, m of lane": 3 * len(roads.spots(sees(RECORDED_EXAMPLE))),
             }

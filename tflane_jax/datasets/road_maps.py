@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import os
 import zipfile
 from collections.abc import Collection, Iterator
@@ -96,9 +97,13 @@ def find_maps(root: Path) -> list[MapFile]:
     expansion and scene files of nuScenes (npz), segments of OpenLane-V2 (`openlane_maps`), and lanes as GeoJSON
     (`geojson_lanes`).
 
+    A folder that links lead to twice, or back to one above it, is read once.
+
     Raises UserError if there is none, or if two have the same name.
     """
     root = Path(root)
+    if not root.exists():
+        raise UserError(f"there is no {root}: name a folder of logs, or one log")
     found = sorted(_found(root), key=lambda one: one.name)
     if not found:
         formats = (
@@ -106,9 +111,11 @@ def find_maps(root: Path) -> list[MapFile]:
             "(<segment>/info/<timestamp>.json) or lanes (geojson)"
         )
         raise UserError(f"{root} holds no map: expected {formats}")
-    names = [one.name for one in found]
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise UserError(f"{root} holds two maps with the name {min(twice)}: take one out")
+    for one, other in itertools.pairwise(found):
+        if one.name == other.name:
+            raise UserError(
+                f"{root} holds two maps with the name {one.name}: take out {one.files[0]} or {other.files[0]}"
+            )
     return found
 
 
@@ -148,8 +155,14 @@ def _found(root: Path) -> Iterator[MapFile]:
 
 def _files(root: Path) -> Iterator[Path]:
     """Yield all files below a folder, but for those in folders of images and sweeps, which are many."""
+    seen = {os.path.realpath(root)}
     for folder, inner, names in os.walk(root, followlinks=True):
-        inner[:] = sorted(name for name in inner if name not in _SENSOR_FOLDERS)
+        places = [os.path.join(folder, name) for name in inner if name not in _SENSOR_FOLDERS]
+        inner.clear()
+        for place in sorted(places, key=lambda place: (os.path.islink(place), place)):
+            if (real := os.path.realpath(place)) not in seen:
+                seen.add(real)
+                inner.append(os.path.basename(place))
         yield from (Path(folder) / name for name in sorted(names))
 
 

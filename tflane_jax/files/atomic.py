@@ -167,7 +167,7 @@ def _replace_folder(new: Path, path: Path) -> None:
 
 def _delete(path: Path) -> None:
     """Delete a file or folder if it exists; an error here must not hide the one that brought us here."""
-    if path.is_dir() and not path.is_symlink():
+    if os.path.isdir(path) and not os.path.islink(path):  # unlike Path.is_dir, False for a name that is too long
         shutil.rmtree(path, ignore_errors=True)
     else:
         with contextlib.suppress(OSError):

@@ -6,6 +6,7 @@ Every function returns the value or raises UserError. `where` names the place in
 from __future__ import annotations
 
 import json
+import re
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from tflane_jax.errors import UserError
 from tflane_jax.files.plain_pickle import load_plain_pickle
 
+_SPACE = re.compile(r"[ \t\n\r]*")
 _FARTHEST = 1e5
 """Metres from the vehicle, or pixels, that no line of these formats has."""
 
@@ -35,6 +37,32 @@ def load_file(path: Path) -> Any:
 def load_json(path: Path) -> Any:
     """Return the content of a JSON file; raises UserError that names the file and the line of the mistake."""
     return parse_json(read_text(path), str(path))
+
+
+def load_members(path: Path, names: Sequence[str]) -> Mapping[str, Any]:
+    """Return entries of the object in a JSON file, which is parsed only as far as the last of them.
+
+    What is missing in the file is missing in the result, for `member` to name. Raises UserError as `load_json` does for
+    a mistake before the last entry; later ones are not seen.
+    """
+    text, decoder, found, at = read_text(path), json.JSONDecoder(), {}, 0
+    try:
+        while not found.keys() >= set(names):
+            at = _past(text, at, "," if at else "{")
+            name, at = decoder.raw_decode(text, at)
+            value, at = decoder.raw_decode(text, _past(text, at, ":"))
+            found[name] = value
+    except (ValueError, TypeError, RecursionError):  # it ends here, or there is a mistake, which is told by:
+        found = parse_json(text, str(path))
+    return {name: found[name] for name in names if name in found} if isinstance(found, Mapping) else found
+
+
+def _past(text: str, at: int, sign: str) -> int:
+    """Return the place of the next value, after a sign and spaces around it."""
+    start = _SPACE.match(text, at).end()  # pyright: ignore[reportOptionalMemberAccess] - it matches nothing, too
+    if not text.startswith(sign, start):
+        raise ValueError
+    return _SPACE.match(text, start + len(sign)).end()  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def read_text(path: Path, what: str = "JSON file") -> str:

@@ -7,11 +7,14 @@ one moment into an `Example`. Global coordinates (city frame) stay float64. Only
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from tflane_jax.scene.marker_patterns import MarkerFamily
 from tflane_jax.scene.terrain import Terrain
+
+Side = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,14 @@ class VectorMap:
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks of unlimited height.
         roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
+<<<<<<< HEAD
         dividers: painted dividers (n, 3) where the source records them on their own; None if it records only the sides
             of lanes.
+=======
+        dividers: painted dividers (n, 3) where the source records them on their own; None where the sides of its lanes
+            are all there is.
+        side: on which traffic keeps, where the source tells it; see `world.roads.road_map.driving_side`.
+>>>>>>> h_data
     """
 
     segments: dict[int, LaneSegment]
@@ -79,6 +88,7 @@ class VectorMap:
     buildings: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
     roads: tuple[np.ndarray, ...] = ()
     dividers: tuple[np.ndarray, ...] | None = None
+    side: Side | None = None
 
 
 @dataclass(frozen=True)

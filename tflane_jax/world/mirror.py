@@ -11,11 +11,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.scene.logs import LaneSegment, Log, PlacedMarkers, Tracks, VectorMap
+from tflane_jax.scene.logs import LaneSegment, Log, PlacedMarkers, Side, Tracks, VectorMap
 from tflane_jax.world.moving import moved_boxes, moved_map
 from tflane_jax.world.roads.markers import PlacementConfig, Visible, place_markers
 from tflane_jax.world.roads.road_map import RoadMap, drives_on_left
 
+_OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
 _Y = np.array([1.0, -1.0, 1.0])
 _ACROSS = np.diag([1.0, -1.0, 1.0, 1.0])
 # A board is turned over, too, so that its pattern is not reversed: x runs along the board (`tflane_jax.markers`).
@@ -66,6 +67,7 @@ def mirrored_map(found: VectorMap) -> VectorMap:
         ),
         # Turned round, which is the same box: the left side of a building is its front.
         buildings=there.buildings * [1.0, -1.0, 1.0, 1.0, -1.0] + [0.0, 0.0, 0.0, 0.0, np.pi],
+        side=None if found.side is None else _OTHER[found.side],
     )
 
 

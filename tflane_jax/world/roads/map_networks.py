@@ -181,6 +181,7 @@ def build_map_network(
             dividers=None
             if road_map.map.dividers is None
             else tuple(_on_plane(line) for line in road_map.map.dividers if _near(line, spot, _SEGMENTS)),
+            side=road_map.map.side,
         ),
         speed_limit=dict.fromkeys(lanes, speed),
         yield_to=yields,

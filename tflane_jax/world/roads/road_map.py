@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.scene.logs import LaneSegment, VectorMap
+from tflane_jax.scene.logs import LaneSegment, Side, VectorMap
 
 # Lanes shorter than this carry no traffic, metres.
 _SHORTEST = 0.5
@@ -40,14 +40,20 @@ class RoadMap:
 
 
 def drives_on_left(found: VectorMap) -> bool:
-    """Return whether traffic keeps to the left: whether oncoming lanes are mostly on the right side of lanes.
+    """Return whether traffic keeps to the left; where nothing tells, it keeps to the right."""
+    return driving_side(found) == "left"
 
-    For every few metres of lane the nearest oncoming lane counts, if one is near. Without any, traffic keeps right.
+
+def driving_side(found: VectorMap) -> Side | None:
+    """Return the side on which traffic keeps: opposite to that of most oncoming lanes.
+
+    For every few metres of lane the nearest oncoming lane counts, if one is near. Without any, as in a map of one-way
+    streets alone, it is what the source of the map tells; None where that is nothing.
     """
     lanes = [lane for lane in found.segments.values() if not lane.is_intersection and lane.vehicle]
     lines = [lane.centerline[:, :2] for lane in lanes if _length(lane.centerline) >= _SHORTEST]
     if not lines:
-        return False
+        return found.side
     at, ahead = (np.concatenate(parts) for parts in zip(*map(_directed, lines), strict=True))
     oncoming = 0
     for place, heading in zip(at, ahead, strict=True):
@@ -56,7 +62,7 @@ def drives_on_left(found: VectorMap) -> bool:
         beside = (ahead @ heading < _OPPOSED) & (along < _EVERY) & (np.abs(left) > 1.0) & (np.abs(left) < _BESIDE)
         if beside.any():
             oncoming += int(np.sign(left[beside][np.abs(left[beside]).argmin()]))
-    return oncoming < 0
+    return ("right" if oncoming > 0 else "left") if oncoming else found.side
 
 
 def _directed(line: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2"]]:

@@ -1,0 +1,41 @@
+"""Entries of JSON files that are parsed only in part."""
+
+import json
+
+import pytest
+
+from tflane_jax.errors import UserError
+from tflane_jax.files.fields import load_json, load_members
+
+RECORD = {"a": [1, {"b": "}"}], "pose": {"x": 1.5}, "é": None, "long": "z"}
+
+
+@pytest.mark.parametrize("indent", [None, 2, "\t"])
+@pytest.mark.parametrize("names", [(), ("a",), ("pose", "a"), ("long",), ("none",), ("none", "a")])
+def test_entries_are_those_of_the_whole_file(tmp_path, names, indent):
+    path = tmp_path / "record.json"
+    path.write_text(json.dumps(RECORD, indent=indent), encoding="utf-8")
+    assert load_members(path, names) == {name: RECORD[name] for name in names if name in RECORD}
+
+
+def told(read):
+    """Return what is read, or the text of the error."""
+    try:
+        return read()
+    except UserError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", "null", "{}", '{"a" 1}', '{"a": 1 "b": 2}', "{1: 2}", "x"])
+def test_what_is_no_object_with_the_entry_is_told_as_by_reading_all(tmp_path, text):
+    path = tmp_path / "record.json"
+    path.write_text(text)
+    assert told(lambda: load_members(path, ("pose",))) == told(lambda: load_json(path))
+
+
+def test_nothing_is_parsed_after_the_last_entry(tmp_path):
+    path = tmp_path / "record.json"
+    path.write_text(json.dumps(RECORD)[:-20] + "here is the fault")
+    assert load_members(path, ("pose", "a")) == {"a": RECORD["a"], "pose": RECORD["pose"]}
+    with pytest.raises(UserError, match="no JSON file"):
+        load_members(path, ("long",))

@@ -71,14 +71,9 @@ class VectorMap:
         elements: traffic lights and signs.
         buildings: (B, 5) x, y, length, width, yaw of opaque blocks of unlimited height.
         roads: centre line (n, 3) of each road; empty if the source has no roads. A closed one repeats its first point.
-<<<<<<< HEAD
         dividers: painted dividers (n, 3) where the source records them on their own; None if it records only the sides
             of lanes.
-=======
-        dividers: painted dividers (n, 3) where the source records them on their own; None where the sides of its lanes
-            are all there is.
-        side: on which traffic keeps, where the source tells it; see `world.roads.road_map.driving_side`.
->>>>>>> h_data
+        side: on which traffic keeps, if the source says so; see `world.roads.road_map.driving_side`.
     """
 
     segments: dict[int, LaneSegment]

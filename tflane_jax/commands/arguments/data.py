@@ -51,12 +51,7 @@ def data(commands) -> None:
         "--format",
         metavar="NAME",
         type=SourceName(checked=True),
-<<<<<<< HEAD
-        default="argoverse2",
         help="format of the dataset (default argoverse2)",
-=======
-        help="of the dataset (default argoverse2)",
->>>>>>> h_data
     )
     check.add_argument(
         "--tracks",

@@ -82,6 +82,14 @@ def test_tusimples_own_view_needs_no_search(network, monkeypatch):
     assert set(network["views"]) == {whole}
 
 
+def test_a_portrait_is_searched_however_plausible_it_looks(network, monkeypatch):
+    """Stretched to 16:9, it is not what TuSimple's camera would have seen."""
+    whole = Placement(0, 0, 405, 720)
+    monkeypatch.setitem(globals(), "TRUE", whole)
+    reader().read(photo(whole, (720, 405)))
+    assert len(set(network["views"])) > 15
+
+
 def test_a_known_camera_is_not_searched(network):
     reader().read(photo(), PhotoCamera(horizon=449))
     assert len(set(network["views"])) == 1
@@ -132,6 +140,23 @@ def test_what_lies_above_the_horizon_is_cut(network):
     network["upper"] = 0.0
     found = reader().read(photo(), PhotoCamera(horizon=449))
     assert min(points[:, 1].min() for points in found.lanes) >= 449 - 12
+
+
+@pytest.mark.parametrize("together", [1e-9, 1e-4, -1e-4, 0.02])
+@pytest.mark.parametrize(("camera", "horizon"), [(PhotoCamera(horizon=449), 449), (PhotoCamera(focal=2000), 298)])
+def test_nearly_parallel_lanes_are_cut_at_the_horizon_of_a_known_camera(monkeypatch, camera, horizon, together):
+    """They meet far above the photo or far below it, which says nothing of the horizon."""
+    beside = np.array([0.2, 0.4, 0.6, 0.8])
+    slopes, none = together * (beside - 0.5), np.zeros(4)
+    lanes = np.stack([none, none + 1.0, none, none + 0.2, none, none, slopes, slopes - beside], -1)
+
+    def predict(task, params, examples):
+        return CurvePrediction(np.tile([0.0, 2.0], (1, 4, 1)), lanes[None])
+
+    monkeypatch.setattr(photo_lanes, "predict_curves", predict)
+    found = reader().read(photo(), camera)
+    assert len(found.lanes) == 4
+    assert [points[:, 1].min() for points in found.lanes] == pytest.approx([horizon + 4] * 4, abs=6)
 
 
 def test_frames_of_a_video_share_a_view(network):

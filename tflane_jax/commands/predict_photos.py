@@ -129,7 +129,7 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     frames, doubtful = [], 0
     with writing_video(out, info) as writer:
         for frame in progress_bar(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
-            answer = reader.read_view(frame, view, known=camera is not None)
+            answer = reader.read_view(frame, view) if camera is None else reader.read(frame, camera)
             writer.add(lanes_drawn(frame, answer.lanes))
             frames.append(_plain(answer, _VIDEO_POINTS))
             doubtful += bool(answer.warning)

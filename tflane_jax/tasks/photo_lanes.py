@@ -31,6 +31,9 @@ _FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
 # The value from which a photo is seen whole without a search (TuSimple's ten frames at hand have 0.23 or more), and the
 # ranks from which a view is taken without a warning, and taken at all.
 _SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
+# By how much a photo may be wider or narrower than TuSimple's 16:9 and still be seen whole without a search: 4:3 and
+# 21:9 are, squares and portraits are not, in which all lanes are distorted.
+_ALIKE = 1.5
 _POINTS = 100
 _EMPTY = "the photo is empty: it has one brightness almost everywhere"
 _NOTHING = (
@@ -90,8 +93,8 @@ class PhotoReader:
             view = fit_photo(photo, camera).placement
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
         if camera is not None and (camera.focal is not None or camera.horizon is not None):
-            return self._checked(photo, self._see(photo, grey, camera), known=True)
-        return self._checked(photo, self._search(photo, grey), known=False)
+            return self._checked(photo, self._see(photo, grey, camera), camera)
+        return self._checked(photo, self._search(photo, grey))
 
     def find_view(self, photos: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Placement | None:
         """Return the view that suits frames of one camera best; None if no frame shows plausible lanes."""
@@ -99,17 +102,17 @@ class PhotoReader:
         best = max(found, key=lambda seen: seen.judged.rank, default=None)
         return None if best is None or best.judged.rank < _LEAST else best.view
 
-    def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement, *, known: bool = False) -> PhotoLanes:
-        """Return the lanes that a view of a photo shows; `known` tells that it was not searched."""
+    def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement) -> PhotoLanes:
+        """Return the lanes in a view that `find_view` found in other frames of the camera."""
         grey = _grey(photo)
         if is_blank(grey):
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
-        return self._checked(photo, self._look(photo, grey, view), known=known)
+        return self._checked(photo, self._look(photo, grey, view))
 
     def _search(self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"]) -> _Seen:
         height, width = grey.shape
         whole = self._see(photo, grey, PhotoCamera())
-        if whole.judged.value >= _SURE:
+        if whole.judged.value >= _SURE and 1.0 / _ALIKE < width * 9 / (height * 16) < _ALIKE:
             return whole
         tried = {whole.view: whole}
         for horizon in _HORIZONS:
@@ -149,16 +152,17 @@ class PhotoReader:
         lanes, scores = list(lanes[order]), scores[chosen][order]
         return _Seen(view, lanes, scores, judge_lanes(grey, view, lanes, scores))
 
-    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _Seen, *, known: bool) -> PhotoLanes:
-        """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing."""
+    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _Seen, camera: PhotoCamera | None = None) -> PhotoLanes:
+        """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing.
+
+        Without a camera the view was searched, and may show nothing that is plausible.
+        """
         judged, (height, width) = seen.judged, photo.shape[:2]
-        searched = not known and seen.view != fit_photo(photo).placement
+        searched = camera is None and seen.view != fit_photo(photo).placement
         worth_of_view = judged.rank if searched else judged.value
-        if not known and worth_of_view < _LEAST:
+        if camera is None and worth_of_view < _LEAST:
             return PhotoLanes(seen.view, (), (), (), judged.value, _NOTHING)
-        top = seen.view.top + HORIZON * seen.view.height
-        if judged.meeting is not None and not judged.crossed and judged.meeting[1] < height:
-            top = min(top, judged.meeting[1])
+        top = _horizon(seen, camera)
         lanes, worth, kept = [], [], []
         believed = [i for i in range(len(seen.lanes)) if not searched or judged.supported[i]]
         for i in believed:
@@ -189,6 +193,16 @@ class PhotoReader:
             judged.value,
             "; ".join(warnings),
         )
+
+
+def _horizon(seen: _Seen, camera: PhotoCamera | None) -> float:
+    """Return the row above which no lane lies: the known horizon, or else that of the view or of its lanes."""
+    if camera is not None and camera.horizon is not None:
+        return camera.horizon
+    top, meeting = seen.view.top + HORIZON * seen.view.height, seen.judged.meeting
+    # Nearly parallel lanes meet far above the view or below it, which says nothing of the horizon.
+    believed = meeting is not None and not seen.judged.crossed and meeting[1] >= seen.view.top
+    return min(top, meeting[1]) if believed and meeting is not None else top
 
 
 def _grey(photo: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:

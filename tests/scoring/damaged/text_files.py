@@ -189,6 +189,7 @@ def _plain():
             ("no frames", drop("frames"), "lacks the entry 'frames'"),
             ("frames are null", put("frames", None), "frames is missing"),
             ("a frame twice", repeat(*frame), "frame a at 2 ns is there twice"),
+            ("a long scene", put(*frame, "scene", "9" * 5000), r"1 of 3 frames are .*: 9{80} "),
             ("a frame lost", drop(*frame), "1 of . frames are .*: a at 2 ns"),
             ("no scene", drop(*frame, "scene"), r"frames\[1\] lacks the entry 'scene'"),
             ("scene is a list", put(*frame, "scene", ["a"]), r"frames\[1\]: scene is \['a'\], expected a text"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.evaluation.test_photo_lanes import FEET, road
-from tflane_jax.datasets.photos import HORIZON, PhotoCamera, Placement
+from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement
 from tflane_jax.errors import UserError
 from tflane_jax.scene import CurvePrediction
 from tflane_jax.tasks import photo_lanes
@@ -97,6 +97,19 @@ def test_a_known_camera_is_not_searched(network):
         reader().read(photo(), PhotoCamera(horizon=900))
 
 
+def test_the_horizon_is_searched_for_a_known_focal_length(network):
+    """Without it, the photo would be seen with the horizon of TuSimple, 150 rows too high."""
+    focal = FOCAL * TRUE.width
+    found = reader().read(photo(), PhotoCamera(focal=focal))
+    horizon = TRUE.top + HORIZON * TRUE.height
+    assert found.view.top + HORIZON * found.view.height == pytest.approx(horizon, abs=12)
+    assert (found.view.width, found.warning, len(found.lanes) >= 2) == (TRUE.width, "", True)
+    assert {view.width for view in network["views"]} <= {TRUE.width, 1600}
+    view = reader().find_view([photo()], focal)
+    assert view is not None
+    assert view.width == TRUE.width
+
+
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_empty_photos_have_no_lanes(network, value):
     found = reader().read(np.full((90, 160, 3), value, np.uint8))
@@ -143,8 +156,7 @@ def test_what_lies_above_the_horizon_is_cut(network):
 
 
 @pytest.mark.parametrize("together", [1e-9, 1e-4, -1e-4, 0.02])
-@pytest.mark.parametrize(("camera", "horizon"), [(PhotoCamera(horizon=449), 449), (PhotoCamera(focal=2000), 298)])
-def test_nearly_parallel_lanes_are_cut_at_the_horizon_of_a_known_camera(monkeypatch, camera, horizon, together):
+def test_nearly_parallel_lanes_are_cut_at_the_horizon_of_a_known_camera(monkeypatch, together):
     """They meet far above the photo or far below it, which says nothing of the horizon."""
     beside = np.array([0.2, 0.4, 0.6, 0.8])
     slopes, none = together * (beside - 0.5), np.zeros(4)
@@ -154,9 +166,11 @@ def test_nearly_parallel_lanes_are_cut_at_the_horizon_of_a_known_camera(monkeypa
         return CurvePrediction(np.tile([0.0, 2.0], (1, 4, 1)), lanes[None])
 
     monkeypatch.setattr(photo_lanes, "predict_curves", predict)
-    found = reader().read(photo(), camera)
+    found = reader().read(photo(), PhotoCamera(horizon=449))
     assert len(found.lanes) == 4
-    assert [points[:, 1].min() for points in found.lanes] == pytest.approx([horizon + 4] * 4, abs=6)
+    assert [points[:, 1].min() for points in found.lanes] == pytest.approx([453] * 4, abs=6)
+    found = reader().read(photo(), PhotoCamera(focal=2000))
+    assert (found.lanes, found.warning[:8]) == ((), "no lanes")
 
 
 def test_frames_of_a_video_share_a_view(network):

@@ -106,6 +106,35 @@ def test_broken_tensors_are_refused(case, path):
     assert name in said or "does not fit the model" in said
 
 
+PROJECTION = "transformer.encoder.layers.0.self_attn.out_proj.weight"
+ATTENTION = {
+    "packed": PACKED,
+    "packed bias": PACKED_BIAS,
+    "projection": PROJECTION,
+    "projection bias": PROJECTION.replace("weight", "bias"),
+}
+
+
+@pytest.mark.parametrize("kind", ATTENTION)
+@pytest.mark.parametrize("change", [*CHANGES, "one number", "lost"])
+def test_broken_attention_is_refused_where_a_product_replaces_it(change, kind, path):
+    state, name = lstr_state(), ATTENTION[kind]
+    if change == "lost":
+        del state[name]
+    elif change == "one number":  # a bias that numpy would broadcast
+        state[name] = state[name].reshape(-1)[:1]
+    elif change == "flat" and kind.endswith("bias"):
+        pytest.skip("a bias is flat")
+    else:
+        CHANGES[change][0](state, name)
+    with pytest.raises(UserError) as error:
+        load_lstr(write(path, state), replace(TINY, encoder=GcnEncoderConfig(1, hidden=12)))
+    said = str(error.value)
+    assert said.startswith(str(path))
+    messages = name, "which are none of one attention", "value/bias is absent in the file"
+    assert any(message in said for message in messages), said
+
+
 DAMAGE = {
     "negative variance": (
         lambda s: s[VARIANCE].__setitem__(2, -0.1),
@@ -122,6 +151,10 @@ DAMAGE = {
     ),
     "a tensor lost": (lambda s: s.pop(LINEAR), "heads/class/kernel is absent in the file and 8x2 in the model"),
     "a tensor more": (lambda s: s.update({"fc.weight": s[LINEAR]}), "fc.weight is no tensor of LSTR: is this the"),
+    "a name that is no name": (
+        lambda s: s.update({"a" * 5000 + "\n": s[LINEAR]}),
+        "a{200} is no tensor of LSTR: is this",
+    ),
     "a layer more": (
         lambda s: s.update({k.replace("layers.0", "layers.1"): v for k, v in s.items() if "encoder" in k}),
         "encoder/layer_1/.* in the file and absent in the model",

@@ -65,6 +65,7 @@ def test_a_flipped_byte_never_escapes(tmp_path_factory, place, change, write):
         (b"PK\x03\x04", "no PyTorch checkpoint, or it is damaged"),
         (b"\x89PNG\r\n\x1a\n", "no PyTorch checkpoint, or it is damaged"),
         (pickle.dumps(5, 2), "no tensors by name, only a int"),
+        (pickle.dumps({"a": GRID}) + pickle.dumps({"a": GRID}), "goes on after its content: was it written twice"),
     ],
 )
 def test_other_files_are_named(tmp_path, content, message):

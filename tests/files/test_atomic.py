@@ -207,11 +207,18 @@ def test_writers_side_by_side_never_mix(tmp_path):
     assert names(tmp_path) == ["a.txt"]
 
 
-@pytest.mark.parametrize("path", [".", "/", ""])
+@pytest.mark.parametrize("path", [".", "/", "", ".."])
 def test_a_path_without_a_name_is_told(path):
     for write in (check_stem, lambda path: write_text(path, "x")):
         with pytest.raises(UserError, match="it names no file, only a folder; add a name"):
             write(path)
+
+
+def test_a_name_that_is_too_long_is_told(tmp_path):
+    for write in (check_stem, lambda path: write_text(path, "x")):
+        with pytest.raises(UserError, match=r"a(\.md)?: File name too long; check the path"):
+            write(tmp_path / ("a" * 300))
+    assert names(tmp_path) == []
 
 
 def test_the_files_of_a_stem_are_checked_before_they_are_made(tmp_path):

@@ -115,3 +115,11 @@ def test_folders_stand_for_their_photos(tmp_path):
         list_photos([tmp_path / "nothing"])
     with pytest.raises(UserError, match="no photos given"):
         list_photos([])
+
+
+def test_opencv_prints_nothing_beside_the_message(tmp_path, capfd):
+    """It would print warnings about a TIFF of floating-point numbers."""
+    path = written(tmp_path / "depth.tiff", np.zeros((6, 8, 3), np.float32), ".tiff")
+    with pytest.raises(UserError, match=r"depth.tiff is damaged or no image of a known format"):
+        read_image(path)
+    assert capfd.readouterr() == ("", "")

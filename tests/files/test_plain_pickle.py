@@ -87,6 +87,14 @@ def test_a_damaged_file_is_named(tmp_path, data):
         load_plain_pickle(tmp_path / "broken.pkl")
 
 
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_a_file_with_a_second_object_is_refused(tmp_path, protocol):
+    """A program that appends to its file leaves the old results in front."""
+    (tmp_path / "twice.pkl").write_bytes(pickle.dumps(PLAIN, protocol) + pickle.dumps(1))
+    with pytest.raises(UserError, match=r"twice\.pkl goes on for 5 bytes after its content: was it written twice"):
+        load_plain_pickle(tmp_path / "twice.pkl")
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*nowhere\.pkl"):
         load_plain_pickle(tmp_path / "nowhere.pkl")

@@ -44,13 +44,15 @@ def test_an_interrupted_video_is_not_left(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_damaged_files_are_named(video, tmp_path):
+def test_damaged_files_are_named(video, tmp_path, capfd):
     (tmp_path / "bad.avi").write_bytes(b"nothing")
     for path, message in ((tmp_path / "bad.avi", "damaged or no video"), (tmp_path / "none.mp4", "there is no file")):
         for read in (video_info, lambda path: next(read_frames(path)), lambda path: sample_frames(path, 2)):
             with pytest.raises(UserError, match=message):
                 read(path)
     whole = video.read_bytes()
-    video.write_bytes(whole[: len(whole) // 3])
-    with pytest.raises(UserError, match=r"drive.mp4"):
-        list(read_frames(video))
+    for kept in (1 / 3, 0.9):
+        video.write_bytes(whole[: int(kept * len(whole))])
+        with pytest.raises(UserError, match=r"drive.mp4"):
+            list(read_frames(video))
+    assert capfd.readouterr() == ("", "")  # nothing of OpenCV and FFmpeg

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tflane_jax.plots.images import lanes_drawn, predicted_lines
+from tflane_jax.plots.images import lanes_drawn, predicted_lines, save_photo
 from tflane_jax.scene import CurvePrediction
 
 
@@ -28,3 +28,17 @@ def test_a_lane_whose_ends_changed_places_is_not_drawn():
     found = predicted_lines(CurvePrediction(logits=logits, curves=curves))
     np.testing.assert_allclose(found[:, 0], [[0.2, 0.5], [0.7, 0.4]])
     np.testing.assert_allclose(found[:, -1], [[0.2, 0.8], [0.7, 0.9]])
+
+
+SIZES = [((900, 1600), 630), ((1600, 900), 1910), ((2000, 1), 2145), ((1, 900), 34)]
+
+
+@pytest.mark.parametrize(("size", "drawn"), SIZES)
+def test_the_picture_of_a_narrow_photo_is_of_bounded_height(tmp_path, size, drawn):
+    """A photo one pixel wide would be stretched to a picture of gigabytes."""
+    pytest.importorskip("matplotlib")
+    from PIL import Image
+
+    path = save_photo(tmp_path / "photo.png", np.full((*size, 3), 90, np.uint8), [], "a photo")
+    with Image.open(path) as picture:
+        assert picture.size == (1056, pytest.approx(drawn, abs=5))

@@ -206,7 +206,10 @@ def test_nuscenes_samples_name_the_scenes_of_maptr(folder, tmp_path, capsys):
     assert "the intervals are too narrow (name the drives by --scenes FILE)" in said
     for content, message in (
         (table[:2], "names no scene for s2"),
-        ({"s0": 1}, "s0 has a scene of type int"),
+        ({"s0": 1}, "s0 has the scene 1, expected a text"),
+        ({"s0": ""}, "s0 has the scene '', expected a text"),
+        ({"s0": "\ud800"}, r"s0 has the scene '\\ud800', expected a text"),
+        ([*table, {"token": "s0", "scene_token": "b"}], "row 3 has the scene 'b', another row 'a': name one"),
         ([{"token": "s0"}], "row 0 lacks the entry 'scene_token'"),
         (7, "is of type int, expected a list"),
     ):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.evaluation.test_photo_lanes import FEET, road
-from tflane_jax.datasets.photos import HORIZON, PhotoCamera, Placement
+from tflane_jax.datasets.photos import FOCAL, HORIZON, PhotoCamera, Placement
 from tflane_jax.errors import UserError
 from tflane_jax.scene import CurvePrediction
 from tflane_jax.tasks import photo_lanes
@@ -82,11 +82,32 @@ def test_tusimples_own_view_needs_no_search(network, monkeypatch):
     assert set(network["views"]) == {whole}
 
 
+def test_a_portrait_is_searched_however_plausible_it_looks(network, monkeypatch):
+    """Stretched to 16:9, it is not what TuSimple's camera would have seen."""
+    whole = Placement(0, 0, 405, 720)
+    monkeypatch.setitem(globals(), "TRUE", whole)
+    reader().read(photo(whole, (720, 405)))
+    assert len(set(network["views"])) > 15
+
+
 def test_a_known_camera_is_not_searched(network):
     reader().read(photo(), PhotoCamera(horizon=449))
     assert len(set(network["views"])) == 1
     with pytest.raises(UserError, match="below a photo"):
         reader().read(photo(), PhotoCamera(horizon=900))
+
+
+def test_the_horizon_is_searched_for_a_known_focal_length(network):
+    """Without it, the photo would be seen with the horizon of TuSimple, 150 rows too high."""
+    focal = FOCAL * TRUE.width
+    found = reader().read(photo(), PhotoCamera(focal=focal))
+    horizon = TRUE.top + HORIZON * TRUE.height
+    assert found.view.top + HORIZON * found.view.height == pytest.approx(horizon, abs=12)
+    assert (found.view.width, found.warning, len(found.lanes) >= 2) == (TRUE.width, "", True)
+    assert {view.width for view in network["views"]} <= {TRUE.width, 1600}
+    view = reader().find_view([photo()], focal)
+    assert view is not None
+    assert view.width == TRUE.width
 
 
 @pytest.mark.parametrize("value", [0, 128, 255])
@@ -132,6 +153,24 @@ def test_what_lies_above_the_horizon_is_cut(network):
     network["upper"] = 0.0
     found = reader().read(photo(), PhotoCamera(horizon=449))
     assert min(points[:, 1].min() for points in found.lanes) >= 449 - 12
+
+
+@pytest.mark.parametrize("together", [1e-9, 1e-4, -1e-4, 0.02])
+def test_nearly_parallel_lanes_are_cut_at_the_horizon_of_a_known_camera(monkeypatch, together):
+    """They meet far above the photo or far below it, which says nothing of the horizon."""
+    beside = np.array([0.2, 0.4, 0.6, 0.8])
+    slopes, none = together * (beside - 0.5), np.zeros(4)
+    lanes = np.stack([none, none + 1.0, none, none + 0.2, none, none, slopes, slopes - beside], -1)
+
+    def predict(task, params, examples):
+        return CurvePrediction(np.tile([0.0, 2.0], (1, 4, 1)), lanes[None])
+
+    monkeypatch.setattr(photo_lanes, "predict_curves", predict)
+    found = reader().read(photo(), PhotoCamera(horizon=449))
+    assert len(found.lanes) == 4
+    assert [points[:, 1].min() for points in found.lanes] == pytest.approx([453] * 4, abs=6)
+    found = reader().read(photo(), PhotoCamera(focal=2000))
+    assert (found.lanes, found.warning[:8]) == ((), "no lanes")
 
 
 def test_frames_of_a_video_share_a_view(network):

@@ -121,7 +121,8 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     """Write the video with its lanes; all frames are seen in one view, because they have one camera."""
     info = video_info(path)
     some = sample_frames(path, _SEARCHED_FRAMES)
-    view = reader.find_view(some) if camera is None else fit_photo(some[0], camera).placement
+    known = camera is not None and camera.horizon is not None
+    view = fit_photo(some[0], camera).placement if known else reader.find_view(some, camera and camera.focal)
     head = {"file": str(path), "width": info.width, "height": info.height, "rate": info.rate}
     if view is None:
         warning = "no view of its frames shows plausible lanes, and no video is written: give --horizon and --focal"
@@ -129,7 +130,7 @@ def _video(reader: PhotoReader, path: Path, out: Path, camera: PhotoCamera | Non
     frames, doubtful = [], 0
     with writing_video(out, info) as writer:
         for frame in progress_bar(read_frames(path), desc=path.name, unit="frame", total=info.frames or None):
-            answer = reader.read_view(frame, view, known=camera is not None)
+            answer = reader.read(frame, camera) if known else reader.read_view(frame, view)
             writer.add(lanes_drawn(frame, answer.lanes))
             frames.append(_plain(answer, _VIDEO_POINTS))
             doubtful += bool(answer.warning)

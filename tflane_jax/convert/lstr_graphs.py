@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from tflane_jax.convert.renaming import Rule
+from tflane_jax.convert.renaming import Rule, checked, size_text
 from tflane_jax.errors import UserError
 from tflane_jax.geometry.namespace import AnyArray
 from tflane_jax.models.graph_encoders import (
@@ -103,10 +103,10 @@ def as_graph_state(
         if not (found := _ATTENTION.fullmatch(name)):
             continue
         layer = found["layer"]
-        parts = [state.get(layer + part) for part in ("in_proj_bias", "out_proj.weight", "out_proj.bias")]
-        if any(part is None for part in parts):
-            raise UserError(f"{layer}in_proj_bias, {layer}out_proj.weight or {layer}out_proj.bias is missing")
-        product = _product(*map(np.asarray, (state[name], *parts)), where=layer)
+        names = [layer + part for part in ("in_proj_weight", "in_proj_bias", "out_proj.weight", "out_proj.bias")]
+        if lost := [part for part in names if part not in state]:
+            raise UserError(f"{lost[0]} is missing")
+        product = _product(*(checked(part, np.asarray(state[part])) for part in names), where=layer)
         products |= {f"{layer}value_and_output.{key}": value for key, value in product.items()}
         remarks |= {
             f"{layer}{part}": "; its product with the output projection is the graph's value projection"
@@ -117,9 +117,9 @@ def as_graph_state(
 
 def _product(packed: Any, packed_bias: Any, output: Any, output_bias: Any, *, where: str) -> dict[str, np.ndarray]:
     """Return one linear layer for the value projection followed by the output projection."""
-    size = len(packed) // 3
-    if packed.ndim != 2 or output.shape != (size, size) or packed_bias.shape != (3 * size,):
-        shapes = f"{packed.shape}, {packed_bias.shape} and {output.shape}"
-        raise UserError(f"{where}in_proj and out_proj have shapes {shapes}, which are none of one attention")
+    size = output.shape[0] if output.ndim else 0
+    found = [size_text(tensor.shape) for tensor in (packed, packed_bias, output, output_bias)]
+    if found != [size_text(shape) for shape in ((3 * size, size), (3 * size,), (size, size), (size,))]:
+        raise UserError(f"{where}in_proj and out_proj have shapes {', '.join(found)}, which are none of one attention")
     weight, bias = packed[2 * size :], packed_bias[2 * size :]
     return {"weight": output @ weight, "bias": output @ bias + output_bias}

@@ -61,7 +61,9 @@ def convert(state: Mapping[str, AnyArray], rules: Rules, network: str, frozen: s
             continue
         leaves = renamed(plain, tensor, rules)
         if leaves is None:
-            raise UserError(f"{name} is no tensor of {network}: is this the checkpoint of another network?")
+            raise UserError(
+                f"{ascii(name)[1:-1]:.200} is no tensor of {network}: is this the checkpoint of another network?"
+            )
         for path, value in leaves.items():
             if path in origin:
                 raise UserError(f"{name} and {origin[path]} are the same tensor of {network}: keep one of them")
@@ -156,7 +158,7 @@ def renamed(name: str, tensor: AnyArray, rules: Rules) -> dict[str, Any] | None:
             if kind == "unused":
                 return {}
             _check_axes(name, tensor.shape, kind)
-            return _leaves(found.expand(ours), _checked(name, tensor), kind)
+            return _leaves(found.expand(ours), checked(name, tensor), kind)
     return None
 
 
@@ -181,7 +183,7 @@ def _check_axes(name: str, shape: tuple[int, ...], kind: str) -> None:
         raise UserError(f"{name} has shape {size_text(shape)}, expected two halves of equal width")
 
 
-def _checked(name: str, tensor: AnyArray) -> AnyArray:
+def checked(name: str, tensor: AnyArray) -> AnyArray:
     """Return a tensor as float32; raises UserError for numbers that cannot be weights. Traced values stay."""
     if not isinstance(tensor, np.ndarray):
         return tensor

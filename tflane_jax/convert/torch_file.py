@@ -154,6 +154,8 @@ def _legacy_contents(file: IO[bytes]) -> _Contents:
     """Read the format before PyTorch 1.6: magic number, version, machine, object, keys, then the storages."""
     tree = TorchUnpickler(file).load()
     if not isinstance(tree, int) or tree != _LEGACY_MAGIC:
+        if file.read(1):
+            raise Damaged("the file goes on after its content: was it written twice? Save it again")
         return _Contents(tree, _nothing, "little")
     if (version := TorchUnpickler(file).load()) != 1001:
         raise Damaged(f"version {reprlib.repr(version)} of PyTorch's format is unknown")

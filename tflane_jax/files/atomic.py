@@ -125,6 +125,13 @@ def check_writable(path: Path | str) -> None:
     path = Path(path)
     if os.path.isdir(path):
         raise UserError(f"cannot write {path}: it is a folder; choose another path")
+    temporary = _temporary(path)
+    try:
+        os.lstat(temporary)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:  # such as a name that is too long
+        raise UserError(_message(path, temporary, error)) from None
     above = next(parent for parent in path.absolute().parents if os.path.lexists(parent))
     if not os.path.isdir(above):
         raise UserError(f"cannot write {path}: {above} is no folder; choose another path")
@@ -141,7 +148,7 @@ def check_stem(stem: Path | str) -> None:
 
 
 def _check_name(path: Path) -> None:
-    if not path.name:
+    if path.name in ("", ".."):
         raise UserError(f"cannot write {path}: it names no file, only a folder; add a name")
 
 
@@ -167,10 +174,10 @@ def _replace_folder(new: Path, path: Path) -> None:
 
 def _delete(path: Path) -> None:
     """Delete a file or folder if it exists; an error here must not hide the one that brought us here."""
-    if os.path.isdir(path) and not os.path.islink(path):  # unlike Path.is_dir, False for a name that is too long
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):
+        if os.path.isdir(path) and not os.path.islink(path):
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
 
 

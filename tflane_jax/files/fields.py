@@ -5,6 +5,7 @@ Every function returns the value or raises UserError. `where` names the place in
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import reprlib
@@ -135,7 +136,7 @@ def as_list(value: Any, where: str) -> Sequence[Any]:
 def numbers(value: Any, shape: tuple[int | None, ...], where: str, *, largest: float = np.inf) -> np.ndarray:
     """Return an array of finite numbers: float32 stays, every other type becomes float64.
 
-    Text, complex numbers, truth values and dates are no numbers.
+    Text, complex numbers, truth values (one among numbers too) and dates are no numbers.
 
     Args:
         value: a number, nested lists or an array.
@@ -166,6 +167,8 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     except (TypeError, ValueError, RecursionError):
         raise UserError(f"{where} is {_kind(value)}, {_ragged(value) or expected}") from None
     if array.dtype.kind in "iuf":
+        if _has_truth_value(value):
+            raise UserError(f"{where} holds a truth value, {expected}")
         return array if array.dtype == np.float32 else array.astype(np.float64)
     if array.dtype.kind == "O" and array.size:  # such as integers of more than 64 bits
         wrong = [item for item in array.flat if not _is_number(item)]
@@ -181,6 +184,19 @@ def _as_array(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarr
     if array.ndim == 0 or array.dtype.kind not in names:
         raise UserError(f"{where} is {_kind(value)}, {expected}")
     raise UserError(f"{where} is {_kind(value)}, {expected}, not {names[array.dtype.kind]}")
+
+
+def _has_truth_value(value: Any) -> bool:
+    """Return whether one is among the numbers of nested lists, where numpy would make it 0 or 1."""
+    level = [value]
+    while level:
+        kinds = set(map(type, level))
+        if kinds & {bool, np.bool_}:
+            return True
+        if not kinds <= {list, tuple}:
+            level = [row for row in level if isinstance(row, (list, tuple))]
+        level = list(itertools.chain.from_iterable(level))
+    return False
 
 
 def _is_number(value: Any) -> bool:
@@ -236,11 +252,25 @@ def choices(value: Any, shape: tuple[int | None, ...], where: str) -> np.ndarray
 
 
 def _as_integers(value: Any) -> Any:
+    """Return numbers and truth values as an array; anything else as it is."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RecursionError):
         return value
+    if array.dtype.kind in "iuf":
+        return array
     return array.astype(np.int64) if array.dtype == bool else value
+
+
+def is_text(value: Any) -> bool:
+    """Return whether a value is a text that can be written; half a character (a surrogate) cannot."""
+    if not isinstance(value, str):
+        return False
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def whole_number(value: Any, low: int, high: int, where: str) -> int:

@@ -6,7 +6,9 @@ decoding and its rounding, so another library would give other pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import contextlib
+import os
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -20,11 +22,25 @@ PHOTO_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 def opencv() -> ModuleType:
     """Return the module cv2; raises UserError that names the extra where it is not installed."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # quiet; FFmpeg prints beside OpenCV's own log
     try:
         import cv2
     except ImportError as error:
         raise missing_extra("images need OpenCV", "images") from error
     return cv2
+
+
+@contextlib.contextmanager
+def quiet_opencv() -> Iterator[ModuleType]:
+    """Yield the module cv2, which prints no warnings of its own meanwhile: the caller's message replaces them."""
+    cv2 = opencv()
+    log = cv2.utils.logging  # cv2.setLogLevel is gone from OpenCV 5
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_SILENT)
+    try:
+        yield cv2
+    finally:
+        log.setLogLevel(level)
 
 
 def list_photos(paths: Iterable[Path], suffixes: tuple[str, ...] = PHOTO_SUFFIXES) -> list[Path]:
@@ -65,7 +81,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     if data.size == 0:
         raise UserError(f"{path} is empty: copy or download the image again")
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        with quiet_opencv():
+            image = cv2.imdecode(data, cv2.IMREAD_COLOR)
     except cv2.error as error:
         raise UserError(f"cannot read the image {path}: {error.err}") from None
     if image is None:

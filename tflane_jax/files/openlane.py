@@ -6,14 +6,13 @@ docs/reference/data_formats.md, section 2.
 
 from __future__ import annotations
 
-import reprlib
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, line_points, member, numbers, whole_number
+from tflane_jax.files.fields import is_text, items, line_points, member, numbers, shown, whole_number
 
 ATTRIBUTES = 13
 """Attributes of traffic elements, 0 (unknown) to 12."""
@@ -95,7 +94,12 @@ def read_areas(record: Any, where: str) -> tuple[list[Float[np.ndarray, "_ 3"]],
 def as_identifier(identifier: Any, where: str) -> FrameKey:
     """Return a key of a collected file as a frame; raises UserError if it is none."""
     named = isinstance(identifier, tuple) and len(identifier) == 3
-    if not named or not all(isinstance(part, (str, int, np.integer)) for part in identifier):
-        shown = reprlib.repr(identifier)
-        raise UserError(f"{where}: {shown:.80} is no frame, expected (split, segment, timestamp) as texts or numbers")
+    if not named or not all(map(_is_name, identifier)):
+        expected = "expected (split, segment, timestamp) as texts or numbers"
+        raise UserError(f"{where}: the key {shown(identifier)} is no frame, {expected}")
     return FrameKey(*map(str, identifier))
+
+
+def _is_name(part: Any) -> bool:
+    # Python refuses to write integers of more than 4300 digits.
+    return is_text(part) or (isinstance(part, (int, np.integer)) and abs(int(part)) < 2**64)

@@ -24,15 +24,16 @@ def load_plain_pickle(path: Path) -> Any:
     """Return the content of a pickle file of plain data.
 
     Raises:
-        UserError: the file does not exist, is no pickle, is truncated, or names anything but containers, numbers,
-            strings and numpy arrays.
+        UserError: the file does not exist, is no pickle, is truncated, names anything but containers, numbers, strings
+            and numpy arrays, or does not end with its object: a file that was appended to holds several.
     """
     try:
         data = Path(path).read_bytes()
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from None
+    stream = io.BytesIO(data)
     try:
-        return RestrictedUnpickler(io.BytesIO(data), PLAIN).load()
+        content = RestrictedUnpickler(stream, PLAIN).load()
     except Refused as error:
         raise UserError(
             f"{path} is refused: it is a pickle that names {error}, and only containers, numbers, strings and numpy "
@@ -41,6 +42,9 @@ def load_plain_pickle(path: Path) -> Any:
     # A damaged file may ask for any operation on any operands.
     except Exception as error:
         raise UserError(f"{path} is no pickle file, or it is damaged ({type(error).__name__}: {error})") from None
+    if rest := len(data) - stream.tell():
+        raise UserError(f"{path} goes on for {rest} bytes after its content: was it written twice? Write it afresh")
+    return content
 
 
 class Refused(Exception):

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import items, member, numbers, parse_json, read_text
+from tflane_jax.files.fields import is_text, items, member, numbers, parse_json, read_text
 
 NO_POINT = -2.0
 """x of a row in which a lane has no point."""
@@ -71,7 +71,7 @@ def _records(path: Path) -> list[tuple[str, Any, str]]:
         where = f"{path}, line {number}"
         record = parse_json(line.strip(), where, "JSON record", once=True)
         name = member(record, "raw_file", where)
-        if not isinstance(name, str) or not name:
+        if not is_text(name) or not name:
             raise UserError(f"{where}: raw_file is {reprlib.repr(name)}, expected the path of an image")
         if name in first:
             raise UserError(f"{where}: {name} is there twice, first in line {first[name]}")

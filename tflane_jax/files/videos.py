@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import replacing
-from tflane_jax.files.images import opencv
+from tflane_jax.files.images import opencv, quiet_opencv
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".webm")
 _USUAL_RATE = 25.0  # frames a second, where a file does not tell
@@ -117,17 +117,10 @@ def writing_video(path: Path, info: VideoInfo) -> Iterator[VideoWriter]:
 
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    cv2 = opencv()
     if not path.is_file():
         raise UserError(f"there is no file {path}")
-    level = cv2.getLogLevel() if hasattr(cv2, "getLogLevel") else None
-    if level is not None:
-        cv2.setLogLevel(0)  # a damaged file would print warnings of its own
-    try:
+    with quiet_opencv() as cv2:
         video = cv2.VideoCapture(str(path))
-    finally:
-        if level is not None:
-            cv2.setLogLevel(level)
     try:
         if not video.isOpened():
             raise UserError(f"{path} is damaged or no video of a known format: open it in a player and save it as MP4")

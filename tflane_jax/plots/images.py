@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 LANE_COLOURS = ("#ff4d6d", "#ffd166", "#4dd2ff", "#7ae582", "#c792ea", "#ff9d3c", "#f5f5f5")
 TRUTH = "#8be28b"
 _POINTS = 100
+_TALLEST = 19.2  # inches of the picture of one photo; portraits of a phone need 17
 
 
 def save_road_images(
@@ -69,7 +70,9 @@ def save_photo(
 ) -> Path:
     """Write one photo with the lanes found in it, columns and rows in pixels, and return the path."""
     height, width = photo.shape[:2]
-    figure, axes = new_figure(1, 1, panel=(9.6, 9.6 * height / width + 0.3))
+    # A strip one pixel wide would otherwise become a picture of gigabytes, higher than matplotlib can draw.
+    tall = min(9.6 * height / width, _TALLEST)
+    figure, axes = new_figure(1, 1, panel=(9.6, tall + 0.3))
     draw_image(axes[0, 0], photo, title)
     draw_lanes(axes[0, 0], lanes)
     return save_figure(figure, path)

@@ -1,7 +1,8 @@
 """MapTR's files: `nuscmap_results.json` and the ground truth that its evaluation writes (`*_map_anns_val.json`).
 
 Both are lists of {"sample_token", "vectors": [{"pts", "cls_name", "confidence_level" (results only)}]}, under "results"
-and under "GTs". Other fields of MapTR (`pts_num`, `type`) repeat these. Points are (x, y), or (x, y, z) in MapTRv2's
+and under "GTs". Other fields of MapTR (`pts_num`, `type`) repeat these, and must not contradict them: MapTR's own
+evaluation sorts by `type`, of which every configuration has its own order. Points are (x, y), or (x, y, z) in MapTRv2's
 variant for Argoverse 2. For groups by occlusion, the truth has a field of ours, `visibility`, 0 to 1.
 """
 
@@ -17,11 +18,13 @@ import numpy as np
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import replacing
-from tflane_jax.files.fields import items, load_file, member, numbers, scores
+from tflane_jax.files.fields import is_text, items, load_file, member, numbers, scores, whole_number
 from tflane_jax.metrics.map_matching import LINE_CLASSES, Dims, MapDetections, MapTruth
 
 # Metres from the vehicle: no line of a local map is so far away.
 _FARTHEST = 1e5
+# Number of each class in a file.
+_Types = dict[str, int]
 # What the official files say about the inputs; the evaluation does not read it.
 _META = {"use_lidar": False, "use_camera": True, "use_radar": False, "use_map": False, "use_external": True}
 
@@ -29,8 +32,9 @@ _META = {"use_lidar": False, "use_camera": True, "use_radar": False, "use_map": 
 def read_predictions(path: Path, dims: Dims = 2) -> dict[str, MapDetections]:
     """Return the detections by sample token, see `read_truth`."""
     frames = {}
+    types: _Types = {}
     for token, vectors, where in _samples(path, "results"):
-        lines = _lines(vectors, where, 1, dims)
+        lines = _lines(vectors, where, 1, dims, types)
         levels = [member(vector, "confidence_level", f"{where}: vectors[{i}]") for i, vector in enumerate(vectors)]
         frames[token] = MapDetections(*lines, scores(levels, f"{where}: confidence_level"))
     return frames
@@ -47,8 +51,9 @@ def read_truth(path: Path, dims: Dims = 2) -> dict[str, MapTruth]:
         UserError: it names file, sample and field; also for points with other coordinates, whose numbers would be those
             of another protocol.
     """
+    types: _Types = {}
     return {
-        token: MapTruth(*_lines(vectors, where, 2, dims), visibility=_visibility(vectors, where))
+        token: MapTruth(*_lines(vectors, where, 2, dims, types), visibility=_visibility(vectors, where))
         for token, vectors, where in _samples(path, "GTs")
     }
 
@@ -81,7 +86,7 @@ def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
     samples, seen = [], set()
     for i, record in enumerate(items(load_file(path), field, str(path))):
         token = member(record, "sample_token", f"{path}: {field}[{i}]")
-        if not isinstance(token, str) or not token:
+        if not is_text(token) or not token:
             raise UserError(f"{path}: {field}[{i}].sample_token is {reprlib.repr(token)}, expected a text")
         where = f"{path}, sample {token}"
         if token in seen:
@@ -91,8 +96,16 @@ def _samples(path: Path, field: str) -> list[tuple[str, Any, str]]:
     return samples
 
 
-def _lines(vectors: Any, where: str, least: int, dims: Dims) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return points and classes; `least` is the number of points that a line must have, `dims` that of coordinates."""
+def _lines(vectors: Any, where: str, least: int, dims: Dims, types: _Types) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return points and classes.
+
+    Args:
+        vectors: of a sample.
+        where: names the sample.
+        least: number of points that a line must have.
+        dims: coordinates of a point.
+        types: numbers of the classes in the samples before, extended by those of this one.
+    """
     points, classes = [], []
     for i, vector in enumerate(vectors):
         at = f"{where}: vectors[{i}]"
@@ -110,9 +123,22 @@ def _lines(vectors: Any, where: str, least: int, dims: Dims) -> tuple[list[np.nd
         if not isinstance(name, str) or name not in LINE_CLASSES:
             shown = reprlib.repr(name)
             raise UserError(f"{at}.cls_name is {shown:.40}, expected one of {', '.join(LINE_CLASSES)}")
+        _check_type(vector, name, at, types)
         points.append(line)
         classes.append(LINE_CLASSES.index(name))
     return points, np.array(classes, np.int64)
+
+
+def _check_type(vector: Any, name: str, at: str, types: _Types) -> None:
+    """Raise UserError where `type` tells the classes apart otherwise than `cls_name` does."""
+    if "type" not in vector:
+        return
+    number = whole_number(vector["type"], -1, 1000, f"{at}.type")
+    if types.setdefault(name, number) != number:
+        raise UserError(f"{at}.type is {number}, but other lines of the class {name} have {types[name]}")
+    other = next((one for one, its in types.items() if its == number and one != name), None)
+    if other is not None:
+        raise UserError(f"{at}.type is {number}, which lines of the class {other} have, but cls_name is {name}")
 
 
 def _visibility(vectors: Any, where: str) -> np.ndarray | None:

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores
+from tflane_jax.files.fields import choices, fractions, items, load_file, member, scores, shown
 from tflane_jax.files.openlane import (
     CENTERLINE,
     DENSE_POINTS,
@@ -230,7 +230,7 @@ def _check_ids(record: Any, groups: tuple[str, ...], where: str) -> None:
                     f"{where}: {things}[{i}].id is of type {type(identity).__name__}, expected a whole number or a text"
                 )
             if identity in first:
-                raise UserError(f"{where}: {things}[{i}] has the id of {things}[{first[identity]}], {identity!r:.40}")
+                raise UserError(f"{where}: {things}[{i}] has the id of {things}[{first[identity]}], {shown(identity)}")
             first[identity] = i
 
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import choices, fractions, items, line_points, load_file, member, scores
+from tflane_jax.files.fields import choices, fractions, is_text, items, line_points, load_file, member, scores
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 
 SUFFIXES = (".npz", ".json")
@@ -74,7 +74,7 @@ def _frames(path: Path) -> Iterator[tuple[PlainKey, Any, str]]:
 
 
 def _scene(value: Any, where: str) -> str:
-    if isinstance(value, bool) or not isinstance(value, (str, int, np.integer)):
+    if isinstance(value, bool) or not (is_text(value) or isinstance(value, (int, np.integer))):
         raise UserError(f"{where}: scene is {reprlib.repr(value)}, expected a text")
     return str(value)
 

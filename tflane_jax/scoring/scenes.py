@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.errors import UserError
-from tflane_jax.files.fields import as_list, load_file, member
+from tflane_jax.files.fields import as_list, is_text, load_file, member, shown
 
 
 def read_scenes(path: Path) -> dict[str, str]:
@@ -27,10 +27,13 @@ def read_scenes(path: Path) -> dict[str, str]:
         for i, row in enumerate(as_list(content, str(path))):
             where = f"{path}: row {i}"
             pairs.append((str(member(row, "token", where)), member(row, "scene_token", where), where))
-    for _, scene, where in pairs:
-        if not isinstance(scene, str) or not scene:
-            raise UserError(f"{where} has a scene of type {type(scene).__name__}, expected a text")
-    return {frame: scene for frame, scene, _ in pairs}
+    scenes: dict[str, str] = {}
+    for frame, scene, where in pairs:
+        if not is_text(scene) or not scene:
+            raise UserError(f"{where} has the scene {shown(scene)}, expected a text")
+        if scenes.setdefault(frame, scene) != scene:
+            raise UserError(f"{where} has the scene {shown(scene)}, another row {shown(scenes[frame])}: name one")
+    return scenes
 
 
 def scene_names(scenes: Mapping[str, str], frames: Iterable[Any], path: Path) -> Callable[[Any], str]:

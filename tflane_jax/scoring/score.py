@@ -133,7 +133,7 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
     ):
         lost = ours.keys() - other.keys()
         if lost:
-            shown = ", ".join(sorted(map(str, lost))[:3])
+            shown = ", ".join(f"{name:.80}" for name in sorted(map(str, lost))[:3])
             more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
             problems.append(f"{len(lost)} of {len(ours)} frames are {what}: {shown}{more} ({remedy})")
     if problems:

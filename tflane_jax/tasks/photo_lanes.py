@@ -31,6 +31,9 @@ _FINE_WIDTHS = (1.0, 0.85, 0.7, 0.55)
 # The value from which a whole photo is taken without a search (TuSimple's ten frames at hand have 0.23 up), and the
 # ranks from which a view is taken without a warning, and taken at all.
 _SURE, _PLAUSIBLE, _LEAST = 0.2, 0.15, 0.05
+# By how much a photo may be wider or narrower than TuSimple's 16:9 and still be seen whole without a search: 4:3 and
+# 21:9 are, squares and portraits are not, in which all lanes are distorted.
+_ALIKE = 1.5
 _POINTS = 100
 _EMPTY = "the photo is empty: it has one brightness almost everywhere"
 _NOTHING = (
@@ -83,7 +86,7 @@ class PhotoReader:
         self.task, self.params, self.threshold = task, params, threshold
 
     def read(self, photo: UInt8[np.ndarray, "h w 3"], camera: PhotoCamera | None = None) -> PhotoLanes:
-        """Return the lanes of a photo; without a camera its view is searched.
+        """Return the lanes of a photo; unless the horizon is known, its view is searched, for a known focal length too.
 
         Raises UserError for a camera that does not fit the photo.
         """
@@ -91,40 +94,47 @@ class PhotoReader:
         if is_blank(grey):
             view = fit_photo(photo, camera).placement
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
-        if camera is not None and (camera.focal is not None or camera.horizon is not None):
-            return self._checked(photo, self._of_camera(photo, grey, camera), known=True)
-        return self._checked(photo, self._search(photo, grey), known=False)
+        if camera is not None and camera.horizon is not None:
+            return self._checked(photo, self._of_camera(photo, grey, camera), camera.horizon)
+        return self._checked(photo, self._search(photo, grey, None if camera is None else camera.focal))
 
-    def find_view(self, photos: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Placement | None:
-        """Return the view that suits frames of one camera best; None if no frame shows plausible lanes."""
-        found = [self._search(photo, grey) for photo in photos if not is_blank(grey := _grey(photo))]
+    def find_view(self, photos: Iterable[UInt8[np.ndarray, "h w 3"]], focal: float | None = None) -> Placement | None:
+        """Return the view that suits frames of one camera best; None if no frame shows plausible lanes.
+
+        Args:
+            photos: of one size.
+            focal: focal length, pixels, where it is known.
+        """
+        found = [self._search(photo, grey, focal) for photo in photos if not is_blank(grey := _grey(photo))]
         best = max(found, key=lambda seen: seen.judged.rank, default=None)
         return None if best is None or best.judged.rank < _LEAST else best.view
 
-    def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement, *, known: bool = False) -> PhotoLanes:
-        """Return the lanes that a view of a photo shows; `known`: the view was given, not searched."""
+    def read_view(self, photo: UInt8[np.ndarray, "h w 3"], view: Placement) -> PhotoLanes:
+        """Return the lanes in a view that `find_view` found in other frames of the camera."""
         grey = _grey(photo)
         if is_blank(grey):
             return PhotoLanes(view, (), (), (), 0.0, _EMPTY)
-        return self._checked(photo, self._in_view(photo, grey, view), known=known)
+        return self._checked(photo, self._in_view(photo, grey, view))
 
-    def _search(self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"]) -> _ViewLanes:
+    def _search(
+        self, photo: UInt8[np.ndarray, "h w 3"], grey: UInt8[np.ndarray, "h w"], focal: float | None
+    ) -> _ViewLanes:
         height, width = grey.shape
-        whole = self._of_camera(photo, grey, PhotoCamera())
-        if whole.judged.value >= _SURE:
+        whole = self._of_camera(photo, grey, PhotoCamera(focal))
+        if whole.judged.value >= _SURE and 1.0 / _ALIKE < width * 9 / (height * 16) < _ALIKE:
             return whole
         tried = {whole.view: whole}
         for horizon in _HORIZONS:
-            self._try(tried, photo, grey, PhotoCamera(None, horizon * height))
-            for part in _WIDTHS:
+            self._try(tried, photo, grey, PhotoCamera(focal, horizon * height))
+            for part in _WIDTHS if focal is None else ():
                 self._try(tried, photo, grey, PhotoCamera(FOCAL * width * part, horizon * height))
         meeting = common_horizon([seen.judged for seen in tried.values()], height)
         if meeting is not None and meeting[1] < 0.9 * height:
             ahead = min(max(meeting[0], 0.25 * width), 0.75 * width)
-            self._try(tried, photo, grey, PhotoCamera(None, meeting[1]))
-            for part in _FINE_WIDTHS:
+            self._try(tried, photo, grey, PhotoCamera(focal, meeting[1]))
+            for one in [FOCAL * width * part for part in _FINE_WIDTHS] if focal is None else [focal]:
                 for column in (None, ahead):
-                    self._try(tried, photo, grey, PhotoCamera(FOCAL * width * part, meeting[1], column))
+                    self._try(tried, photo, grey, PhotoCamera(one, meeting[1], column))
         return max(tried.values(), key=lambda seen: seen.judged.rank)
 
     def _try(self, tried: dict[Placement, _ViewLanes], photo, grey, camera: PhotoCamera) -> None:
@@ -151,15 +161,20 @@ class PhotoReader:
         lanes, scores = list(lanes[order]), scores[chosen][order]
         return _ViewLanes(view, lanes, scores, judge_lanes(grey, view, lanes, scores))
 
-    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _ViewLanes, *, known: bool) -> PhotoLanes:
-        """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing."""
+    def _checked(self, photo: UInt8[np.ndarray, "h w 3"], seen: _ViewLanes, horizon: float | None = None) -> PhotoLanes:
+        """Return what is plausible, in pixels of the photo: below the horizon, inside, not crossing.
+
+        Without a known `horizon` (row) the view was searched, and may show nothing that is plausible.
+        """
         judged, (height, width) = seen.judged, photo.shape[:2]
-        searched = not known and seen.view != fit_photo(photo).placement
+        searched = horizon is None and seen.view != fit_photo(photo).placement
         worth_of_view = judged.rank if searched else judged.value
-        if not known and worth_of_view < _LEAST:
+        if horizon is None and worth_of_view < _LEAST:
             return PhotoLanes(seen.view, (), (), (), judged.value, _NOTHING)
-        top = seen.view.top + HORIZON * seen.view.height
-        if judged.meeting is not None and not judged.crossed and judged.meeting[1] < height:
+        # Lanes meet above their view's horizon where the road rises. Those of a known camera may be nearly parallel and
+        # meet anywhere.
+        top = seen.view.top + HORIZON * seen.view.height if horizon is None else horizon
+        if horizon is None and judged.meeting is not None and not judged.crossed:
             top = min(top, judged.meeting[1])
         lanes, worth, kept = [], [], []
         believed = [i for i in range(len(seen.lanes)) if not searched or judged.supported[i]]

@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.scoring.damaged.valid import KEYS, Case, deep, drop, put
 
-HUGE = 10**400
+HUGE, LONGEST = 10**400, 10**5000  # Python refuses to write the longer one
 _POINTS = {
     "NaN": (np.full((11, 3), np.nan), r"holds nan at \[0, 0\]"),
     "infinite": (np.full((11, 3), np.inf), r"holds inf at \[0, 0\]"),
@@ -20,6 +20,7 @@ _POINTS = {
     "bytes": (np.full((11, 3), b"1"), "of type ndarray, .*not text"),
     "dates": (np.zeros((11, 3), "datetime64[s]"), "of type ndarray, expected numbers"),
     "huge integers": ([[HUGE, 0, 0]] * 11, "holds an integer of hundreds of digits"),
+    "a truth value among numbers": ([[True, 0, 0]] * 11, "holds a truth value, expected numbers"),
     "null": (None, "missing"),
     "nulls": ([[None, 0, 0]] * 11, r"missing \(null\)"),
     "a single number": (3.0, r"has shape \(\), expected \(any, 3\)"),
@@ -50,6 +51,8 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             ("key is text", _rename(top, "val/10000/150"), "'val/10000/150' is no frame, expected"),
             ("key of two", _rename(top, ("val", "10000")), r"\('val', '10000'\) is no frame"),
             ("key of nothing", _rename(top, ("val", "10000", None)), "is no frame, expected .*as texts or numbers"),
+            ("key of a huge number", _rename(top, ("val", "10000", LONGEST)), "is no frame, expected"),
+            ("key of half a character", _rename(top, ("val", "\ud800", "150")), r"'\\ud800', '150'\) is no frame"),
             ("key of numbers", _again(top, ("val", 10000, 150)), f"{where} is there twice: once with numbers"),
             (f"no {lanes}", drop(*frame, lanes), f"{where} lacks the entry '{lanes}'"),
             ("lanes by number", put(*frame, lanes, {0: {}}), f"{where}: {lanes} is of type dict, expected a list"),
@@ -58,6 +61,11 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
             ("a lane is a number", put(*frame, lanes, 1, 3), rf"{where}: {lanes}\[1\] is of type int"),
             (f"no {line}", drop(*frame, lanes, 1, line), rf"{where}: {lanes}\[1\] lacks the entry '{line}'"),
             ("id twice", put(*frame, lanes, 1, "id", 0), rf"{where}: {lanes}\[1\] has the id of {lanes}\[0\], 0"),
+            (
+                "huge id twice",
+                _huge_ids(*frame, lanes),
+                rf"{where}: {lanes}\[1\] has the id of {lanes}\[0\], of type int",
+            ),
             ("id is a list", put(*frame, lanes, 1, "id", [0]), rf"{where}: {lanes}\[1\].id is of type list"),
             ("no elements", drop(*frame, "traffic_element"), f"{where} lacks the entry 'traffic_element'"),
             ("elements are null", put(*frame, "traffic_element", None), f"{where}: traffic_element is missing"),
@@ -130,6 +138,16 @@ def _openlane(form, lanes, line, lane_lane, lane_element):
     yield Case(form, "truth", "visibility above 1", "visibility: number 0 is 1.5, expected 0 to 1", above)
     half = put(KEYS[1], "annotation", lane_lane, np.array([[0, 0.7], [0, 0]]))
     yield Case(form, "truth", "probabilities for edges", r"holds 0.7 at \[0, 1\], expected 0 or 1", half)
+
+
+def _huge_ids(*way):
+    def change(content):
+        for step in way:
+            content = content[step]
+        for thing in content:
+            thing["id"] = LONGEST
+
+    return change
 
 
 def _rename(top, key):

@@ -12,6 +12,7 @@ _BAD_NUMBERS = {
     "null": (None, "null"),
     "text": ("1.5", "text"),
     "object": ({"x": 1}, "type dict|expected numbers"),
+    "truth value": (True, "holds a truth value"),
 }
 
 
@@ -42,6 +43,7 @@ def _tusimple():
             "no lanes": (drop(1, "lanes"), f"{where} lacks the entry 'lanes'"),
             "no image": (drop(1, "raw_file"), "line 2 lacks the entry 'raw_file'"),
             "image is a number": (put(1, "raw_file", 7), "line 2: raw_file is 7, expected the path"),
+            "image is half a character": (put(1, "raw_file", "\ud800"), r"line 2: raw_file is '\\ud800', expected the"),
             "image has no name": (put(1, "raw_file", ""), "line 2: raw_file is '', expected the path"),
             "lanes are text": (put(1, "lanes", "none"), f"{where}: lanes is of type str"),
             "lanes are null": (put(1, "lanes", None), f"{where}: lanes is missing"),
@@ -118,7 +120,7 @@ def _maptr():
         yield Case(
             "maptr", side, "an entry twice", "has the entry 'pts' twice", after=text('"pts":', '"pts": [], "pts":')
         )
-        first = (field, 1, "vectors", 0)
+        first, second = (field, 1, "vectors", 0), (field, 0, "vectors", 1)
         where = rf"{side}.json, sample s1: vectors\[0\]"
         for name, change, message in (
             ("no samples", drop(field), f"lacks the entry '{field}'"),
@@ -129,6 +131,7 @@ def _maptr():
             ("no token", drop(field, 1, "sample_token"), rf"{field}\[1\] lacks the entry 'sample_token'"),
             ("token is null", put(field, 1, "sample_token", None), rf"{field}\[1\].sample_token is None"),
             ("token is a list", put(field, 1, "sample_token", ["s1"]), r"sample_token is \['s1'\], expected a text"),
+            ("token is half a character", put(field, 1, "sample_token", "\ud800"), r"is '\\ud800', expected a text"),
             ("no vectors", drop(field, 1, "vectors"), "sample s1 lacks the entry 'vectors'"),
             ("vectors are null", put(field, 1, "vectors", None), "sample s1: vectors is missing"),
             ("a vector is a number", put(*first, 3), f"{where} is of type int, expected a mapping"),
@@ -146,6 +149,9 @@ def _maptr():
             ("another count", put(*first, "pts_num", 20), f"{where}.pts_num is 20, but pts has 2 points"),
             ("count is text", put(*first, "pts_num", "2"), f"{where}.pts_num is '2', but"),
             ("another class", put(*first, "cls_name", "kerb"), f"{where}.cls_name is 'kerb', expected one of divider"),
+            ("another type", put(*first, "type", 5), f"{where}.type is 5, but other lines of the class divider have 0"),
+            ("type of another class", put(*second, "type", 0), "is 0, which lines of the class divider have, but"),
+            ("type is text", put(*first, "type", "divider"), f"{where}.type is 'divider', expected a whole number"),
             ("class is a number", put(*first, "cls_name", 0), f"{where}.cls_name is 0, expected one of"),
             ("class is a list", put(*first, "cls_name", ["divider"]), f"{where}.cls_name is "),
             ("no class", drop(*first, "cls_name"), f"{where} lacks the entry 'cls_name'"),
@@ -183,9 +189,11 @@ def _plain():
             ("no frames", drop("frames"), "lacks the entry 'frames'"),
             ("frames are null", put("frames", None), "frames is missing"),
             ("a frame twice", repeat(*frame), "frame a at 2 ns is there twice"),
+            ("a long scene", put(*frame, "scene", "9" * 5000), r"1 of 3 frames are .*: 9{80} "),
             ("a frame lost", drop(*frame), "1 of . frames are .*: a at 2 ns"),
             ("no scene", drop(*frame, "scene"), r"frames\[1\] lacks the entry 'scene'"),
             ("scene is a list", put(*frame, "scene", ["a"]), r"frames\[1\]: scene is \['a'\], expected a text"),
+            ("scene is half a character", put(*frame, "scene", "\udfff"), r"scene is '\\udfff', expected a text"),
             ("scene is null", put(*frame, "scene", None), r"frames\[1\]: scene is None, expected a text"),
             ("time is a fraction", put(*frame, "timestamp_ns", 1.5), "timestamp_ns is 1.5, expected whole nanoseconds"),
             ("time is huge", put(*frame, "timestamp_ns", HUGE), "timestamp_ns is an integer of many digits"),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import merged, read_archive, write_archive
-from tflane_jax.ablations.effects import HAS_INTERVAL, NO_INTERVAL
+from tflane_jax.ablations.findings import HAS_INTERVAL, NO_INTERVAL
 from tflane_jax.ablations.reuse import FILE, archive_path
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.errors import UserError

@@ -75,7 +75,8 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert path == folder / "table.md"
     assert {file.name for file in folder.iterdir()} >= TABLE_FILES | {"declaration.json", "curves.png"}
     told = capsys.readouterr().out
-    assert "paper.9, a small table: 6 runs, 0 complete; the others take about" in told
+    assert "paper.9, a small table: 6 runs, 0 complete; the updates of the others take about" in told
+    assert "), evaluation and compiling come on top\n" in told
     text = path.read_text()
     assert "tfm, traffic of another scene" in text
     assert "The paper's own numbers, not comparable with these: a dataset" in text
@@ -271,6 +272,7 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
     assert main(["tables"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in TABLES)
+    assert "Updates alone: evaluation and compiling come on top." in listed
     for arguments, message in (
         (["tf_lane1"], "no table tf_lane1: there is tf_lane.1"),
         (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),

@@ -137,7 +137,8 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, 
     elif complete < len(every):
         seconds, guesses = remaining_seconds(plan.named(), plan.minutes())
         basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
-        text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
+        text += f"; the updates of the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis}), "
+        text += "evaluation and compiling come on top"
     print(text, flush=True)
 
     def replan(threads: Mapping[str, Any]) -> list[Job]:

@@ -121,6 +121,9 @@ def test_a_table_from_its_record_is_that_of_its_runs(tiny, made, tmp_path, monke
     for run in recorded(results).runs.values():
         kept = {name: set(found.samples.get("", ())) for name, found in run.measured.items() if found is not None}
         assert kept == {name: set() if "geometric" in name else {"all/DET_l"} for name in kept}
+        ways = {name: len(found.ways) for name, found in run.measured.items() if found is not None}
+        assert {number for name, number in ways.items() if "geometric" in name} == {1}  # not without traffic, too
+        assert (ways["last"] == 3) == (run.row != "base")
     assert "all/TOP_ll, geometric" in (tmp_path / "paper.9" / "comparison.json").read_text()
     assert not (tmp_path / "paper.9" / "comparison.png").exists()
     (content, commits), (expected, own) = summary(tmp_path), summary(made)

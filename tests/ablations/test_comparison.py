@@ -31,6 +31,7 @@ def test_compact_is_in_percent():
     )
     assert rows == [{"model": "base", "all/DET_l": "15.0 ± 7.1", "occluded/DET_l": "7.5 ± 3.5"}]
     assert compact([variant("base", 0.1)], ["all/DET_l"]) == [{"model": "base", "all/DET_l": "10.0"}]
+    assert compact([variant("base", 0.1, float("nan"))], ["all/DET_l"]) == [{"model": "base", "all/DET_l": "n/a"}]
 
 
 def test_unequal_seeds_cannot_be_paired():

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tflane_jax.ablations.declaration import Claim, Declaration, Declared
-from tflane_jax.ablations.effects import SAMPLES, effects, save_effects, sentence, unmeasured
+from tflane_jax.ablations.effects import SAMPLES, Untested, effects, judged_claims, untested
+from tflane_jax.ablations.findings import findings, save_effects, sentence
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.ablations.results import Results
 from tflane_jax.ablations.statistics import holm, paired_difference
@@ -222,7 +223,7 @@ def test_rows_of_other_scenes_are_refused():
 
 def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
     declared = Declared(DECLARED, (0, 1, 2, 3, 4), "2026-01-01T00:00:00+00:00", 0)
-    (path,) = save_effects(results, declared, "", (), tmp_path / "effects")
+    path = save_effects(results, declared, "", judged_claims(results, DECLARED, ""), tmp_path / "effects")
     text = path.read_text()
     assert text.strip() in capsys.readouterr().out
     assert f"Declared before any run (2026-01-01T00:00:00+00:00): primary measure {PRIMARY}" in text
@@ -238,17 +239,20 @@ def test_the_report_says_what_was_declared_and_found(results, tmp_path, capsys):
     assert [row["model"] for row in rows[:4]] == ["+TFM", "baseline", "+TFM, none", "matched"]
     assert "finding" not in rows[0]
     late = Declared(DECLARED, SEEDS, "2026-01-01T00:00:00+00:00", 3)
-    (path,) = save_effects(results, late, "", (), tmp_path / "late")
+    path = save_effects(results, late, "", judged_claims(results, DECLARED, ""), tmp_path / "late")
     assert "Declared when 3 runs had begun already" in path.read_text()
     assert "Interim" not in path.read_text()
 
 
-def test_without_shared_seeds_nothing_is_written(tmp_path, capsys):
+def test_without_shared_seeds_the_report_says_so(tmp_path, capsys):
     found = Results(("baseline", "+TFM"), (0, 1), {})
     found.add("", "last", "baseline", 0, measured(0, own=(0.3, 0.3)))
     found.add("", "last", "+TFM", 1, measured(1, own=(0.3, 0.3)))
-    assert save_effects(found, Declared(DECLARED, (0, 1), "now", 0), "", (), tmp_path / "effects") == []
-    assert "no effects (test split)" in capsys.readouterr().out
+    path = save_effects(found, Declared(DECLARED, (0, 1), "now", 0), "", judged_claims(found, DECLARED, ""), tmp_path)
+    line = "- **not tested** (no seed has both): +TFM is better than *baseline*; the correction"
+    assert line in path.read_text()
+    assert line in capsys.readouterr().out
+    assert "|" not in path.read_text()
 
 
 def test_claims_about_pairs_are_corrected_together(results):
@@ -262,7 +266,8 @@ def test_claims_about_pairs_are_corrected_together(results):
     found = effects(results, Declaration(PRIMARY, claims), "", "last")
     assert [(e.claim, e.row) for e in found] == [(claim, claim.control) for claim in claims[:3]]
     assert [e.p_holm for e in found] == holm([*(e.p for e in found), 1.0])[:3]
-    assert unmeasured(results, Declaration(PRIMARY, claims), "") == [claims[3]]
+    expected = [Untested(claims[3], "not measured", "no run of not measured was measured")]
+    assert untested(results, Declaration(PRIMARY, claims), "") == expected
     assert [e.finding for e in found] == ["shown", "contradicted", "contradicted"]
     assert found[0].difference == pytest.approx(-found[2].difference)
     assert sentence(found[:1]).endswith("Claim: it helps")
@@ -270,13 +275,56 @@ def test_claims_about_pairs_are_corrected_together(results):
 
 def test_the_page_names_claims_without_a_result(results, tmp_path):
     """A model that failed does not make the tests of the others easier."""
-    claims = (Claim("+TFM", "baseline", "it helps"), Claim("failed", "baseline", "this too"))
+    claims = (Claim("+TFM", "baseline", "it helps"), Claim("failed, none", "baseline", "this too"))
     whole, part = (effects(results, Declaration(PRIMARY, c), "", "last")[0].p_holm for c in (claims, claims[:1]))
     assert whole == pytest.approx(2 * part)
+    more = replace(results, models=(*results.models, "failed"), failed={"failed": "the disk is full"})
     declared = Declared(Declaration(PRIMARY, claims), SEEDS, "now", 0)
-    text = "".join(path.read_text() for path in save_effects(results, declared, "", (), tmp_path / "effects"))
-    assert "**no result**: failed is better than *baseline*" in text.replace("\n", " ")
-    assert "Claim: this too" in text.replace("\n", " ")
+    tested = judged_claims(more, declared.declaration, "")
+    text = save_effects(more, declared, "", tested, tmp_path / "effects").read_text().replace("\n", " ")
+    assert "- **not tested** (no run of failed, none was measured (the disk is full)): failed, none is better" in text
+    assert "Claim: this too" in text
+
+
+def test_a_claim_about_all_rows_names_those_that_failed():
+    """`compare` declares one treatment: a row that failed is not passed over, and takes no other row's seeds away."""
+    found = Results(("baseline", "+TFM", "matched", "gone"), SEEDS, {}, failed={"gone": "loss is not finite"})
+    for seed in SEEDS:
+        found.add("", "last", "+TFM", seed, measured(seed, own=(0.6, 0.3), none=(0.2, 0.3)))
+        found.add("", "last", "baseline", seed, measured(seed, own=(0.3, 0.3)))
+    found.add("", "last", "matched", 3, measured(3, own=(0.31, 0.3)))
+    every = [e for e in effects(found, DECLARED, "", "last") if e.measure == PRIMARY]
+    assert [(e.row, e.seeds) for e in every] == [("baseline", SEEDS), ("+TFM, none", SEEDS), ("matched", (3,))]
+    whole = [e.p for e in every[:2]]
+    assert [e.p_holm for e in every[:2]] == holm([*whole, 1.0, 1.0])[:2]  # one seed and a failed row count as well
+    assert [e.finding for e in every] == ["shown", "shown", "not tested"]
+    assert math.isnan(every[2].p_holm)
+    *_, one, last = findings(judged_claims(found, DECLARED, ""))
+    assert one.startswith("**not tested** (one seed): +TFM minus *matched*")
+    reason = "no run of gone was measured (loss is not finite)"
+    assert last.startswith(f"**not tested** ({reason}): +TFM is better than *gone*")
+
+
+def test_where_every_row_but_one_failed_all_comparisons_are_named(tmp_path):
+    found = Results(("baseline", "+TFM", "matched"), SEEDS, {}, "p", failed={"+TFM": "out of memory"})
+    found.add("", "last", "baseline", 0, measured(0, own=(0.3, 0.3)))
+    said = findings(judged_claims(found, DECLARED, ""))
+    assert said[0].startswith("**not tested** (no run of +TFM was measured (out of memory)): +TFM is better than *bas")
+    assert "(no run of +TFM was measured (out of memory) and no run of matched was measured)" in said[1]
+    assert len(said) == 2
+
+
+def test_a_score_that_is_no_number_is_not_tested_and_counts():
+    """It says nothing about the claim: "not shown" would sound like a test."""
+    found, claims = Results(("a", "b", "c"), SEEDS, {}), (Claim("a", "b"), Claim("c", "b"))
+    for seed in SEEDS:
+        for model, score in (("a", math.nan if seed == 2 else 0.3), ("b", 0.2 + 0.01 * seed), ("c", 0.4)):
+            found.add("", "last", model, seed, Measured(1, "p", {"": {PRIMARY: score}}, {"": {}}))
+    broken, other = effects(found, Declaration(PRIMARY, claims), "", "last")
+    assert (broken.finding, other.finding) == ("not tested", "shown")
+    assert other.p_holm == holm([other.p, 1.0])[0]
+    text = f"**not tested** (a run has no number for it): a minus *b* in {PRIMARY}, no number"
+    assert sentence([broken]) == text
 
 
 def test_a_secondary_measure_is_corrected_apart(results):

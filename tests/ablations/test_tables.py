@@ -75,7 +75,8 @@ def test_a_table_from_training_to_page(tiny, tmp_path, capsys):
     assert path == folder / "table.md"
     assert {file.name for file in folder.iterdir()} >= TABLE_FILES | {"declaration.json", "curves.png"}
     told = capsys.readouterr().out
-    assert "paper.9, a small table: 6 runs, 0 complete; the others take about" in told
+    assert "paper.9, a small table: 6 runs, 0 complete; the updates of the others take about" in told
+    assert "), evaluation and compiling come on top\n" in told
     text = path.read_text()
     assert "tfm, traffic of another scene" in text
     assert "The paper's own numbers, not comparable with these: a dataset" in text
@@ -203,7 +204,10 @@ def test_rows_start_from_hosts_of_their_seed(tiny, tmp_path):
     other = (replace(table.hosts[0], settings=("--optim.lr", "0.2")),)
     with pytest.raises(UserError, match=r"host host: optim\.lr: 0\.1 there, 0\.2 here"):
         run_table(replace(table, hosts=other), range(2), tmp_path)
-    for start, seeds in starts.items():
+    shutil.rmtree(next(iter(starts)))
+    run_table(table, range(2), tmp_path)  # whose rows are complete: no host is trained for them
+    assert sum(host.exists() for host in hosts) == 3
+    for start, seeds in list(starts.items())[1:]:
         assert tmp_path / "runs" in [*(tmp_path / "runs" / "x").parents]
         assert next(host for host in hosts if str(host) == start)
         assert json.loads((type(tmp_path)(start) / "config.json").read_text())["training"]["seeds"] == seeds
@@ -268,6 +272,7 @@ def test_the_command_lists_tables_and_names_mistakes(capsys):
     assert main(["tables"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in TABLES)
+    assert "Updates alone: evaluation and compiling come on top." in listed
     for arguments, message in (
         (["tf_lane1"], "no table tf_lane1: there is tf_lane.1"),
         (["tf_lane.1", "--seeds", "0"], "--seeds 0: at least one"),

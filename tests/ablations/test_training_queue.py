@@ -148,3 +148,38 @@ def test_a_run_that_a_process_still_trains_is_waited_for(tmp_path, monkeypatch):
         assert reservations.released == [tmp_path]
     now[0] += 2 * LOOK_SECONDS
     assert queue.take() is run
+
+
+def test_a_run_knows_the_one_that_it_starts_from_by_any_path():
+    """`--out runs/x` beside an absolute training.init_from: a host that was stopped half-way is no host yet."""
+    host, row = job(0, 0), job(1, 0)
+    training = replace(row.config.training, init_from=str(Path.cwd() / host.folder))
+    row = replace(row, config=replace(row.config, training=training))
+    queue = Queue([host, row], Everything([]), lambda each: False)
+    assert queue.take() is host
+    assert queue.take() is None
+    with pytest.raises(UserError, match="is not complete"):
+        queue.check_origins(row)
+
+
+def test_a_complete_run_is_trained_again_if_the_one_that_it_starts_from_was():
+    """--retrain with another setting of the host: the row has not changed, and is of the old host."""
+    host = job(0, 0)
+    row = starting_from(host, 1, 0)
+    last = starting_from(row, 2, 0)
+    complete = {row.folder, last.folder}
+    queue = Queue([last, row, host], Everything([]), lambda each: each.folder in complete)
+    for taken, spoiled in ((host, row), (row, last), (last, None)):
+        assert queue.take() is taken
+        assert queue.take() is None
+        complete.add(taken.folder)
+        complete.discard(spoiled and spoiled.folder)
+        queue.done(taken)
+    assert len(queue) == 0
+    # One that the host's training did not change is left alone.
+    complete = {row.folder}
+    queue = Queue([row, host], Everything([]), lambda each: each.folder in complete)
+    complete.add(queue.take().folder)
+    queue.done(host)
+    assert queue.take() is None
+    assert len(queue) == 0

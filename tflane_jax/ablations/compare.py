@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.declaration import Declaration, check, declare
-from tflane_jax.ablations.effects import save_effects
+from tflane_jax.ablations.effects import judged_claims
+from tflane_jax.ablations.findings import save_effects
 from tflane_jax.ablations.jobs import Failure, Job, Tests, check_rows, plan_jobs
 from tflane_jax.ablations.report import save_report, suffixes
 from tflane_jax.ablations.results import Results
@@ -83,6 +84,7 @@ def compare(
     results = Results(tuple(configs), tuple(seeds), tests)
     trained = without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
+    results.failed.update(reasons(plan, failures))
     written = [save_plan(plan, failures, results, out)]
     if not results.scores:
         raise UserError(summary_of(failures, len(every)))
@@ -94,7 +96,8 @@ def compare(
         tables = save_report(results, first.task, remarks, out)
         if declared is not None:
             for test, suffix in suffixes(results).items():
-                tables += save_effects(results, declared, test, first.task.errors, out / f"effects{suffix}")
+                tested = judged_claims(results, declared.declaration, test, first.task.errors)
+                tables.append(save_effects(results, declared, test, tested, out / f"effects{suffix}"))
         print("\nwritten:", *tables, *written, sep="\n  ")
     if failures:
         raise UserError(summary_of(failures, len(every)))
@@ -117,6 +120,13 @@ def without_failures(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failu
     """Return the trainings that did not fail."""
     failed = {failure.job.folder for failure in failures}
     return {name: [job for job in planned if job.folder not in failed] for name, planned in plan.items()}
+
+
+def reasons(plan: Mapping[str, Sequence[Job]], failures: Sequence[Failure]) -> dict[str, str]:
+    """Return why the first training of each model that failed did, in one line."""
+    first = {failure.job.folder: failure.reason.partition("\n")[0] for failure in reversed(failures)}
+    found = {name: [first[job.folder] for job in jobs if job.folder in first] for name, jobs in plan.items()}
+    return {name: of_model[0] for name, of_model in found.items() if of_model}
 
 
 def evaluate_runs(trained: Mapping[str, Sequence[Job]], results: Results) -> list[Failure]:

@@ -66,14 +66,14 @@ def summarise(
 
 
 def compact(variants: Sequence[Variant], metrics: Sequence[str]) -> list[dict[str, str]]:
-    """Return one row for each variant with "mean ± std" in percent, as papers print tables."""
+    """Return one row for each variant with "mean ± std" in percent, as papers print tables; "n/a" if one is NaN."""
     rows = []
     for variant in variants:
         row = {"model": variant.name}
         for metric in metrics:
             values = 100.0 * _column(variant, metric)
             spread = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
-            row[metric] = f"{values.mean():.1f}{spread}"
+            row[metric] = f"{values.mean():.1f}{spread}" if np.isfinite(values).all() else "n/a"
         rows.append(row)
     return rows
 

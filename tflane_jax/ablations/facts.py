@@ -31,7 +31,7 @@ def _code(git: Mapping[str, Any]) -> str:
 
 
 def row_minutes(trained: Mapping[str, Sequence[Job]]) -> dict[str, float]:
-    """Return the training time of each row, in minutes, mean over runs."""
+    """Return the time of a run's updates in each row, in minutes, mean over runs; no evaluation, no compiling."""
     found = {}
     for name, jobs in trained.items():
         seconds = [one for job in jobs if (one := facts(job).seconds) is not None]

@@ -68,6 +68,17 @@ class Job:
         return self.folder.with_name(f"{self.folder.name}.log")
 
     @property
+    def place(self) -> Path:
+        """The folder with its absolute path, by which runs that start from it are told."""
+        return self.folder.resolve()
+
+    @property
+    def starts_from(self) -> list[Path]:
+        """Absolute folders of the runs that this one starts from."""
+        start, seeds = self.config.training.init_from, self.config.training.seeds
+        return [] if start is None else [folder.resolve() for folder in origin_folders(start, seeds)]
+
+    @property
     def key(self) -> str:
         """Hash of everything that identifies the run."""
         text = json.dumps([to_json(self.config), dict(self.threads), *filter(None, [self.content])], sort_keys=True)
@@ -150,7 +161,7 @@ def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
 
     A row may start from the runs of another one, which do not exist yet.
     """
-    wrong, folders = [], {job.folder for jobs in plan.values() for job in jobs}
+    wrong, places = [], {job.place for jobs in plan.values() for job in jobs}
     for name, jobs in plan.items():
         if waiting := [job for job in jobs if not job.is_complete()]:
             job = waiting[0]
@@ -158,9 +169,7 @@ def check_rows(plan: Mapping[str, Sequence[Job]]) -> None:
                 check_run(job.config)
                 check_rate_factors(job.config)
                 _check_same(waiting)
-                training = job.config.training
-                starts = folders & set(origin_folders(training.init_from or "", training.seeds))
-                if job.start() != "resume" and not starts:
+                if job.start() != "resume" and not places & set(job.starts_from):
                     check_origin(job.config)
             except UserError as error:
                 wrong.append(f"{name}: {error}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.archive import merged, read_archive, write_archive
-from tflane_jax.ablations.effects import HAS_INTERVAL, NO_INTERVAL
+from tflane_jax.ablations.findings import HAS_INTERVAL, NO_INTERVAL
 from tflane_jax.ablations.reuse import FILE, archive_path
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.errors import UserError
@@ -76,7 +76,7 @@ def _section(summary: Mapping[str, Any]) -> list[str]:
     rows = _without_repeated(summary["rows"])
     facts = (
         f"{_counted(len(summary['seeds']), 'seed')}, {_listed(summary['steps'])} updates a run, each on {cores} "
-        f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}) in "
+        f"core{'' if cores == '1' else 's'} ({_listed(summary['devices'])}); the updates of a run took "
         f"{_between(minutes.values())} minutes, other work beside it; code {_listed(summary['commits'])}. "
         f"{summary['protocol']}, test split of the built-in world, percent (mean ± std over seeds). "
         f"{summary['declared']}{_interim(summary)}"

@@ -42,7 +42,7 @@ class Facts:
     Attributes:
         commits: of the code that trained it, nine digits each, in order; one whose code was changed says so.
         devices: that trained it, in order.
-        seconds: of training; None if the run has no record of it.
+        seconds: of all updates, without evaluation and compiling; None if the run has no record of it.
         validation: records of the validation split, see `training.records`.
     """
 

@@ -30,6 +30,7 @@ class Results:
         samples: other scores in samples of the scenes, in the same order.
         owners: model of each row.
         protocols: of each test set and model.
+        failed: why the first run of a model that failed did, by model.
     """
 
     models: tuple[str, ...]
@@ -41,6 +42,7 @@ class Results:
     samples: dict[tuple[str, Which], dict[str, dict[int, Samples]]] = field(default_factory=dict)
     owners: dict[str, str] = field(default_factory=dict)
     protocols: dict[tuple[str, str], str] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
 
     def add(self, test: str, which: Which, model: str, seed: int, measured: Measured) -> None:
         """Add what was measured of a run; raises UserError if it is not measured as the other runs of its row."""
@@ -57,6 +59,11 @@ class Results:
     def has(self, model: str) -> bool:
         """Return whether any run of a model was measured."""
         return model in self.owners.values()
+
+    def model_of(self, row: str) -> str:
+        """Return the model of a row, measured or not; "" if it is of none."""
+        named = (model for model in self.models if row == model or row.startswith(f"{model}, "))
+        return self.owners.get(row) or max(named, key=len, default="")
 
     def rows(self, test: str, which: Which) -> dict[str, dict[int, Scores]]:
         """Return the rows of a table and their scores by seed, in the order of models and seeds."""

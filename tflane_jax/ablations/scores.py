@@ -99,7 +99,9 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
         run = open_run(job.folder, step)
         task = run.config.task
         data = load_test_data(config)
-        ways = {"": config.evaluation} | task.interventions(data, config.evaluation)
+        # Another evaluation than the run's own, such as with geometric topology, adds a column to the row as trained.
+        own = config.evaluation == job.config.evaluation
+        ways = {"": config.evaluation} | (task.interventions(data, config.evaluation) if own else {})
         found = {way: task.evaluate(run.params[0], data, evaluation) for way, evaluation in ways.items()}
         entry = {
             "code": code_digest(),
@@ -108,7 +110,7 @@ def measure(job: Job, config: RunConfig, which: Which) -> Measured | None:
             "ways": {way: evaluation.scores() for way, evaluation in found.items()},
             "ratios": {way: _counts(evaluation.ratios) for way, evaluation in found.items()},
         }
-        if config.evaluation == job.config.evaluation:  # nothing is tested by another one
+        if own:  # nothing is tested by another one
             entry["samples"] = {way: _samples(evaluation.samples()) for way, evaluation in found.items()}
         if job.scored_by == "this code":
             kept = {name: other for name, other in kept.items() if other["code"] == code_digest()}

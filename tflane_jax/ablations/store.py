@@ -131,7 +131,9 @@ def _settings(store: Path) -> list[dict[str, Any]]:
 
 
 def remaining_seconds(plan: Mapping[str, Sequence[Job]], minutes: Mapping[str, float]) -> tuple[float, int]:
-    """Return the time that all incomplete trainings need on one core each, and how many of them are guesses.
+    """Return the time of all updates that are left, each run on one core, and how many of the runs are guesses.
+
+    Evaluation and compiling are not in it: `metrics.jsonl` has the time of updates alone.
 
     A run's rate is that of complete runs of the same row, or its own so far. Where there is none, a run takes the
     `minutes` of its row.

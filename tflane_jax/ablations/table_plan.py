@@ -83,8 +83,8 @@ def plan_table(
     plans = [_planned(table, rows, hosts, seeds, store, threads) for threads in settings]
     chosen = with_recorded([plan.jobs for plan in plans], archive, table.declaration.scores)
     trained = {name: [replace(job, scored_by=scored_by) for job in of_row] for name, of_row in chosen.items()}
-    # The host of a recorded row is needed no more.
-    starts = {job.config.training.init_from for of_row in trained.values() for job in of_row if job.recorded is None}
+    # The host of a row that is recorded or complete is needed no more; trained anew, it would make another row of that.
+    starts = {job.config.training.init_from for of_row in trained.values() for job in of_row if not job.is_complete()}
     needed = {
         name: [job for job in of_host if str(job.folder) in starts] for name, of_host in plans[0].host_jobs.items()
     }
@@ -137,7 +137,8 @@ def tell_work(plan: TablePlan, seeds: Sequence[int], store: Path, jobs: int, *, 
     elif complete < len(every):
         seconds, guesses = remaining_seconds(plan.named(), plan.minutes())
         basis = f"{guesses} of the runs by the table's own figure" if guesses else "measured on this machine"
-        text += f"; the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis})"
+        text += f"; the updates of the others take about {_duration(seconds / jobs)} ({jobs} at a time; {basis}), "
+        text += "evaluation and compiling come on top"
     print(text, flush=True)
 
     def replan(threads: Mapping[str, Any]) -> list[Job]:

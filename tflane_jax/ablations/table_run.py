@@ -25,6 +25,7 @@ from tflane_jax.ablations.compare import (
     draw_models,
     evaluate_runs,
     first_models,
+    reasons,
     save_plan,
     summary_of,
     without_failures,
@@ -32,8 +33,9 @@ from tflane_jax.ablations.compare import (
 from tflane_jax.ablations.comparison import Variant, compact
 from tflane_jax.ablations.declaration import FILE as DECLARATION
 from tflane_jax.ablations.declaration import Declared, declare
-from tflane_jax.ablations.effects import effects, findings, save_effects, unmeasured
+from tflane_jax.ablations.effects import Tested, judged_claims
 from tflane_jax.ablations.facts import facts, row_minutes
+from tflane_jax.ablations.findings import findings, save_effects
 from tflane_jax.ablations.jobs import Job, ScoredBy
 from tflane_jax.ablations.paper.table import PaperTable
 from tflane_jax.ablations.results import Results
@@ -42,7 +44,6 @@ from tflane_jax.ablations.scores import CHECKPOINTS, OWN_TEST, code_digest, eval
 from tflane_jax.ablations.store import TOPOLOGY
 from tflane_jax.ablations.table_plan import plan_table, seed_by_seed, store_of, tell_work
 from tflane_jax.ablations.workers import train_all
-from tflane_jax.config import RunConfig
 from tflane_jax.errors import UserError
 from tflane_jax.files.atomic import write_json, write_text
 from tflane_jax.files.fields import load_json
@@ -109,6 +110,7 @@ def run_table(
     failures = train_all(seed_by_seed(planned.named()), jobs, cores)
     results, trained = Results(tuple(configs), tuple(seeds), {}), without_failures(plan, failures)
     failures += evaluate_runs(trained, results)
+    results.failed.update(reasons(plan, failures))
     trained = without_failures(plan, failures)
     _add_geometric(trained, results)
     save_plan(plan, failures, results, folder)
@@ -118,13 +120,14 @@ def run_table(
     write_archive(folder / FILE, scores)
     first = next(iter(configs.values()))
     path = _save_scores(table, results, folder, quick=quick)
-    save_effects(results, declared, OWN_TEST, first.task.errors, folder / "effects")
+    tested = judged_claims(results, declared.declaration, OWN_TEST, first.task.errors)
+    save_effects(results, declared, OWN_TEST, tested, folder / "effects")
     pair = (table.claims[0].control or table.rows[0].name, table.claims[0].treatment)
     models = first_models(trained, results)
     if {results.owners.get(row, row) for row in pair} <= models.keys():  # recorded runs have no parameters
         draw_models(first, models, pair, folder / "comparison.png")
     _draw_curves(table, trained, folder / "curves.png")
-    _save_summary(table, declared, results, trained, first, folder, quick=quick)
+    _save_summary(table, declared, results, trained, tested, folder, quick=quick)
     print(f"\n{table.name}: {folder} has tables, tests, curves and pictures ({time.monotonic() - began:.0f} s)")
     if failures:
         raise UserError(summary_of(failures, len(planned.every())))
@@ -217,15 +220,12 @@ def _save_summary(
     declared: Declared,
     results: Results,
     trained: Mapping[str, Sequence[Job]],
-    first: RunConfig,
+    tested: Tested,
     folder: Path,
     *,
     quick: bool,
 ) -> None:
     """Write what docs/results.md is made of."""
-    every = [
-        e for which in CHECKPOINTS for e in effects(results, declared.declaration, OWN_TEST, which, first.task.errors)
-    ]
     runs = [job for jobs in trained.values() for job in jobs]
     commits = {commit for job in runs for commit in facts(job).commits}
     write_json(
@@ -245,7 +245,7 @@ def _save_summary(
             "devices": sorted({device for job in runs for device in facts(job).devices}),
             "core minutes of a run": row_minutes(trained),
             "rows": _rows(table, results),
-            "findings": findings(every, unmeasured(results, declared.declaration, OWN_TEST)),
+            "findings": findings(tested),
             "quoted": asdict(table.quoted),
         },
     )

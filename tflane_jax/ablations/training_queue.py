@@ -1,18 +1,19 @@
 """The runs that a comparison still has to train or measure: those that wait, and those that other processes have.
 
-A run that starts from another one of them waits until that one is complete, or has failed.
+A run that starts from another one of them waits until that one is complete, or has failed. Whether it is done is
+decided then: a run whose origin was trained anew is not.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from typing import Any
 
 from tflane_jax.ablations.jobs import Job
 from tflane_jax.ablations.reservations import Reservations
 from tflane_jax.errors import UserError
-from tflane_jax.training.fine_tuning import origin_folders
 from tflane_jax.training.run_folder import is_locked
 
 LOOK_SECONDS = 10.0
@@ -26,10 +27,11 @@ class Queue:
 
     def __init__(self, jobs: Sequence[Job], reservations: Reservations, is_done: Callable[[Job], bool]) -> None:
         self._is_done = is_done
-        self._waiting = [job for job in jobs if not is_done(job)]
         self._elsewhere: list[Job] = []
         self._taken: list[Job] = []
-        self._every = {job.folder: job for job in jobs}
+        self._every = {job.place: job for job in jobs}
+        undone = {job.place for job in jobs if not is_done(job)}
+        self._waiting = [job for job in jobs if undone & {job.place, *(each.place for each in self._lineage(job))}]
         self._reservations = reservations
         self._looked = time.monotonic()
 
@@ -77,14 +79,21 @@ class Queue:
 
     def _origins(self, job: Job) -> list[Job]:
         """Return the jobs of this queue, done or not, that a job starts from."""
-        training = job.config.training
-        folders = origin_folders(training.init_from, training.seeds) if training.init_from else []
-        return [self._every[folder] for folder in folders if folder in self._every]
+        return [self._every[place] for place in job.starts_from if place in self._every]
+
+    def _lineage(self, job: Job) -> list[Job]:
+        """Return the jobs of this queue that a job starts from, and those that these start from."""
+        found: dict[Path, Job] = {}
+        new = self._origins(job)
+        while new:
+            found |= {each.place: each for each in new}
+            new = [each for one in new for each in self._origins(one) if each.place not in found]
+        return list(found.values())
 
     def _ready(self) -> list[Job]:
         """Return the waiting jobs that start from none that is still to be done."""
-        pending = {job.folder for job in (*self._waiting, *self._elsewhere, *self._taken)}
-        ready = [job for job in self._waiting if not any(origin.folder in pending for origin in self._origins(job))]
+        pending = {job.place for job in (*self._waiting, *self._elsewhere, *self._taken)}
+        ready = [job for job in self._waiting if not pending.intersection(job.starts_from)]
         # Runs that start from one another: the first one is refused.
         return ready or ([] if self._elsewhere or self._taken else self._waiting)
 

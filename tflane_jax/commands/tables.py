@@ -108,5 +108,5 @@ def _totals() -> str:
     listed = ", ".join(f"{name} {cost}" for name, cost in hours.items())
     return (
         f"In one --out, runs that tables share are trained once. Together on one core: {listed}; all "
-        f"{core_minutes(TABLES.values()) / 60:.0f} h."
+        f"{core_minutes(TABLES.values()) / 60:.0f} h. Updates alone: evaluation and compiling come on top."
     )

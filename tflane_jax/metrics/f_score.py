@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from tflane_jax.metrics.chamfer import PaddedLines
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth, Lines
+from tflane_jax.metrics.merging import joined
 
 SAMPLES = np.arange(-50.0, 50.0)  # x of the planes, metres
 NEAR = 1.5  # metres; also the cost of a plane that only one of two lanes passes
@@ -39,11 +40,11 @@ class CenterlineFScore:
         self._counts += [recalled, precise, len(true.points), len(found.points)]
         self._frames += 1
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both (neither changes)."""
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the frames of all (none changes)."""
         merged = type(self)()
-        merged._frames = self._frames + other._frames
-        merged._counts = self._counts + other._counts
+        for name in vars(self):
+            setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
     def compute(self) -> dict[str, float]:

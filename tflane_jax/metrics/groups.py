@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Int
 
 from tflane_jax.errors import UserError
 from tflane_jax.metrics.frames import Lines
+from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.resampling import Weights
 
 
@@ -71,8 +72,8 @@ class LaneMetrics(Protocol):
         """Add a matched frame."""
         ...
 
-    def merge(self, other: Any) -> Any:
-        """Return an accumulator of the frames of both."""
+    def merge(self, *others: Any) -> Any:
+        """Return an accumulator of the frames of all."""
         ...
 
     def compute(self) -> dict[str, float]:
@@ -238,14 +239,18 @@ class GroupedMetrics(Generic[FrameT]):
         """
         return {group: np.array(counts, int).reshape(-1, 2) for group, counts in self._recalled.items()}
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both, in this order (neither changes)."""
-        if self.protocol != other.protocol or self._metrics.keys() != other._metrics.keys():
-            raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
-        merged = copy.copy(self)
-        merged._metrics = {group: metrics.merge(other._metrics[group]) for group, metrics in self._metrics.items()}
-        merged._recalled = {group: counts + other._recalled[group] for group, counts in self._recalled.items()}
-        merged._measures = {group: frames + other._measures[group] for group, frames in self._measures.items()}
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the frames of all, in this order (none changes)."""
+        for other in others:
+            if self.protocol != other.protocol or self._metrics.keys() != other._metrics.keys():
+                raise UserError(f"cannot merge metrics of {self.protocol} with {other.protocol}, or of other groups")
+        every, merged = (self, *others), copy.copy(self)
+        merged._metrics = {
+            group: metrics.merge(*(other._metrics[group] for other in others))
+            for group, metrics in self._metrics.items()
+        }
+        merged._recalled = {group: joined([each._recalled[group] for each in every]) for group in self._metrics}
+        merged._measures = {group: joined([each._measures[group] for each in every]) for group in self._metrics}
         return merged
 
     def compute(self) -> dict[str, dict[str, float]]:

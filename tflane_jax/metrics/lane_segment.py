@@ -20,6 +20,7 @@ from tflane_jax.errors import UserError
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
 from tflane_jax.metrics.matching import average_precision_11, pooled
+from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.openlane_v2 import CenterlineMetrics
 from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 from tflane_jax.metrics.segment_matching import (
@@ -75,16 +76,15 @@ class LaneSegmentMetrics:
         if frame.wrong is not None:
             self._errors[2:] += segments.hits.sum(1), segments.hits @ frame.wrong
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both, in this order (neither changes)."""
-        if self.flavour != other.flavour:
-            raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one flavour")
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the frames of all, in this order (none changes)."""
+        for other in others:
+            if self.flavour != other.flavour:
+                raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one flavour")
         merged = type(self)(self.flavour)
-        merged._lanes = self._lanes.merge(other._lanes)
-        merged._true_areas = self._true_areas + other._true_areas
-        merged._area_detections = self._area_detections + other._area_detections
-        merged._frame_areas = self._frame_areas + other._frame_areas
-        merged._errors = self._errors + other._errors
+        merged._lanes = self._lanes.merge(*(other._lanes for other in others))
+        for name in vars(self).keys() - {"flavour", "_lanes"}:
+            setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
     def compute(self) -> dict[str, float]:

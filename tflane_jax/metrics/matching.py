@@ -51,6 +51,17 @@ def pooled(detections: list[tuple[np.ndarray, ...]], *empty: tuple[int, ...]) ->
     return [np.concatenate(field, -1) for field in zip(*detections, strict=True)]
 
 
+def ranked(scores: Float[np.ndarray, " p"], *fields: np.ndarray) -> list[np.ndarray]:
+    """Return detections from the highest to the lowest score; another stable sort of them costs little.
+
+    Args:
+        scores: of the detections.
+        fields: their other fields, detections along the last axis.
+    """
+    order = descending(scores)
+    return [field[..., order] for field in (scores, *fields)]
+
+
 def average_precision_11(scores: Float[np.ndarray, " p"], hits: Bool[np.ndarray, " p"], truths: int) -> float:
     """Return the mean over the recalls 0, 0.1, ..., 1 of the best precision at that recall or above.
 

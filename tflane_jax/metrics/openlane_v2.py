@@ -20,7 +20,8 @@ from tflane_jax.files.openlane import ATTRIBUTES
 from tflane_jax.metrics.centerline_matching import LANE_THRESHOLDS, MatchedFrame, match_frame
 from tflane_jax.metrics.frames import LaneDetections, LaneTruth
 from tflane_jax.metrics.groups import BY_OCCLUSION, FrameGroup, GroupedMetrics, Partition
-from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled
+from tflane_jax.metrics.matching import average_precision_11, average_precision_area, pooled, ranked
+from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_mean, resampled_precisions
 from tflane_jax.metrics.topology import Version, check_versions
 
@@ -81,13 +82,14 @@ class CenterlineMetrics:
             self._element_topology += np.stack([elements.topology[version] for version in self.versions])
             self._element_detections.append((elements.scores, elements.hits, elements.attributes))
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both, in this order (neither changes)."""
-        if self.versions != other.versions:
-            raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one version")
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the frames of all, in this order (none changes)."""
+        for other in others:
+            if self.versions != other.versions:
+                raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one version")
         merged = type(self)(self.versions)
         for name in vars(self).keys() - {"versions"}:
-            setattr(merged, name, getattr(self, name) + getattr(other, name))
+            setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
     def compute(self) -> dict[str, float]:
@@ -106,7 +108,7 @@ class CenterlineMetrics:
         - `TOP_ll`, `TOP_lt` and `OLS` of the further versions, named with the version: `TOP_ll_v1.0`.
         """
         result: dict[str, float] = {"frames": self._frames, "lanes": self._lanes}
-        scores, hits = pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0))
+        scores, hits = ranked(*pooled(self._lane_detections, (len(LANE_THRESHOLDS), 0)))
         precisions = [average_precision_11(scores, row, self._lanes) for row in hits]
         result["DET_l"] = float(np.mean(precisions))
         result |= {f"DET_l@{t}": value for t, value in zip(LANE_THRESHOLDS, precisions, strict=True)}

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from tflane_jax.errors import UserError
 from tflane_jax.files.tusimple import RowLanes
+from tflane_jax.metrics.merging import joined
 
 PIXEL_THRESHOLD = 20.0  # across the lane
 MATCHED = 0.85  # least fraction of rows
@@ -46,14 +47,14 @@ class TuSimpleMetrics:
         self._sums += self._images[-1]
         self._frames += 1
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the images of both (neither changes)."""
-        if self.time_limit != other.time_limit:
-            raise UserError(f"cannot merge {self.protocol} with {other.protocol}: use one time limit")
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the images of all, in this order (none changes)."""
+        for other in others:
+            if self.time_limit != other.time_limit:
+                raise UserError(f"cannot merge {self.protocol} with {other.protocol}: use one time limit")
         merged = type(self)(self.time_limit)
-        merged._frames = self._frames + other._frames
-        merged._sums = self._sums + other._sums
-        merged._images = self._images + other._images
+        for name in vars(self).keys() - {"time_limit"}:
+            setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
     def compute(self) -> dict[str, float]:

@@ -28,7 +28,8 @@ from tflane_jax.metrics.map_matching import (
     match_map,
 )
 from tflane_jax.metrics.map_overlap import OVERLAP_THRESHOLDS
-from tflane_jax.metrics.matching import average_precision_area, pooled
+from tflane_jax.metrics.matching import average_precision_area, pooled, ranked
+from tflane_jax.metrics.merging import joined
 from tflane_jax.metrics.resampling import Weights, frame_numbers, resampled_precisions
 
 _NAMES: dict[Measure, str] = {"chamfer": "MapTR Chamfer AP", "iou": "MapTR IoU AP"}
@@ -86,14 +87,15 @@ class VectorMapMetrics:
         self._frame_truths.append(frame.truths)
         self._detections.append((frame.scores, frame.classes.astype(np.int8), frame.hits))
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both, in this order (neither changes)."""
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the frames of all, in this order (none changes)."""
         settings = ("sampling", "measure", "dims")
-        if any(getattr(self, name) != getattr(other, name) for name in settings):
-            raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one sampling")
+        for other in others:
+            if any(getattr(self, name) != getattr(other, name) for name in settings):
+                raise UserError(f"cannot merge {self.protocol} with {other.protocol}: update both with one sampling")
         merged = type(self)(self.sampling, self.measure, self.dims)
         for name in vars(self).keys() - set(settings):
-            setattr(merged, name, getattr(self, name) + getattr(other, name))
+            setattr(merged, name, joined([getattr(each, name) for each in (self, *others)]))
         return merged
 
     def compute(self) -> dict[str, float]:
@@ -107,7 +109,7 @@ class VectorMapMetrics:
         - `recall`: fraction of the true lines that are found, whatever the confidence; mean over the thresholds.
         """
         thresholds, names = self.thresholds, self.classes
-        scores, classes, hits = pooled(self._detections, (0,), (len(thresholds), 0))
+        scores, classes, hits = ranked(*pooled(self._detections, (0,), (len(thresholds), 0)))
         hits = hits.astype(bool)[:, classes < len(names)]
         scores, classes = scores[classes < len(names)], classes[classes < len(names)]
         truths = self._truths[: len(names)]

@@ -23,8 +23,13 @@ def format_table(rows: Sequence[Row], columns: Sequence[str] | None = None, *, t
         columns: to show, in this order; None shows all in order of appearance.
         title: line above the table, for example the metric's protocol and version.
         digits: decimals of floating-point numbers.
+
+    Returns:
+        The title alone if there is no column.
     """
     names = list(columns) if columns is not None else list(dict.fromkeys(name for row in rows for name in row))
+    if not names:
+        return title
     cells = [[_cell(row.get(name), digits) for name in names] for row in rows]
     numeric = [
         any(_is_number(row.get(name)) for row in rows)

@@ -6,7 +6,6 @@ intervals over frames would be far too narrow.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
@@ -29,8 +28,8 @@ class Accumulator(Protocol):
         """Add a frame."""
         ...
 
-    def merge(self, other: Self) -> Self:
-        """Return an accumulator of the frames of both."""
+    def merge(self, *others: Self) -> Self:
+        """Return an accumulator of the frames of all."""
         ...
 
     def compute(self) -> dict[str, Any]:
@@ -141,4 +140,5 @@ def _check_frames(predictions: Mapping[Hashable, Any], truth: Mapping[Hashable, 
 
 
 def _merged(accumulators: list[Accumulator]) -> Accumulator:
-    return functools.reduce(lambda a, b: a.merge(b), accumulators)
+    first, *others = accumulators
+    return first.merge(*others)

@@ -10,7 +10,7 @@ _Run = tuple[object, ...]
 
 
 def core_minutes(tables: Iterable[PaperTable]) -> float:
-    """Return the minutes that all runs of the tables take on one core; runs that tables share count once.
+    """Return the minutes that the updates of all runs take on one core; runs that tables share count once.
 
     Runs are equal here if their rows refer to the same configuration, settings, steps, host and seed. Loading no
     configuration, this misses equal ones that are written differently.

@@ -75,7 +75,7 @@ class PaperTable:
         seeds: number of seeds.
         steps: updates of every run; None for those of the configurations.
         hosts: models that rows start from. They are trained first and are no rows.
-        minutes: that a run takes on one core, for estimates; the mean over rows in docs/results where it is recorded.
+        minutes: of a run's updates on one core, for estimates; the mean over rows in docs/results where it is recorded.
         host_minutes: the same for one of `hosts`.
         note: a sentence of the table's text, such as why a column of the paper is missing.
         steps_factor: how many times as long every run is, see `lengthened`.

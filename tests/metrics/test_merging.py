@@ -1,0 +1,47 @@
+"""Accumulators of many scenes joined at once, against one after the other; what they keep, bit for bit."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from tests.metrics.test_resampling import centerlines, lines, segments
+from tflane_jax.metrics import CenterlineFScore, CenterlineMetrics, LaneSegmentMetrics, VectorMapMetrics
+from tflane_jax.metrics.matching import average_precision_11, average_precision_area, ranked
+from tflane_jax.metrics.merging import joined
+
+
+def test_joined():
+    assert joined([[1], [], [2, 3]]) == [1, 2, 3]
+    assert joined([2]) == 2
+    parts = [np.array([0.1, 1e16]), np.array([0.2, 1.0]), np.array([0.3, -1e16])]
+    assert joined(parts).tolist() == ((parts[0] + parts[1]) + parts[2]).tolist()  # in this order
+    assert parts[0].tolist() == [0.1, 1e16]
+
+
+@pytest.mark.parametrize(
+    ("make", "frame"),
+    [
+        (CenterlineMetrics, centerlines),
+        (CenterlineFScore, centerlines),
+        (LaneSegmentMetrics, segments),
+        (VectorMapMetrics, lines),
+    ],
+)
+def test_many_at_once_are_as_one_after_the_other(make, frame):
+    parts = [make() for _ in range(6)]
+    for number, part in enumerate(parts):
+        part.update(*frame(number))
+    first, *others = (parts[i] for i in (4, 0, 0, 5, 2, 1))
+    before = first.compute()
+    assert first.merge(*others).compute() == functools.reduce(lambda a, b: a.merge(b), others, first).compute()
+    assert first.merge().compute() == first.compute() == before
+
+
+def test_ranked_detections_keep_the_order_of_equal_scores():
+    rng = np.random.default_rng(0)
+    scores, hits = rng.integers(0, 5, 60) / 5, rng.random((2, 60)) < 0.4
+    order, rows = ranked(scores, hits)
+    assert (np.diff(order) <= 0).all()
+    for precision in (average_precision_11, average_precision_area):
+        assert [precision(order, row, 30) for row in rows] == [precision(scores, row, 30) for row in hits]

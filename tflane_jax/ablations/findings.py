@@ -1,0 +1,120 @@
+"""What a comparison found, for people: a sentence for each declared comparison, and their table."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared
+from tflane_jax.ablations.effects import SAMPLES, Effect, Tested, Untested, measures, std, values
+from tflane_jax.ablations.report import listed
+from tflane_jax.ablations.results import Results
+from tflane_jax.evaluation.by_scene import SAMPLES as SHARED_SAMPLES
+from tflane_jax.plots.tables import format_table, save_table
+
+HAS_INTERVAL = "95 %"
+NO_INTERVAL = "no interval over scenes: decided by seeds alone"
+
+
+def save_effects(results: Results, declared: Declared, test: str, tested: Tested, stem: Path) -> Path:
+    """Print the findings and their table, save both as `<stem>.md` and `<stem>.json`, and return the first."""
+    lines = [f"{results.protocol}, {results.title(test)}", "", declared.sentence()]
+    seeds = min((effect.seeds for effect in tested.effects), key=len, default=())
+    if seeds and set(seeds) != set(declared.seeds):
+        lines.append(f"**Interim**: {len(seeds)} of {len(declared.seeds)} declared seeds ({listed(seeds)}).")
+    lines += ["", *(f"- {text}." for text in findings(tested))]
+    if tested.effects:
+        lines += [
+            "",
+            "Difference: the claim's model minus the row. From, to: 95 % interval over scenes (seeds averaged,",
+            f"{SAMPLES:,} bootstrap samples, {SHARED_SAMPLES} of scores that rank detections). "
+            "p: two-sided paired t-test",
+            "over seeds; Holm: corrected for all differences of one measure and checkpoint.",
+        ]
+    rows, title = _rows(results, declared.declaration, test, tested.effects), "\n".join(lines)
+    print("\n" + format_table(rows, title=title, digits=4))
+    meta = {"declaration": asdict(declared), "protocol": results.protocol, "seeds": list(seeds)}
+    return save_table(stem, rows, meta, title=title, digits=4)[0]
+
+
+def findings(tested: Tested) -> list[str]:
+    """Return a sentence for each claim and row, about the last checkpoint; those without any result last."""
+    by_row: dict[tuple[Claim, str], list[Effect]] = {}
+    for effect in tested.effects:
+        if effect.checkpoint == "last":
+            by_row.setdefault((effect.claim, effect.row), []).append(effect)
+    return [*map(sentence, by_row.values()), *map(_without_result, tested.untested)]
+
+
+def _without_result(untested: Untested) -> str:
+    text = f"**not tested** ({untested.reason}): {untested.claim.treatment} is better than *{untested.row}*; "
+    return _with_claim(f"{text}the correction of the other tests counts it", untested.claim)
+
+
+def sentence(of_row: Sequence[Effect]) -> str:
+    """Return the effects against one row as a sentence: primary measure, then the others, see `measures`."""
+    primary, *others = of_row
+    claim = primary.claim
+    if primary.finding == "not tested":
+        text = f"**not tested** ({_why(primary)}): {claim.treatment} minus *{primary.row}* in {primary.measure}, "
+    else:
+        text = f"**{primary.finding}**: {claim.treatment} is better than *{primary.row}* in {primary.measure}, "
+    text = "; ".join([text + _numbers(primary), *(f"{_judged(each)}{_numbers(each)}" for each in others)])
+    return _with_claim(text, claim)
+
+
+def _judged(effect: Effect) -> str:
+    finding = "" if effect.finding == "not tested" else f"{effect.finding} "
+    return f"{finding}in the {effect.measure}, "
+
+
+def _why(effect: Effect) -> str:
+    return "one seed" if len(effect.seeds) == 1 else "a run has no number for it"
+
+
+def _with_claim(text: str, claim: Claim) -> str:
+    return f"{text}. Claim: {claim.text}" if claim.text else text
+
+
+def _numbers(effect: Effect) -> str:
+    """Return a difference in points of percent, with its uncertainties; those between seeds only if there are some."""
+    if math.isnan(effect.difference):
+        return "no number"
+    parts = [] if math.isnan(effect.low) else [f"{HAS_INTERVAL} {100 * effect.low:+.2f} to {100 * effect.high:+.2f}"]
+    if effect.finding == "not tested":
+        return " ".join([f"{100 * effect.difference:+.2f} points", *(f"({part})" for part in parts)])
+    parts += [_p_value(effect.p_holm), f"better in {effect.better} of {len(effect.seeds)} seeds"]
+    parts += [NO_INTERVAL] if math.isnan(effect.low) else []
+    return f"{100 * effect.difference:+.2f} points ({', '.join(parts)})"
+
+
+def _p_value(p: float) -> str:
+    return f"p {p:.4f}" if p >= 1e-4 else "p < 0.0001"
+
+
+def _rows(results: Results, declaration: Declaration, test: str, every: Sequence[Effect]) -> list[dict[str, Any]]:
+    """Return the table: for each measure, checkpoint and claim the treatment, then what it is compared with.
+
+    Rows that are compared over other seeds have a line of the treatment of their own.
+    """
+    rows: list[dict[str, Any]] = []
+    by_name = {measure.name: measure for measure in measures(declaration)}
+    for (which, name, claim, seeds), group in itertools.groupby(
+        every, lambda effect: (effect.checkpoint, effect.measure, effect.claim, effect.seeds)
+    ):
+        treated = values(results.rows(test, which)[claim.treatment], by_name[name], seeds)
+        place = {"measure": name, "checkpoint": which}
+        rows.append(place | {"model": claim.treatment, "mean": float(treated.mean()), "std": std(treated)})
+        rows += [
+            place
+            | {"model": effect.row, "mean": effect.mean, "std": effect.std}
+            | {"difference": effect.difference, "from": effect.low, "to": effect.high}
+            | {"p": effect.p, "p (Holm)": effect.p_holm}
+            | {"seeds better": f"{effect.better} of {len(effect.seeds)}", "finding": effect.finding}
+            for effect in group
+        ]
+    return rows

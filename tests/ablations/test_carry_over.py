@@ -13,7 +13,7 @@ from tflane_jax.ablations import carry_over as subject
 from tflane_jax.ablations import carry_over_plan as plans
 from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, carry_over
 from tflane_jax.ablations.carry_over_plan import ROWS, Settings
-from tflane_jax.ablations.declaration import Declaration, check
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.cli import main
@@ -199,7 +199,7 @@ def test_fewer_logs_are_an_interim_look(folder, capsys):
         assert "**Interim**: 1 of 2 declared logs (scene-3)." in (out / name).read_text()
     assert "3 runs, 3 complete" in capsys.readouterr().out
     tests = json.loads((out / "effects.json").read_text())["rows"]
-    assert {test["verdict"] for test in tests} == {"not tested"}
+    assert {test["verdict"] for test in tests} == {"not tested (one log)"}
     carry_over(settings(folder), out)
     assert [(out / name).read_bytes() for name in names] == before
 
@@ -267,3 +267,31 @@ def test_models_are_compared_on_the_seeds_that_all_of_them_have(tmp_path, monkey
         "mixed": [0.5, 0.5],
         "maps": [0.5, 0.5],
     }
+
+
+def test_claims_about_rows_without_a_result_are_listed_and_counted():
+    """Two claims, one of them about a model whose trainings failed: the p of the other is doubled by Holm."""
+    logs = tuple("abcdef")
+    scores = {"mixed": [0.3, 0.31, 0.29, 0.35, 0.3, 0.33], "generated": [0.28, 0.3, 0.28, 0.32, 0.29, 0.3]}
+    found = {row: {log: {PRIMARY: value} for log, value in zip(logs, of, strict=True)} for row, of in scores.items()}
+    claims = (Claim("mixed", "generated", "maps help"), Claim("mixed", "maps", "roads help"))
+    declared = Declared(Declaration(PRIMARY, claims), (0,), "", 0)
+    tested, missing = subject._tests(found, logs, declared)
+    assert tested["p (Holm)"] == pytest.approx(2.0 * tested["p"])
+    assert tested["verdict"] == "shown"
+    assert missing["verdict"] == "not tested (no result of maps)"
+    assert np.isnan(missing["difference"])
+
+
+@pytest.mark.parametrize(
+    ("row", "model"),
+    [
+        ("generated", "generated"),
+        (f"generated, {NONE}", "generated"),
+        ("generated, right-hand traffic", "generated, right-hand traffic"),
+        (f"generated, right-hand traffic, {OTHER}", "generated, right-hand traffic"),
+        (f"mixed + BEV, {OTHER}", "mixed + BEV"),
+    ],
+)
+def test_the_model_of_a_row_is_told_from_its_intervention(row, model):
+    assert subject._model(row) == model

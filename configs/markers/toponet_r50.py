@@ -39,7 +39,8 @@ CAMERA = Path(__file__).parents[1] / "camera"
 CLIP = 4
 EPOCH = 22_477 // CLIP
 MARKERS = as_written(MarkerFusionConfig())
-# "200 x 100 covering a 100 m x 50 m region". TopoNet's own program, on which the paper builds, has 102.4 x 51.2 m.
+# "200 x 100 covering a 100 m x 50 m region". TopoNet's own program, on which the paper builds, has 102.4 x 51.2 m, so
+# that lanes cut at 100 x 50 m end within its box; here they end at its border, where a sigmoid only comes near.
 GRID = BevGrid(PerceptionRange((-50.0, 50.0), (-25.0, 25.0), (-2.3, 1.7)), rows=100, columns=200)
 # "Random resizing and color jitter". The paper gives no range; images of its full size are the largest.
 AUGMENTATION = PhotometricConfig(scale=(0.8, 1.0))

@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import shutil
 import warnings
 from argparse import Namespace
 
@@ -13,7 +14,7 @@ from tests.markers.test_reader import BOARDS, LANES, SECOND, ego, seen_from
 from tests.tasks.test_marker_drive import Remembering
 from tflane_jax.cli import main
 from tflane_jax.commands import marker_run
-from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, save_drive
+from tflane_jax.datasets.drive_files import Drive, DriveCamera, DriveFrame, load_drive, save_drive
 from tflane_jax.datasets.procedural import ProceduralConfig
 from tflane_jax.errors import UserError
 from tflane_jax.geometry import invert_pose
@@ -116,6 +117,27 @@ def test_any_number_of_days_is_an_age():
     age = marker_run._age(Namespace(max_age_days=10**12))
     assert not old.outdated(day, age)
     assert marker_run._age(Namespace(max_age_days=None)) is None
+
+
+def test_a_damaged_image_counts_as_missing_and_is_named(drive, tmp_path, capsys):
+    images, out = tmp_path / "images", tmp_path / "out"
+    shutil.copytree(drive, images)
+    (images / "1.png").write_bytes(b"cut off")
+    assert main(arguments(drive, out, images=images)) == 2
+    record = json.loads((out / "frames.json").read_text())
+    first, damaged, gap, last = record["frames"]
+    assert [[board["id"] for board in frame["boards"]] for frame in (first, damaged, gap)] == [[3], [], []]
+    assert damaged["remembered"]
+    assert gap["remembered"]
+    assert {board["id"] for board in last["boards"]} == {8, 40}
+    (fault,) = record["faults"]
+    assert fault["file"] == str(images / "1.png")
+    said = capsys.readouterr().err
+    assert fault["error"] in said
+    assert "images of the drive left out: 1" in said
+    read = load_drive(images / "poses.json", images)
+    with pytest.raises(UserError, match=r"1\.png"):
+        read.views(read.frames[1])
 
 
 def test_a_store_of_another_family_is_refused(drive, tmp_path, capsys):

@@ -48,6 +48,21 @@ def test_distance_is_proportional_to_marker_size(photos, tmp_path):
     assert marker["position"][0] == pytest.approx(4.5, abs=0.02)
 
 
+def test_a_damaged_photo_is_named_and_the_others_are_searched(photos, tmp_path, capsys):
+    """Sorted by name it comes before the photo with the marker."""
+    out, damaged = tmp_path / "out", photos / "0.png"
+    damaged.write_bytes((photos / "a.png").read_bytes()[:40])
+    assert main(["markers", "detect", str(photos), *INTRINSICS, "--out", str(out)]) == 2
+    written = json.loads((out / "detections.json").read_text())
+    assert [[marker["id"] for marker in photo["markers"]] for photo in written["photos"]] == [[12], []]
+    (fault,) = written["faults"]
+    assert fault["file"] == str(damaged)
+    said = capsys.readouterr()
+    assert fault["error"] in said.err
+    assert "photos without an answer: 1 of 3" in said.err
+    assert "a.png" in said.out
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -56,6 +71,10 @@ def test_distance_is_proportional_to_marker_size(photos, tmp_path):
         (["--distortion", "0.1"], "--distortion"),
         (["--intrinsics", "0", "900", "1", "1"], "--intrinsics"),
         (["--enlarge", "0"], "tflane: --enlarge is 0: it must be"),
+        (["--height", "nan"], "tflane: --height takes finite numbers"),
+        (["--pitch", "inf"], "tflane: --pitch takes finite numbers"),
+        (["--distortion", "0.1", "nan", "0", "0"], "tflane: --distortion takes finite numbers"),
+        (["--intrinsics", "900", "900", "nan", "1"], "tflane: --intrinsics takes finite numbers"),
     ],
 )
 def test_errors_name_the_remedy(photos, tmp_path, capsys, change, words):

@@ -4,11 +4,12 @@
     tflane convert --config markers/toponet_r50 --weights resnet50.pth --out runs/imagenet
     tflane train --config markers/toponet_r50 --data.root PATH
 
-Section IV-C: ResNet-50 from ImageNet, 2048 x 1550 pixels, 200 x 100 BEV cells, AdamW, a cosine of 24 epochs from 1e-4,
-one frame at a time. The encoder is that of OpenLane-V2's large baseline, six layers, with Eq. (3) as written in each. A
-scene has one board. Ours: one clip of four frames for an update, and the clear place of a board. Of the 28 images of a
-clip, one feature map of 256 channels at a quarter of the size takes 5.4 GiB, so that every part recomputes its
-activations, and the frames pass in a loop. Not trained.
+Section IV-C: ResNet-50 from ImageNet, 2048 x 1550 pixels with random resizing and colours, 200 x 100 BEV cells of half
+a metre, AdamW, a cosine of 24 epochs from 1e-4, one frame at a time. The encoder is that of OpenLane-V2's large
+baseline, six layers, with Eq. (3) as written in each. A scene has one board. Ours: one clip of four frames for an
+update, the range of the resizing, and the clear place of a board. Of the 28 images of a clip, one feature map of 256
+channels at a quarter of the size takes 5.4 GiB, so that every part recomputes its activations, and the frames pass in a
+loop. Not trained.
 """
 
 from dataclasses import replace
@@ -20,7 +21,9 @@ from tflane_jax.datasets.openlane_markers import BoardsConfig
 from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.view_images import BASELINE_LARGE
 from tflane_jax.evaluation.results import EvaluationConfig
+from tflane_jax.geometry import BevGrid, PerceptionRange
 from tflane_jax.markers.simulation import MarkerConfig
+from tflane_jax.models.bev_encoder import BevFormerConfig
 from tflane_jax.models.bevformer_detr import BevFormerDetrConfig
 from tflane_jax.models.camera_encoder import CameraEncoderConfig
 from tflane_jax.models.host import HostConfig
@@ -36,6 +39,11 @@ CAMERA = Path(__file__).parents[1] / "camera"
 CLIP = 4
 EPOCH = 22_477 // CLIP
 MARKERS = as_written(MarkerFusionConfig())
+# "200 x 100 covering a 100 m x 50 m region". TopoNet's own program, on which the paper builds, has 102.4 x 51.2 m, so
+# that lanes cut at 100 x 50 m end within its box; here they end at its border, where a sigmoid only comes near.
+GRID = BevGrid(PerceptionRange((-50.0, 50.0), (-25.0, 25.0), (-2.3, 1.7)), rows=100, columns=200)
+# "Random resizing and color jitter". The paper gives no range; images of its full size are the largest.
+AUGMENTATION = PhotometricConfig(scale=(0.8, 1.0))
 
 
 def get_config() -> RunConfig:
@@ -74,10 +82,8 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
     boards = BoardsConfig(placement=PlacementConfig(per="scene", site="clear"))
     return replace(
         config,
-        task=replace(config.task, model=_recomputing(_six_layers(config.task.model), priors), clip=CLIP, time="scan"),
-        data=replace(
-            config.data, image=BASELINE_LARGE, augmentation=PhotometricConfig(), example=example, boards=boards
-        ),
+        task=replace(config.task, model=_recomputing(_bev(config.task.model), priors), clip=CLIP, time="scan"),
+        data=replace(config.data, image=BASELINE_LARGE, augmentation=AUGMENTATION, example=example, boards=boards),
         optim=replace(config.optim, lr=1e-4, epoch_steps=EPOCH),
         training=replace(
             config.training,
@@ -92,9 +98,11 @@ def _row(priors: PriorsConfig, host: str = "toponet_r50") -> RunConfig:
     )
 
 
-def _six_layers(model: HostConfig) -> HostConfig:
+def _bev(model: HostConfig) -> HostConfig:
+    """Return the host with the paper's BEV grid and the baseline's six layers."""
     assert isinstance(model.encoder, CameraEncoderConfig)
-    return replace(model, encoder=replace(model.encoder, bev=replace(model.encoder.bev, layers=6)))
+    assert isinstance(model.encoder.bev, BevFormerConfig)
+    return replace(model, encoder=replace(model.encoder, bev=replace(model.encoder.bev, grid=GRID, layers=6)))
 
 
 def _recomputing(model: HostConfig, priors: PriorsConfig) -> HostConfig:

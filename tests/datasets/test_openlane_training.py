@@ -16,6 +16,7 @@ from tflane_jax.datasets.base import ExampleConfig
 from tflane_jax.datasets.batches import batches, count, first_example
 from tflane_jax.datasets.openlane_sd_map import read_sd_lines
 from tflane_jax.datasets.openlane_v2 import OpenLaneV2Dataset
+from tflane_jax.datasets.photometric import PhotometricConfig
 from tflane_jax.datasets.streaming import StreamingConfig
 from tflane_jax.datasets.view_images import ImageConfig
 from tflane_jax.errors import UserError
@@ -92,6 +93,12 @@ def test_clips_have_markers_and_the_sd_map(data):
     assert plain.sd_map.valid.any(-1).all()
     changed = np.asarray(plain.cameras.image != coloured.cameras.image).any((2, 3, 4, 5))
     assert changed.all()
+    scaled = TASK.prepare(replace(data, augmentation=PhotometricConfig(scale=(0.5, 0.9))))
+    smaller = next(batches(clips, (0,), range(1), 10, scaled))[0]
+    assert jax.tree.map(np.shape, smaller) == jax.tree.map(np.shape, plain)
+    sizes = np.asarray(smaller.cameras.size[:, :, 0]) / np.asarray(plain.cameras.size[:, :, 0])
+    assert len(np.unique(sizes[..., 0])) > CLIP  # each frame has its own
+    assert 0.45 < sizes.min() < sizes.max() < 0.95
     assert jax.tree.map(jnp.shape, first_example(frames)) == jax.tree.map(jnp.shape, TASK.shapes(data))
 
 

@@ -176,3 +176,29 @@ def test_lanes_stay_in_range_for_any_pose(x, y, yaw):
     assert not (markers.successor & ~(markers.lane_valid[:, :, None] & markers.lane_valid[:, None])).any()
     for m, i, j in np.argwhere(markers.successor):
         np.testing.assert_allclose(markers.lanes[m, i, -1], markers.lanes[m, j, 0], atol=1e-4)
+
+
+@given(st.floats(-30, 30), st.floats(-30, 30), st.floats(-np.pi, np.pi))
+@settings(max_examples=40, deadline=None)
+def test_lanes_move_with_the_frame_and_residuals_do_not(x, y, yaw):
+    """The same detections from another place of the vehicle: nothing but the frame changes."""
+    move, wide = yaw_pose(*np.array([[x], [y], [yaw]]))[0], PerceptionRange((-500, 500), (-500, 500))
+    shift = yaw_pose(*np.array([[2.0], [0.5], [0.1]]))[0]
+
+    def seen_from(ego):
+        before, motion = detect(shift @ PLACED.pose), ego
+        return observe(
+            detect(ego @ PLACED.pose), STORE, wide, previous=before, now_from_previous=motion, **SIZES
+        ).markers
+
+    here, there = seen_from(np.eye(4)), seen_from(move)
+    rows, others = rows_of(here), rows_of(there)
+    for number in (5, 8, 2):
+        a, b = rows[number], others[number]
+        np.testing.assert_array_equal(here.lane_valid[a], there.lane_valid[b])
+        np.testing.assert_array_equal(here.successor[a], there.successor[b])
+        used = here.lane_valid[a]
+        moved = here.lanes[a][used] @ move[:3, :3].T + move[:3, 3]
+        np.testing.assert_allclose(there.lanes[b][used], moved, atol=1e-3)
+        assert there.residual[b] == pytest.approx(here.residual[a], abs=1e-3)
+        assert here.residual[a] > 0.1

@@ -47,6 +47,8 @@ def test_the_store_of_a_scene(tmp_path, capsys):
         (["--log", "200000040"], "has no junction, split or merge"),
         (["--log", "1", "--radius", "0"], "--radius must be more than 0 m"),
         (["--log", "1", "--expires", "soon"], "--expires soon is no day"),
+        (["--log", "1", "--surveyed", "2025-07-11", "--expires", "2025-07-11"], "--expires 2025-07-11 must be after"),
+        (["--log", "1", "--surveyed", "2025-07-11", "--expires", "2024-07-11"], "must be after --surveyed 2025-07-11"),
     ],
 )
 def test_errors_name_the_remedy(tmp_path, arguments, message, capsys):

@@ -4,9 +4,11 @@
     {"store", "model", "threshold", "frames": [{"timestamp_ns", "picture", "gate", "remembered",
      "boards": [{"id", "outcome", "score", "size", "position", "distance", "residual", "confidence"}, ...],
      "guidance": [{"weight", "points": [[x, y], ...]}, ...],
-     "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...]}
+     "lanes": [{"score", "points": [[x, y, z], ...]}, ...]}, ...],
+     "faults": [{"file", "error"}, ...]}
     "outcome" is one of `markers.observe.Outcome`; "residual" and "confidence" exist for boards that give a prior,
-    "lanes" with a model. Coordinates are in the ego frame, metres.
+    "lanes" with a model. Coordinates are in the ego frame, metres. `faults` are images that could not be read; their
+    cameras saw nothing in that frame.
 
 `render` writes such a drive of the built-in world, with its store.
 """
@@ -15,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import sys
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -52,10 +55,14 @@ _RINGS = {"argoverse2": ARGOVERSE2_RING, "nuscenes": NUSCENES_RING}
 
 
 def run(options: argparse.Namespace) -> int:
-    """Follow a drive: markers, store, confidence, memory and, with a model, lanes."""
+    """Follow a drive: markers, store, confidence, memory and, with a model, lanes.
+
+    An image that cannot be read is recorded and told, and counts as missing; the result is then 2.
+    """
     if not 0.0 <= options.threshold <= 1.0:
         raise UserError(f"--threshold {options.threshold:g}: it must be a score from 0 to 1")
     configure_jax()
+    opencv()  # without it, every image would be a fault
     store, drive = load_store(options.store), load_drive(options.poses, options.images)
     if options.interval is not None:
         if not options.interval > 0.0:
@@ -66,9 +73,10 @@ def run(options: argparse.Namespace) -> int:
     detector = _detector(options, store)
     config = ReaderConfig(detector, range_, today=_day(options), max_age_days=_age(options))
     steps = MarkerDrive(MarkerReader(store, as_trained(config, model)), model)
+    faults: dict[str, str] = {}
     if model is not None:
         # A model that cannot read these images is refused before they are searched, which takes seconds each.
-        fitted_views(drive.views(drive.frames[0]), model.source)
+        fitted_views(drive.views(drive.frames[0], faults), model.source)
     if steps.remembers:
         check_rate([frame.timestamp_ns for frame in drive.frames], steps.interval)
     make_folder(options.out)
@@ -78,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
         warnings.simplefilter("ignore", UnknownMarkerWarning)
         warnings.simplefilter("ignore", StaleMarkerWarning)
         for number, frame in enumerate(progress_bar(drive.frames, desc="drive", unit="frame")):
-            views = drive.views(frame)
+            views = drive.views(frame, faults)
             found = search_views(views, detector)
             step = steps.step(views, frame.timestamp_ns, frame.global_from_ego, found)
             outcomes.update(step.reading.observed.outcomes.values())
@@ -99,14 +107,19 @@ def run(options: argparse.Namespace) -> int:
                 threshold=options.threshold,
             )
     head = {"store": str(options.store), "model": None if options.model is None else str(options.model)}
-    write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames})
+    told = [{"file": file, "error": error} for file, error in faults.items()]
+    write_json(options.out / "frames.json", head | {"threshold": options.threshold, "frames": frames, "faults": told})
     boards = {f"boards {name}": outcomes[name] for name in ("used", "unknown", "stale", "contradictory", "dropped")}
     guided = sum(bool(frame["guidance"]) for frame in frames)
     remembered = sum(frame["remembered"] for frame in frames)
     rows = [{"frames": len(frames), "with lanes": guided, "from memory": remembered} | boards]
     print(format_table(rows, title=f"{options.poses}: markers of {options.store}"))
     print(f"\nwritten to {options.out}")
-    return 0
+    for error in faults.values():
+        print(f"tflane: {error}", file=sys.stderr)
+    if faults:
+        print(f"tflane: images of the drive left out: {len(faults)}, see above", file=sys.stderr)
+    return 2 if faults else 0
 
 
 def _model(folder: Path) -> DriveModel:
@@ -140,8 +153,7 @@ def _day(options: argparse.Namespace) -> datetime.date:
 def _age(options: argparse.Namespace) -> int | None:
     if options.max_age_days is not None and options.max_age_days < 0:
         raise UserError(f"--max-age-days is a number of days, not {options.max_age_days}")
-    # Python counts no more days; no survey is older.
-    return None if options.max_age_days is None else min(options.max_age_days, datetime.timedelta.max.days)
+    return options.max_age_days
 
 
 def _confidence(step: DriveStep) -> dict[int, float]:

@@ -22,6 +22,8 @@ def run(options: argparse.Namespace) -> int:
     if not options.radius > 0.0:
         raise UserError(f"--radius must be more than 0 m, not {options.radius:g}")
     surveyed, expires = _day(options.surveyed, "--surveyed"), _day(options.expires, "--expires")
+    if surveyed is not None and expires is not None and expires <= surveyed:
+        raise UserError(f"--expires {expires} must be after --surveyed {surveyed}: before it, no entry would be valid")
     log = _open_log(options.log)
     store = store_of_log(
         log, radius=options.radius, bike_lanes=options.bike_lanes == "include", surveyed=surveyed, expires=expires

@@ -3,9 +3,10 @@
 `detect` writes one picture for each photo, with the outline and the axes of every marker (x red, y green, z blue), and
 detections.json:
     {"family", "size", "photos": [{"file", "picture", "markers": [{"id", "score", "position", "distance", "turn",
-     "reprojection", "ambiguity", "pose"}, ...]}, ...]}
+     "reprojection", "ambiguity", "pose"}, ...]}, ...],
+     "faults": [{"file", "error"}, ...]}
     Position and pose (ego_from_marker, 4 x 4) are in the ego frame, on the ground below the camera: x forward, y left,
-    z up, metres.
+    z up, metres. `faults` are photos that could not be read.
 
 `curves` writes curves-NAME.md and .json for each curve, and curves.png.
 """
@@ -13,6 +14,7 @@ detections.json:
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,11 @@ _OUTLINE = (255, 210, 0)
 
 
 def find(options: argparse.Namespace) -> int:
-    """Detect markers in photos of one calibrated camera; print a table, write pictures and detections.json."""
+    """Detect markers in photos of one calibrated camera; print a table, write pictures and detections.json.
+
+    A photo that cannot be read is recorded and told, the others are searched, and the result is 2.
+    """
+    opencv()  # without it, every photo would be a fault
     photos = list_photos(options.images)
     config = DetectorConfig(
         _family(options.family),
@@ -53,11 +59,19 @@ def find(options: argparse.Namespace) -> int:
     distortion: list[float] = options.distortion or []
     if len(distortion) not in (0, 4, 5, 8):
         raise UserError(f"--distortion takes OpenCV's K1 K2 P1 P2, with K3, or with K3 to K6, not {len(distortion)}")
+    for name in ("intrinsics", "distortion", "height", "pitch"):
+        if not np.isfinite(getattr(options, name) or 0.0).all():
+            raise UserError(f"--{name} takes finite numbers, not nan or inf")
     intrinsics, pose = _intrinsics(options.intrinsics), camera_pose(options.height, np.deg2rad(options.pitch))
     make_folder(options.out)
-    rows, records = [], []
+    rows, records, faults = [], [], []
     for number, path in enumerate(photos):
-        photo = undistorted(read_image(path), intrinsics, distortion)
+        try:
+            photo = read_image(path)
+        except UserError as error:
+            faults.append({"file": str(path), "error": str(error)})
+            continue
+        photo = undistorted(photo, intrinsics, distortion)
         found = detect(_views(photo, intrinsics, pose), config)
         picture = f"{number:03d}-{path.stem}-markers.png"
         _write_picture(options.out / picture, photo, found, config.size, intrinsics, pose)
@@ -67,12 +81,17 @@ def find(options: argparse.Namespace) -> int:
         shown = [{k: v for k, v in record.items() if k not in ("pose", "position")} for record in here]
         places = [dict(zip("xyz", record["position"], strict=True)) for record in here]
         rows += [{"photo": path.name} | a | b for a, b in zip(shown, places, strict=True)] or [{"photo": path.name}]
-    write_json(options.out / "detections.json", {"family": config.family.name, "size": config.size, "photos": records})
+    head = {"family": config.family.name, "size": config.size}
+    write_json(options.out / "detections.json", head | {"photos": records, "faults": faults})
     columns = ("photo", "id", "score", "distance", "x", "y", "z", "turn", "reprojection", "ambiguity")
     full = [{column: row.get(column) for column in columns} for row in rows]
     print(format_table(full, columns, title=f"{config.family.name}, {config.size:g} m; metres, degrees, pixels"))
     print(f"\nwritten to {options.out}")
-    return 0
+    for fault in faults:
+        print(f"tflane: {fault['error']}", file=sys.stderr)
+    if faults:
+        print(f"tflane: photos without an answer: {len(faults)} of {len(photos)}, see above", file=sys.stderr)
+    return 2 if faults else 0
 
 
 def curves(options: argparse.Namespace) -> int:

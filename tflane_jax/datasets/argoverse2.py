@@ -142,7 +142,7 @@ class LogData:
         example: what is in an example, and its capacities.
         loading: memory or disk, and workers.
         image: scaling and cropping of the ring cameras' images, see `Argoverse2Config`; None does not read them.
-        augmentation: of the colours of training images, or None.
+        augmentation: of training images, or None.
     """
 
     train: Path

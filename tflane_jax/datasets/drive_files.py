@@ -73,15 +73,25 @@ class Drive:
     cameras: tuple[DriveCamera, ...]
     frames: tuple[DriveFrame, ...]
 
-    def views(self, frame: DriveFrame) -> CameraViews:
+    def views(self, frame: DriveFrame, faults: dict[str, str] | None = None) -> CameraViews:
         """Read the images of a frame, without lens distortion; a camera without an image is not valid.
+
+        Args:
+            frame: one of the drive.
+            faults: gets the error of each file that cannot be read, which then counts as missing; None raises it.
 
         Raises UserError for an image that cannot be read.
         """
         images: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
         for number, camera in enumerate(self.cameras):
             if camera.name in frame.images:
-                image = read_image(frame.images[camera.name])
+                try:
+                    image = read_image(frame.images[camera.name])
+                except UserError as error:
+                    if faults is None:
+                        raise
+                    faults[str(frame.images[camera.name])] = str(error)
+                    continue
                 images[number] = undistorted(image, camera.intrinsics, camera.distortion)
         height = max((image.shape[0] for image in images.values()), default=1)
         width = max((image.shape[1] for image in images.values()), default=1)

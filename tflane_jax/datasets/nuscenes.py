@@ -235,7 +235,7 @@ class NuScenesData:
         train, val, test: which official split serves as each; the official test split has no annotations.
         version, splits, frame, least_visibility, camera_poses, can_bus, image, example, loading: see `NuScenesConfig`.
         depth_cell: the same, of training images; others need no depth.
-        augmentation: of the colours of training images, or None.
+        augmentation: of training images, or None.
     """
 
     root: Path

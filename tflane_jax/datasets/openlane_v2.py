@@ -282,7 +282,7 @@ class OpenLaneV2Data:
         root: folder of the dataset.
         train, val, test: which official split serves as each; the official test split has no annotations.
         subset, flavour, data_dict, image, example, loading: see `OpenLaneV2Config`.
-        augmentation: of the colours of training images, or None.
+        augmentation: of training images, or None.
         map_changes: whether the training split keeps or drops logs whose streets differ from their map, as
             `OpenLaneV2Config.map_changes`.
         tracks, without_tracks: traffic flow, see `OpenLaneV2Config`.

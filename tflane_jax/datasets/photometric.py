@@ -1,10 +1,11 @@
-"""Photometric distortion of multi-view images, which every camera system of the papers trains with, and GridMask.
+"""Augmentation of multi-view images: photometric distortion, which every camera system of the papers trains with,
+GridMask and random scaling.
 
 Photometric distortion is mmdetection's `PhotoMetricDistortion` (brightness, contrast, saturation, hue, channel swap;
 contrast before or after the colours), drawn for each view separately, as in BEVFormer
 (https://github.com/fundamentalvision/BEVFormer). The originals work on unbounded floats; here images are uint8, so
 values are clipped to 0 to 255. GridMask (Chen et al. 2020, https://arxiv.org/abs/2001.04086) has BEVFormer's setting:
-squares without rotation, one mask for all views.
+squares without rotation, one mask for all views. Scaling has one factor for all views of a frame (`random_scale`).
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from tflane_jax.datasets.random_scale import scaled_example
 from tflane_jax.files.images import opencv
-from tflane_jax.limits import Fraction, Range, within
+from tflane_jax.limits import ASCENDING, Factor, Fraction, Range, within
 from tflane_jax.scene import CameraViews, Example
 
 # Colour of a hidden square: the mean of ImageNet, which normalisation turns into zero as in the original.
@@ -26,7 +28,7 @@ _HIDDEN = np.array([124, 116, 104], np.uint8)
 
 @dataclass(frozen=True)
 class PhotometricConfig:
-    """Strength of the changes to the images of an example.
+    """Strength of the changes to the images of an example; the defaults keep their size.
 
     Attributes:
         probability: of brightness, contrast, saturation and hue, independently.
@@ -37,6 +39,7 @@ class PhotometricConfig:
         swap: probability of a random order of the channels.
         grid_mask: probability of a GridMask; papers that use one have 0.7.
         grid_ratio: fraction of the period that stays visible in either direction.
+        scale: smallest and largest factor on width and height of all images of a frame.
     """
 
     probability: Fraction = 0.5
@@ -47,6 +50,7 @@ class PhotometricConfig:
     swap: Fraction = 0.5
     grid_mask: Fraction = 0.0
     grid_ratio: Fraction = 0.5
+    scale: Annotated[tuple[Factor, Factor], ASCENDING] = (1.0, 1.0)
 
 
 LANESEGNET_PHOTOMETRIC = PhotometricConfig(grid_mask=0.7)
@@ -60,14 +64,23 @@ MAPTR_PHOTOMETRIC = LANESEGNET_PHOTOMETRIC
 
 
 def augment_example(example: Example, config: PhotometricConfig, seed: int | Sequence[int]) -> Example:
-    """Return an example with its images changed at random; without cameras it is unchanged."""
+    """Return an example with its images changed at random; without cameras it is unchanged.
+
+    Intrinsics and the boxes of traffic elements follow the scale of the images.
+    """
     if example.cameras is None:
         return example
+    # A stream after those of `augment_views`, whose numbers thereby do not depend on this one.
+    *_, sizing = np.random.default_rng(seed).spawn(2 + len(example.cameras.valid))
+    example = scaled_example(example, float(sizing.uniform(*config.scale)))
+    assert example.cameras is not None
     return replace(example, cameras=augment_views(example.cameras, config, seed))
 
 
 def augment_views(cameras: CameraViews, config: PhotometricConfig, seed: int | Sequence[int]) -> CameraViews:
-    """Return images changed at random; the same seed gives the same bits. Padding and calibration are unchanged.
+    """Return images with colours changed and squares hidden at random; the same seed gives the same bits.
+
+    Padding, sizes and calibration are unchanged.
 
     Args:
         cameras: numpy.

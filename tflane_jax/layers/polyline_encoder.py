@@ -44,6 +44,7 @@ def temperature_encoding(
         raise ValueError(f"every frequency has a sine and a cosine, so bands must be even, not {bands}")
     frequency = 2.0 * math.pi * temperature ** (-2.0 * jnp.arange(bands // 2, dtype=coordinates.dtype) / bands)
     angle = coordinates[..., None] * jnp.expand_dims(frequency, tuple(range(coordinates.ndim)))
+    # Eq. (1) of marker fusion.
     waves = jnp.stack([jnp.sin(angle), jnp.cos(angle)], -2 if layout == "blocks" else -1)
     return waves.reshape(*coordinates.shape[:-1], coordinates.shape[-1] * bands)
 
@@ -75,7 +76,7 @@ class PolylineEncoderConfig:
         yield "bands", self.bands % 2 == 0, "even: every frequency has a sine and a cosine"
 
 
-# Marker fusion, section IV-C.
+# Marker fusion, section IV-C; hidden channels and dropout, which it does not give, are SMERF's.
 MARKER_POLYLINES = PolylineEncoderConfig(bands=32, layout="interleaved", attend="points")
 
 

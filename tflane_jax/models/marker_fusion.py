@@ -38,7 +38,9 @@ from tflane_jax.scene import Example, MarkerObservations
 
 @dataclass(frozen=True)
 class MarkerFusionConfig:
-    """The module. The defaults are the paper's; `SMALL_MARKER_FUSION` trains on two CPU cores.
+    """The module. The defaults have the paper's sizes, and Eq. (3) for hosts that also run without markers.
+
+    `as_written` is Eq. (3) to the letter; `SMALL_MARKER_FUSION` trains on two CPU cores.
 
     Attributes:
         prior: confidence and polylines.
@@ -49,8 +51,8 @@ class MarkerFusionConfig:
         fusion: "gated" is Eq. (3); "uniform" sets c = 1; "hard" sets c = 1 and ignores markers, seen or remembered,
             whose own confidence is below `hard_threshold` (Table II). c is only the factor in Eq. (3): confidence also
             scales tokens (Eq. 4) and decides when memory is read. `uniform_fusion` removes it from there too.
-        hard_threshold: lowest confidence at which "hard" uses markers.
-        heads: of the attention to the tokens.
+        hard_threshold: lowest confidence at which "hard" uses markers; the paper gives none.
+        heads: of the attention to the tokens; the paper gives those of the line encoder alone.
         width: channels of that attention; None: those of the BEV features.
         norm: position of the LayerNorm in Eq. (3). "written": around the sum, in every frame, so that a host without
             markers in sight differs from one without this module. "sum": the same in frames with lanes of markers;

@@ -48,7 +48,10 @@ def check_origins(reference: str, seeds: Sequence[int]) -> None:
         try:
             _starting_checkpoint(folder)
         except UserError as error:
-            raise UserError(f"training.init_from is {reference}: {error}") from error
+            raise UserError(
+                f"training.init_from is {reference}: {error}; make that run first (tflane train, or tflane convert for "
+                "published weights), or name another"
+            ) from error
 
 
 def origins(reference: str, seeds: Sequence[int]) -> list[dict[str, Any]]:

@@ -1,0 +1,135 @@
+"""What holds for every variant of marker fusion: no markers, padding, order of lanes, motion of the vehicle."""
+
+from dataclasses import replace
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.models.cases import BASELINE
+from tests.models.test_marker_fusion import CONFIG, observed, same, seeing
+from tests.parameters import random_params
+from tflane_jax.geometry import BevGrid, relative_pose, yaw_pose
+from tflane_jax.models.marker_fusion import (
+    FusedMarkers,
+    MarkerFusionConfig,
+    MarkerPrior,
+    MarkerTokens,
+    as_written,
+    fusion_gate,
+    uniform_fusion,
+)
+from tflane_jax.models.prior import BevCells
+from tflane_jax.priors.marker_memory import MarkerGuidance
+
+VARIANTS = {
+    "gated": CONFIG,
+    "as written": as_written(CONFIG),
+    "query": replace(CONFIG, norm="query", width=16),
+    "radius": replace(CONFIG, norm="query", radius=10.0),
+    "uniform": uniform_fusion(CONFIG),
+    "ungated": replace(CONFIG, fusion="uniform"),
+    "hard": replace(CONFIG, fusion="hard"),
+    "no memory": replace(CONFIG, memory=None),
+    "connectivity": replace(CONFIG, connectivity=True),
+    "transformer": replace(CONFIG, encoding="transformer"),
+    "MLP": replace(CONFIG, encoding="mlp"),
+}
+RNG = np.random.default_rng(0)
+BEV, POSITION = (jnp.asarray(RNG.normal(size=(12, 8)), jnp.float32) for _ in range(2))
+CENTERS = jnp.asarray(RNG.uniform(-20, 20, (12, 2)), jnp.float32)
+HOST = BASELINE.spec
+
+
+class OneLayer(nn.Module):
+    """Tokens of lanes, fused into the BEV features of one layer."""
+
+    config: MarkerFusionConfig
+
+    @nn.compact
+    def __call__(self, lanes: MarkerGuidance):
+        tokens = MarkerTokens(self.config, HOST.bev_range, name="tokens")(lanes)
+        fused = FusedMarkers(tokens, lanes, *fusion_gate(lanes, self.config))
+        cells = BevCells(BEV, POSITION, CENTERS, BevGrid(HOST.bev_range, 3, 4))
+        return MarkerPrior(self.config, HOST).into_bev(fused, 0, cells)
+
+
+def lanes_of(config, markers):
+    prior = MarkerPrior(config, HOST)
+    return prior.observe(seeing(markers), prior.start())[0]
+
+
+@pytest.fixture(params=VARIANTS, scope="module")
+def variant(request):
+    """Return a variant, with random parameters, and its function from lanes to BEV features."""
+    config = VARIANTS[request.param]
+    module = OneLayer(config)
+    variables = random_params(module.init, lanes_of(config, observed()))
+    return config, variables["params"], jax.jit(lambda lanes: module.apply(variables, lanes))
+
+
+def test_without_markers_features_stay(variant):
+    """They do not depend on the lanes in the padding either; Eq. (3) as written normalises them."""
+    config, params, fuse = variant
+    for markers in (None, observed(valid=False, garbage=np.nan), observed(lanes=0)):
+        lanes = lanes_of(config, markers)
+        expected = BEV
+        if config.norm == "written":
+            expected = nn.LayerNorm(epsilon=1e-5).apply({"params": params["markers_0"]["norm"]}, BEV)
+            np.testing.assert_allclose(fuse(lanes), expected, atol=1e-6)
+        else:
+            same(fuse(lanes), expected)
+    assert np.abs(fuse(lanes_of(config, observed())) - expected).max() > 1e-3
+
+
+def test_padding_of_lanes_may_hold_nan(variant):
+    config, _, fuse = variant
+    lanes = lanes_of(config, observed())
+    gone = ~lanes.valid
+    assert gone.any()
+    dirty = lanes.replace(
+        points=jnp.where(gone[:, None, None], jnp.nan, lanes.points),
+        confidence=jnp.where(gone, jnp.nan, lanes.confidence),
+        successor=lanes.successor | (gone[:, None] & gone[None, :]),
+    )
+    same(fuse(dirty), fuse(lanes))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_lanes_does_not_matter(variant, seed):
+    config, _, fuse = variant
+    lanes = lanes_of(config, observed(lanes=3))
+    order = np.random.default_rng(seed).permutation(len(lanes.valid))
+    by_lane = {name: getattr(lanes, name)[order] for name in ("points", "weight", "confidence", "valid")}
+    shuffled = lanes.replace(**by_lane, successor=lanes.successor[order][:, order])
+    np.testing.assert_allclose(fuse(shuffled), fuse(lanes), atol=1e-5)
+
+
+MOTION = st.tuples(st.floats(-8, 8), st.floats(-3, 3), st.floats(-0.6, 0.6))
+
+
+@given(st.lists(MOTION, min_size=1, max_size=2), MOTION)
+@settings(max_examples=30, deadline=None)
+def test_remembered_lanes_stay_on_the_ground_on_any_drive(steps, turn):
+    """The bank moves its lanes with each pose; here the poses of the whole drive are known at once."""
+    prior = MarkerPrior(CONFIG, HOST)
+    observe = jax.jit(prior.observe)
+    start = yaw_pose(*np.array(turn)[:, None])[0]
+    first, memory = observe(seeing(observed(), has_previous=np.asarray(False)), prior.start())
+    before = start
+    for step in steps:
+        now = before @ yaw_pose(*np.array(step)[:, None])[0]
+        pose = relative_pose(before, now).astype(np.float32)
+        frame = seeing(None, has_previous=np.asarray(True)).replace(previous_from_ego=pose)
+        lanes, memory = observe(frame, memory)
+        before = now
+    valid = np.asarray(first.valid[: CONFIG.prior.lanes])
+    points = np.asarray(first.points[: CONFIG.prior.lanes], np.float64)[valid]
+    moved = relative_pose(before, start)
+    expected = points @ moved[:2, :2].T + moved[:2, 3]
+    np.testing.assert_allclose(np.asarray(lanes.points)[np.asarray(lanes.valid)], expected, atol=1e-3)
+    np.testing.assert_allclose(lanes.gate, first.gate * 0.5 ** len(steps), rtol=1e-5)

@@ -1,4 +1,4 @@
-"""Numbers that pages quote from tables: those of docs/results, cell by cell.
+"""Numbers that pages quote from tables: those of docs/results and docs/carry_over, cell by cell.
 
 A quoting table stands below `<!-- results: NAME -->`, which names the recorded table. Its columns and rows have shorter
 names than there, which this file translates.
@@ -11,7 +11,9 @@ import pytest
 
 from tests.shared import ROOT
 
-PAGES = ("README.md", "docs/tf_lane.md", "docs/small_models.md")
+PAGES = ("README.md", "docs/tf_lane.md", "docs/small_models.md", "docs/real_roads.md")
+# The least count of numbers in sentences that must be those of findings; docs/real_roads.md quotes others in brackets.
+FINDINGS = {"README.md": 7, "docs/tf_lane.md": 30, "docs/small_models.md": 0}
 COLUMNS = {
     "DET_l": "all/DET_l",
     "TOP_ll": "all/TOP_ll",
@@ -38,6 +40,7 @@ ON_HOST = {
 ADDED = {
     "- none at inference": ", no traffic flow at inference",
     "- of another scene": ", traffic of another scene",
+    "- of another log": ", traffic of another log",
     "the same, traffic of another scene at inference": ", traffic of another scene",
     "- control: trained without traffic": ", control",
     "the same, trained without traffic (control)": ", control",
@@ -51,8 +54,8 @@ FINDING = re.compile(rf"({NUMBER}) points \((?:95 % ({NUMBER}) to ({NUMBER}), )?
 
 def summaries():
     """Return the recorded tables by name."""
-    paths = (ROOT / "docs" / "results").glob("*.json")
-    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in paths}
+    paths = [*(ROOT / "docs" / "results").glob("*.json"), ROOT / "docs" / "carry_over" / "carry_over.json"]
+    return {path.stem: {"findings": [], **json.loads(path.read_text(encoding="utf-8"))} for path in paths}
 
 
 def tables(text):
@@ -76,7 +79,7 @@ def wrong_tables(text, recorded):
         if named is None or named[1] not in recorded:
             wrong.append(f"a table with the row {rows[0]} does not name a recorded table, but has: {above}")
             continue
-        found = {row["model"]: row for row in recorded[named[1]]["rows"] if row["checkpoint"] == "last"}
+        found = {row["model"]: row for row in recorded[named[1]]["rows"] if row.get("checkpoint", "last") == "last"}
         host = main = ""
         for label, *cells in rows:
             if label in ADDED:
@@ -133,10 +136,12 @@ def _rounds(value, text):
 def test_quoted_numbers_are_the_recorded_ones(page):
     text, recorded = (ROOT / page).read_text(encoding="utf-8"), summaries()
     wrong, cells = wrong_tables(text, recorded)
-    wrong_told, numbers = wrong_sentences(text, recorded)
-    assert wrong + wrong_told == []
+    assert wrong == []
     assert cells >= 20
-    assert numbers >= {"README.md": 7, "docs/tf_lane.md": 30, "docs/small_models.md": 0}[page]
+    if page in FINDINGS:
+        wrong_told, numbers = wrong_sentences(text, recorded)
+        assert wrong_told == []
+        assert numbers >= FINDINGS[page]
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -163,7 +163,10 @@ def test_the_training_split_may_lie_in_another_folder(tmp_path):
     found = training_nearness(RunConfig(data=WorldData()), source, root)
     assert found is not None
     assert found.groups == ["near training"] * 3
-    assert found.sentence() == "3 of 3 frames are within 5 m of a training frame; the nearest is 0.0 m away"
+    assert found.sentence() == (
+        "3 of 3 frames are within 5 m of a training frame; the nearest is 0.0 m away. "
+        "Files do not name the city of 3 of them, which may be another with equal coordinates"
+    )
     with pytest.raises(UserError, match=r"there is no folder .*elsewhere"):
         training_nearness(RunConfig(data=WorldData()), source, tmp_path / "elsewhere")
     with pytest.raises(UserError, match="has no training split in a folder: leave out --training-root"):

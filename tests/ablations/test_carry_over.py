@@ -88,6 +88,8 @@ def test_folds_leave_out_several_logs_at_a_time(folder):
 
     plan, alone = planned(folds=2), planned()
     assert [len(alone.flat()), len(plan.flat())] == [5, 3]
+    assert {row: len(jobs) for row, jobs in alone.by_row().items()} == dict(zip(plans.ROWS, (1, 2, 2), strict=True))
+    assert {row: len(jobs) for row, jobs in plan.by_row().items()} == dict.fromkeys(plans.ROWS, 1)
     assert {plans.map_data(job.config).test_logs for job in plan.flat()} == {(), ("scene-1", "scene-3")}
     (job,) = plan.of("mixed", "scene-1")
     assert plan.of("mixed", "scene-3") == [job]

@@ -9,6 +9,7 @@ import pytest
 
 from tests.fakes import FakeConfig, FakeDataset, fake_views
 from tests.models.cases import WITH_TRAFFIC
+from tflane_jax.datasets.base import FrameInfo
 from tflane_jax.datasets.loading import stream
 from tflane_jax.datasets.procedural import ProceduralConfig, WorldData
 from tflane_jax.datasets.streaming import StreamingConfig
@@ -19,6 +20,7 @@ from tflane_jax.models.toponet import TopoNetConfig
 from tflane_jax.scene import CenterlinePrediction, Prediction, SegmentPrediction
 from tflane_jax.tasks import Model
 from tflane_jax.tasks.lane_graph import LaneGraphTask
+from tflane_jax.tasks.lane_pictures import titles
 
 SIZE = 12
 
@@ -229,3 +231,19 @@ def test_the_numbers_of_a_host_of_segments_have_the_announced_names(of_segments)
     assert {"all/mAP", "hidden+traffic/recall", "occluded/AP_ls", "all/AE_dist"} <= announced
     assert set(task.compared) & found.scores().keys() >= {"all/mAP", "all/AE_dist", "occluded/TOP_lsls"}
     assert set(task.errors) <= set(task.compared)
+
+
+@pytest.mark.parametrize(
+    ("scene", "title"),
+    [
+        ("scene-0061", "scene-0061 at 2.5 s"),
+        ("7fab2350-7eaf-3b7e-a39d-6937a4c1bede", "7fab2350…1bede at 2.5 s"),
+        ("7fab2350-7eaf-3b7e-a39d-6937a4c1bede-00003", "7fab2350…00003 at 2.5 s"),
+    ],
+)
+def test_titles_have_room_for_the_ids_of_logs(scene, title):
+    class OneFrame(FakeDataset):
+        def info(self, index):
+            return FrameInfo("fake", scene, 2_500_000_000, np.eye(4))
+
+    assert titles(OneFrame(FakeConfig()), [0]) == [title]

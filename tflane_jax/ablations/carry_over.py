@@ -95,7 +95,7 @@ def carry_over(settings: Settings, out: Path) -> Path:
     folder = recorded_logs(settings)
     content = {**folder.content, **({} if settings.folds is None else {"folds": str(settings.folds)})}
     plan = with_trainings(folder, settings, configs, out, worker_threads(settings.jobs, settings.cores))
-    by_row = {row: [job for jobs in by_log.values() for job in jobs] for row, by_log in plan.jobs.items()}
+    by_row = plan.by_row()
     check_rows(by_row)
     declared = declare(declaration, by_row, configs, settings.seeds, out, logs=plan.logs, content=content)
     complete = sum(job.is_complete() for job in plan.flat())

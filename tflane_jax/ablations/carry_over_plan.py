@@ -90,6 +90,13 @@ class Plan:
         order = [job for log in ("", *self.logs) for by_log in self.jobs.values() for job in by_log.get(log, ())]
         return list({job.folder: job for job in order}.values())
 
+    def by_row(self) -> dict[str, list[Job]]:
+        """Return the runs of each model, each once: logs of a fold share them."""
+        return {
+            row: list({job.folder: job for jobs in by_log.values() for job in jobs}.values())
+            for row, by_log in self.jobs.items()
+        }
+
     def other(self, log: str) -> str:
         """Return the log whose traffic a log gets: the next one by name."""
         return self.every[(self.every.index(log) + 1) % len(self.every)]

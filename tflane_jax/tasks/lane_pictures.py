@@ -51,6 +51,8 @@ _groups_of: Mapping[type, Callable[..., Mapping[str, np.ndarray]]] = {LaneGraph:
 _FRAMES = 4
 _FRAMES_OF_ONE_MODEL = 6
 _BATCH = 16
+# Characters of a scene's name in a title.
+_LONGEST_NAME = 20
 
 
 def draw_examples(
@@ -238,4 +240,9 @@ def truth_of(model: Model) -> Field:
 def titles(dataset: Dataset, indices: list[int]) -> list[str]:
     """Return a title for the picture of each example."""
     infos = [dataset.info(index) for index in indices]
-    return [f"{info.scene} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]
+    return [f"{_shortened(info.scene)} at {info.timestamp_ns / 1e9:.1f} s" for info in infos]
+
+
+def _shortened(name: str) -> str:
+    """Return a scene's name as a title has room for it: the ids of logs have 36 characters."""
+    return name if len(name) <= _LONGEST_NAME else f"{name[:8]}…{name[-5:]}"

@@ -191,7 +191,8 @@ def _save(
         for log in logs
         for row in found
     ]
-    save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent (mean over {len(seeds)} seeds){ending}")
+    over = f"mean over {len(seeds)} seeds" if len(seeds) > 1 else "1 seed"
+    save_table(out / "logs", each, meta, title=f"{note}{protocol}, percent ({over}){ending}")
     tests = _tests(found, logs, declared)
     paired = f"Paired over {len(logs)} logs, points."
     title = " ".join(filter(None, [note.strip(), declared.sentence(), interim, paired, FITTED]))

@@ -96,9 +96,10 @@ class Declared:
             what += f", negative control {self.declaration.negative_control}"
         when = "before any run" if self.begun == 0 else f"when {self.begun} runs had begun already"
         treatments = ", ".join(dict.fromkeys(claim.treatment for claim in self.declaration.claims))
+        seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
         text = (
             f"Declared {when} ({self.time}): {what}, treatment {treatments}, "
-            f"level {self.declaration.alpha:g}, {len(self.seeds)} seeds."
+            f"level {self.declaration.alpha:g}, {seeds}."
         )
         if _CONFIGURATIONS in self.missing:
             text += " This declaration of an earlier version holds no configurations: those of the rows may be later."

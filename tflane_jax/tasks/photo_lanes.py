@@ -192,7 +192,7 @@ class PhotoReader:
         if len(lanes) < len(believed):
             warnings.append(f"{len(believed) - len(lanes)} of {len(believed)} lanes lie above the horizon or outside")
         if not clear.all():
-            warnings.append(f"{int((~clear).sum())} lanes cross others and are left out")
+            warnings.append(f"lanes that cross others are left out ({int((~clear).sum())})")
         if judged.crossed and clear.all():
             warnings.append("the lanes would cross before the horizon")
         if seen.lanes and worth_of_view < _PLAUSIBLE and not judged.crossed:

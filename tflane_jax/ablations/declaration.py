@@ -98,8 +98,7 @@ class Declared:
         treatments = ", ".join(dict.fromkeys(claim.treatment for claim in self.declaration.claims))
         seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
         text = (
-            f"Declared {when} ({self.time}): {what}, treatment {treatments}, "
-            f"level {self.declaration.alpha:g}, {seeds}."
+            f"Declared {when} ({self.time}): {what}, treatment {treatments}, level {self.declaration.alpha:g}, {seeds}."
         )
         if _CONFIGURATIONS in self.missing:
             text += " This declaration of an earlier version holds no configurations: those of the rows may be later."

@@ -94,7 +94,8 @@ class Declared:
             what += f", secondary measure {self.declaration.secondary}{late}"
         if self.declaration.negative_control is not None:
             what += f", negative control {self.declaration.negative_control}"
-        when = "before any run" if self.begun == 0 else f"when {self.begun} runs had begun already"
+        runs = "1 run" if self.begun == 1 else f"{self.begun} runs"
+        when = "before any run" if self.begun == 0 else f"when {runs} had begun already"
         treatments = ", ".join(dict.fromkeys(claim.treatment for claim in self.declaration.claims))
         seeds = "1 seed" if len(self.seeds) == 1 else f"{len(self.seeds)} seeds"
         text = (

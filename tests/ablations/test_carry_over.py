@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -99,6 +100,14 @@ def test_folds_leave_out_several_logs_at_a_time(folder):
     tested = plans.map_data(plans.on_log(job.config, "scene-3"))
     assert tested.test_logs == ("scene-3",)
     assert tested.source("train") == training
+
+
+def test_logs_whose_names_begin_alike_have_runs_of_their_own():
+    names = ("downtown_drive_1", "downtown_drive_2", "suburb")
+    settings = Settings(Path("maps"), steps=4)
+    config = RunConfig(data=RealMapData(generated=0.5))
+    plan = plans.with_trainings(plans.Plan(names, names, {}), settings, {"mixed": config}, Path("out"), {"cores": 1})
+    assert [plans.map_data(plan.of("mixed", log)[0].config).test_logs for log in names] == [(log,) for log in names]
 
 
 def test_tables_have_every_model_with_own_without_and_with_other_traffic(folder):

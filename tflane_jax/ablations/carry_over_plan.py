@@ -30,6 +30,9 @@ ROWS: Mapping[str, str] = {
 """Models by name: roads that they are trained on, and whether traffic flow enters the queries, the BEV features too
 (+ BEV), or neither."""
 
+# Characters of a log's name that tell it apart: ids of Argoverse 2 have 36.
+_START = 12
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -84,6 +87,12 @@ class Plan:
     def fold(self, log: str, folds: int | None) -> tuple[str, ...]:
         """Return the logs that are left out with a log: every `folds`-th by name, whichever of them are tested."""
         return (log,) if folds is None else self.every[self.every.index(log) % folds :: folds]
+
+    def label(self, row: str, left_out: Sequence[str]) -> str:
+        """Return the name of a model's runs that leave logs out; the starts of the logs' names where these differ."""
+        differ = len({log[:_START] for log in self.every}) == len(self.every)
+        names = ", ".join(log[:_START] if differ else log for log in left_out)
+        return f"{row}, without {names}" if names else row
 
     def flat(self) -> list[Job]:
         """Return every run once, log by log, so that an experiment stopped early has whole logs."""
@@ -148,14 +157,11 @@ def with_trainings(
     for row, config in configs.items():
         data = map_data(config)
         left_out = {"": ()} if data.generated == 1.0 else {log: plan.fold(log, settings.folds) for log in plan.logs}
-        named = {_label(row, logs): replace(config, data=replace(data, test_logs=logs)) for logs in left_out.values()}
+        labels = {log: plan.label(row, logs) for log, logs in left_out.items()}
+        named = {labels[log]: replace(config, data=replace(data, test_logs=logs)) for log, logs in left_out.items()}
         jobs = stored_jobs(named, settings.seeds, store, threads=threads, content=content)
-        plan.jobs[row] = {log: jobs[_label(row, logs)] for log, logs in left_out.items()}
+        plan.jobs[row] = {log: jobs[label] for log, label in labels.items()}
     return plan
-
-
-def _label(row: str, left_out: Sequence[str]) -> str:
-    return f"{row}, without {', '.join(log[:12] for log in left_out)}" if left_out else row
 
 
 def on_log(config: RunConfig, log: str, traffic: str = "") -> RunConfig:

@@ -14,7 +14,7 @@ from tflane_jax.ablations import carry_over as subject
 from tflane_jax.ablations import carry_over_plan as plans
 from tflane_jax.ablations.carry_over import CLAIMS, COLUMNS, NONE, OTHER, PRIMARY, carry_over
 from tflane_jax.ablations.carry_over_plan import ROWS, Settings
-from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, model_of_row
 from tflane_jax.ablations.jobs import Failure, Job
 from tflane_jax.ablations.recorded import Measured
 from tflane_jax.cli import main
@@ -305,4 +305,4 @@ def test_claims_about_rows_without_a_result_are_listed_and_counted():
     ],
 )
 def test_the_model_of_a_row_is_told_from_its_intervention(row, model):
-    assert subject._model(row) == model
+    assert model_of_row(row, ROWS) == model

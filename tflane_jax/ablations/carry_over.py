@@ -34,7 +34,7 @@ from tflane_jax.ablations.carry_over_plan import (
 )
 from tflane_jax.ablations.compare import draw_models, summary_of
 from tflane_jax.ablations.comparison import Scores, Variant, compact
-from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare
+from tflane_jax.ablations.declaration import Claim, Declaration, Declared, check, declare, model_of_row
 from tflane_jax.ablations.jobs import Failure, Job, check_rows
 from tflane_jax.ablations.scores import measure
 from tflane_jax.ablations.statistics import holm, paired_difference
@@ -89,7 +89,9 @@ def carry_over(settings: Settings, out: Path) -> Path:
     """
     out = out / "quick" if settings.quick else out
     configs = model_configs(settings)
-    claims = tuple(claim for claim in CLAIMS if {claim.treatment, _model(str(claim.control))} <= set(configs))
+    claims = tuple(
+        claim for claim in CLAIMS if {claim.treatment, model_of_row(str(claim.control), ROWS)} <= set(configs)
+    )
     declaration = Declaration(PRIMARY, claims)
     check(declaration, configs)
     folder = recorded_logs(settings)
@@ -199,11 +201,6 @@ def _save(
     save_table(out / "effects", tests, meta, title=title)
     print("\n" + format_table(tests, title=title))
     return path
-
-
-def _model(row: str) -> str:
-    """Return the model that a row "model" or "model, intervention" is about."""
-    return max((name for name in ROWS if row == name or row.startswith(f"{name}, ")), key=len)
 
 
 def _tests(found: ByLog, logs: Sequence[str], declared: Declared) -> list[dict[str, Any]]:

@@ -131,6 +131,7 @@ def model_configs(settings: Settings) -> dict[str, RunConfig]:
 
 
 def map_data(config: RunConfig) -> RealMapData:
+    """Return the data of a model of `ROWS`."""
     assert isinstance(config.data, RealMapData)
     return config.data
 

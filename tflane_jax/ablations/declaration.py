@@ -7,7 +7,7 @@ folder, as does one with another declaration. One that was declared when runs ex
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -133,6 +133,11 @@ def check(declaration: Declaration, configs: Mapping[str, RunConfig]) -> None:
         raise UserError(f"--alpha {declaration.alpha:g} is no significance level between 0 and 1")
 
 
+def model_of_row(row: str, models: Iterable[str]) -> str:
+    """Return the model that a row "model" or "model, intervention" is about; "" if it is none of `models`."""
+    return max((model for model in models if row == model or row.startswith(f"{model}, ")), key=len, default="")
+
+
 def _check_claim(claim: Claim, models: Sequence[str]) -> None:
     control, *others = models
     if claim.control is None and claim.treatment not in others:
@@ -143,7 +148,7 @@ def _check_claim(claim: Claim, models: Sequence[str]) -> None:
         )
     for row in (claim.treatment, claim.control):
         # An intervention, "model, intervention", is known only when its model was evaluated.
-        if row is not None and not any(row == model or row.startswith(f"{model}, ") for model in models):
+        if row is not None and not model_of_row(row, models):
             raise UserError(f"a claim is about {row}, which is none of the models ({', '.join(models)})")
 
 

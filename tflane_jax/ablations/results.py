@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tflane_jax.ablations.comparison import Scores
+from tflane_jax.ablations.declaration import model_of_row
 from tflane_jax.ablations.jobs import Tests
 from tflane_jax.ablations.recorded import Measured, Which
 from tflane_jax.errors import UserError
@@ -62,8 +63,7 @@ class Results:
 
     def model_of(self, row: str) -> str:
         """Return the model of a row, measured or not; "" if it is of none."""
-        named = (model for model in self.models if row == model or row.startswith(f"{model}, "))
-        return self.owners.get(row) or max(named, key=len, default="")
+        return self.owners.get(row) or model_of_row(row, self.models)
 
     def rows(self, test: str, which: Which) -> dict[str, dict[int, Scores]]:
         """Return the rows of a table and their scores by seed, in the order of models and seeds."""

@@ -79,6 +79,7 @@ class Argoverse2Dataset:
             raise UserError("image reads recorded images, example.cameras draws others: set one of them to None")
         self._folders = find_logs(config.root)
         self._keyframes = [read_keyframes(folder, config.keyframes, config.openlane) for folder in self._folders]
+        self._cities = [city_of(folder) for folder in self._folders]
         self._frames = [(row, i) for row, moments in enumerate(self._keyframes) for i in range(len(moments))]
         self._log: Recent[Path, Log] = Recent(
             partial(load_log, keyframes=config.keyframes, openlane=config.openlane), _KEPT
@@ -116,8 +117,8 @@ class Argoverse2Dataset:
     def info(self, index: int) -> FrameInfo:
         """Return log id, time and pose of one example."""
         row, number = self._frames[index]
-        folder, moment = self._folders[row], self._keyframes[row][number]
-        return FrameInfo("argoverse2", folder.name, moment.timestamp_ns, moment.global_from_ego, city_of(folder))
+        name, moment = self._folders[row].name, self._keyframes[row][number]
+        return FrameInfo("argoverse2", name, moment.timestamp_ns, moment.global_from_ego, self._cities[row])
 
     def drives(self) -> Iterator[Log]:
         """Yield the logs."""

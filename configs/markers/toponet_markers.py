@@ -16,6 +16,7 @@ from typing import Any
 
 from tflane_jax.config import RunConfig, load_config
 from tflane_jax.models.marker_fusion import SMALL_MARKER_FUSION, MarkerFusionConfig, as_written, uniform_fusion
+from tflane_jax.models.marker_raster import MarkerRasterConfig
 from tflane_jax.models.priors import PriorsConfig
 from tflane_jax.models.sd_map_encoder import SMALL_SD_MAP
 from tflane_jax.models.traffic_flow_module import TrafficFlowConfig
@@ -54,6 +55,7 @@ def ablations() -> dict[str, RunConfig]:
     rows["as_written"] = _tuned(markers=written)
     rows |= {f"{name}_as_written": row for name, row in _tables_2_to_4(written).items()}
     beyond = {
+        "cells": _tuned(markers=replace(MARKERS, bev=MarkerRasterConfig())),
         "connectivity": _tuned(markers=replace(MARKERS, connectivity=True)),
         "everything": _tuned(markers=MARKERS, sd_map=SMALL_SD_MAP, traffic_flow=TrafficFlowConfig()),
     }

@@ -23,6 +23,7 @@ from tflane_jax.models.marker_fusion import (
     fusion_gate,
     uniform_fusion,
 )
+from tflane_jax.models.marker_raster import MarkerRasterConfig
 from tflane_jax.models.prior import BevCells
 from tflane_jax.priors.marker_memory import MarkerGuidance
 
@@ -38,6 +39,8 @@ VARIANTS = {
     "connectivity": replace(CONFIG, connectivity=True),
     "transformer": replace(CONFIG, encoding="transformer"),
     "MLP": replace(CONFIG, encoding="mlp"),
+    "cells": replace(CONFIG, norm="query", bev=MarkerRasterConfig(hidden=8)),
+    "cells of all layers, no memory": replace(CONFIG, memory=None, bev=MarkerRasterConfig("all", hidden=8)),
 }
 RNG = np.random.default_rng(0)
 BEV, POSITION = (jnp.asarray(RNG.normal(size=(12, 8)), jnp.float32) for _ in range(2))

@@ -24,6 +24,7 @@ from tflane_jax.layers.masks import key_mask, radius_mask
 from tflane_jax.layers.polyline_encoder import MARKER_POLYLINES, PolylineEncoder, PolylineEncoderConfig
 from tflane_jax.layers.precision import Precision, computing, full, run_part
 from tflane_jax.limits import Count, Fraction, Positive, Rules, splits
+from tflane_jax.models.marker_raster import MarkerRasterConfig, MarkerRasterFusion
 from tflane_jax.models.prior import BevCells, HostSpec, Prior
 from tflane_jax.priors.marker_memory import (
     MarkerGuidance,
@@ -32,6 +33,7 @@ from tflane_jax.priors.marker_memory import (
     guidance,
     remember,
 )
+from tflane_jax.priors.marker_raster import rasterise_markers
 from tflane_jax.priors.markers import MarkerPriorConfig, select_marker_lanes
 from tflane_jax.scene import Example, MarkerObservations
 
@@ -64,6 +66,7 @@ class MarkerFusionConfig:
             the cell must then learn from the tokens which lanes are near, which takes small models too long.
         query_position: add position encodings to the attention's queries. Eq. (3) has none, SMERF has; without, BEV
             features from convolutions carry no positions.
+        bev: also write the lanes into the BEV cells that they pass, before Eq. (3), which is ours; None: Eq. (3) alone.
         connectivity: lanes exchange messages with their successors and predecessors (the paper's future work).
         precision: dtype of linear layers, see `layers.precision`; parameters, tokens and results are float32.
         remat: recompute the activations of each layer and of each fusion for the gradient instead of keeping them.
@@ -80,6 +83,7 @@ class MarkerFusionConfig:
     norm: Literal["written", "sum", "query"] = "sum"
     radius: Positive | None = None
     query_position: bool = True
+    bev: MarkerRasterConfig | None = None
     connectivity: bool = False
     precision: Precision = "float32"
     remat: bool = False
@@ -179,10 +183,15 @@ class MarkerPrior(Prior):
         return FusedMarkers(tokens, observation, *fusion_gate(observation, self.config))
 
     def into_bev(self, tokens: FusedMarkers, layer: int, cells: BevCells) -> Float[Array, "q c"]:
-        """Return Eq. (3)."""
+        """Return Eq. (3), after the lanes were written into their cells if `MarkerFusionConfig.bev` is set."""
+        features, written = cells.features, self.config.bev
+        if written is not None and (layer == 0 or written.layers == "all"):
+            lanes = replace(tokens.lanes, gate=tokens.gate)
+            raster = rasterise_markers(lanes, tokens.valid, cells.grid, written.between)
+            features = MarkerRasterFusion(written, name=f"marker_cells_{layer}")(features, raster)
         fusion = MarkerFusion(self.config, name=f"markers_{layer}")
         mask = fusion_mask(tokens.lanes, tokens.valid, cells.centers, self.config)
-        return fusion(cells.features, cells.position, tokens.tokens, mask, tokens.gate)
+        return fusion(features, cells.position, tokens.tokens, mask, tokens.gate)
 
 
 class MarkerTokens(nn.Module):

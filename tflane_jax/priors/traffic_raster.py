@@ -10,6 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from tflane_jax.geometry import BevGrid
+from tflane_jax.priors.bev_cells import cells_of
 from tflane_jax.priors.traffic_flow import TrafficFlowTokens
 from tflane_jax.scene import RoadUser
 
@@ -68,18 +69,14 @@ def rasterise_traffic_flow(
     present = valid[:, :, None] & (followed[:, :, None] | (step == 0.0)[None, None])
     recency = (jnp.arange(frames)[:, None] + step[None] + 1.0) / frames
 
-    size = jnp.asarray([grid.columns, grid.rows], unit.dtype)[None, None, None]
-    inside = ((unit >= 0.0) & (unit <= 1.0)).all(-1)
-    place = jnp.minimum(jnp.floor(unit * size), size - 1.0)  # the upper border belongs to the last cell
-    column, row = place[..., 0].astype(int), place[..., 1].astype(int)
     cells = grid.rows * grid.columns
-    # Points that are absent get an index beyond the last cell, which the scatter drops.
-    cell = jnp.where(present & inside, row * grid.columns + column, cells).reshape(-1)
+    cell, offset = cells_of(unit, present, grid)
+    cell = cell.reshape(-1)
 
     shape = present.shape
     track = jnp.concatenate([moved[:, None], category], -1)
     track = jnp.broadcast_to(track[:, None, None], (*shape, track.shape[-1]))
-    values = jnp.concatenate([jnp.ones((*shape, 1)), heading, unit * size - place - 0.5, track], -1)
+    values = jnp.concatenate([jnp.ones((*shape, 1)), heading, offset, track], -1)
     total = jnp.zeros((cells, values.shape[-1])).at[cell].add(values.reshape(len(cell), -1), mode="drop")
     latest = jnp.zeros(cells).at[cell].max(jnp.broadcast_to(recency[None], shape).reshape(-1), mode="drop")
     count = total[:, :1]

@@ -62,7 +62,7 @@ def _tuned(row: RunConfig, host: str = "camera_host") -> RunConfig:
     return replace(
         config,
         task=replace(config.task, model=model, clip=CLIP),
-        # As in `toponet_markers.py`; for half as many updates a shorter warm-up, and an average over the last 50.
+        # As in `toponet_markers.py`; with so few updates a shorter warm-up, and an average over the last 50.
         optim=replace(config.optim, lr=0.5 * config.optim.lr, warmup_steps=20, ema_decay=0.98),
         training=replace(
             config.training,

@@ -30,8 +30,10 @@ from tflane_jax.scene import MarkerObservations, SdMap
 from tflane_jax.tasks.lane_graph import LaneGraphTask
 
 LINES = PolylineEncoderConfig(dim=8, layers=1, heads=2, hidden=8, dropout=0.0, bands=4)
+FLOW = WITH_TRAFFIC.priors.traffic_flow
+assert FLOW is not None
 PRIORS = PriorsConfig(
-    traffic_flow=replace(WITH_TRAFFIC.priors.traffic_flow, bev=TrafficRasterConfig()),
+    traffic_flow=replace(FLOW, bev=TrafficRasterConfig()),
     sd_map=replace(SMALL_SD_MAP, width=16, lines=LINES),
     markers=replace(SMALL_MARKER_FUSION, width=16, connectivity=True, lines=replace(LINES, attend="points")),
 )

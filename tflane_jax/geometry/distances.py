@@ -86,10 +86,11 @@ def _valid_mean(squared: Float[ArrayT, "*b n"], valid: Bool[ArrayT, "*b n"]) -> 
 
 def _root(squared: Float[ArrayT, "*b"]) -> Float[ArrayT, "*b"]:
     """Return the square root, with a gradient of 0 at 0, where that of `jnp.sqrt` is NaN."""
-    if namespace(squared) is np:
-        return np.sqrt(squared)
+    xp = namespace(squared)
+    if xp is np:
+        return xp.sqrt(squared)
     some = squared > 0.0
-    return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1.0)), squared)
+    return xp.where(some, xp.sqrt(xp.where(some, squared, 1.0)), squared)
 
 
 def _squared(a: Float[ArrayT, "*b d"], b: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b"]:

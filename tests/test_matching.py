@@ -99,3 +99,14 @@ def test_diverged_costs_give_some_assignment():
     cost = jnp.array([[jnp.nan, jnp.inf], [-jnp.inf, jnp.nan], [0.0, 1.0]])
     got = match(cost, jnp.ones(2, bool))
     assert got.matched.all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_64_bit_mode_gives_the_same(backend):
+    rng = np.random.default_rng(3)
+    cost, valid = rng.normal(size=(3, 4, 6)).astype(np.float32), np.arange(6) < np.array([[6], [3], [0]])
+    expected = match(jnp.asarray(cost), jnp.asarray(valid), backend)
+    with jax.enable_x64(True):
+        got = jax.jit(match, static_argnums=2)(cost, valid, backend)
+    assert got.query.dtype == np.int32
+    jax.tree.map(np.testing.assert_array_equal, got, expected)

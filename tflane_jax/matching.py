@@ -112,9 +112,9 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
     queries, targets = cost.shape
     spare = max(targets - queries, 0)
     spare_cost = 2.0 * (jnp.max(jnp.where(valid[None], jnp.abs(cost), 0.0)) + 1.0)
-    table = jnp.concatenate([cost, jnp.full((spare, targets), spare_cost)]).T  # (targets, columns)
+    table = jnp.concatenate([cost, jnp.full((spare, targets), spare_cost, jnp.float32)]).T  # (targets, columns)
     columns = queries + spare
-    order = jnp.argsort(~valid, stable=True)  # valid targets first
+    order = jnp.argsort(~valid, stable=True).astype(jnp.int32)  # valid targets first
 
     def add_target(i, state):
         owner, u, v = state  # owner (columns,): target that holds the column, -1 if free
@@ -124,7 +124,7 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
             slack = table[row] - u[row] - v + offset
             closer = ~done & (slack < distance)
             distance, via = jnp.where(closer, slack, distance), jnp.where(closer, row, via)
-            column = jnp.argmin(jnp.where(done, jnp.inf, distance))
+            column = lax.argmin(jnp.where(done, jnp.inf, distance), 0, jnp.int32)
             done = done.at[column].set(True)
             return distance, via, done, owner[column], distance[column], column
 
@@ -132,8 +132,9 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
             return path[3] >= 0
 
         start = order[i]
-        distance = jnp.full(columns, jnp.inf)
-        path = (distance, jnp.full(columns, -1), jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
+        distance = jnp.full(columns, jnp.inf, jnp.float32)
+        nowhere = jnp.full(columns, -1, jnp.int32)
+        path = (distance, nowhere, jnp.zeros(columns, bool), start, jnp.float32(0.0), jnp.int32(0))
         distance, via, done, _, shortest, end = lax.while_loop(searching, grow, path)
 
         # Potentials inside the tree change by the rest of the shortest path.
@@ -145,13 +146,13 @@ def _augmenting_paths(cost: Float[Array, "q n"], valid: Bool[Array, " n"]) -> In
         def flip(step):
             owner, column, _ = step
             row = via[column]
-            previous = jnp.argmax(owner == row)  # the column this row held before
+            previous = lax.argmax(owner == row, 0, jnp.int32)  # the column this row held before
             return owner.at[column].set(row), previous, row
 
         owner, _, _ = lax.while_loop(lambda s: s[2] != start, flip, flip((owner, end, start)))
         return owner, u, v
 
-    state = (jnp.full(columns, -1), jnp.zeros(targets), jnp.zeros(columns))
+    state = (jnp.full(columns, -1, jnp.int32), jnp.zeros(targets, jnp.float32), jnp.zeros(columns, jnp.float32))
     owner, _, _ = lax.fori_loop(0, valid.sum(), add_target, state)
     held = jnp.where(owner[:queries] >= 0, owner[:queries], targets)
     return jnp.full(targets, -1, jnp.int32).at[held].set(jnp.arange(queries, dtype=jnp.int32), mode="drop")

@@ -108,3 +108,11 @@ def test_chamfer_ignores_what_padding_holds(distance):
     dirty = np.where(a_valid[:, None], a, np.nan), np.where(b_valid[:, None], b, np.nan)
     np.testing.assert_allclose(distance(*dirty, a_valid, b_valid), chamfer_by_loop(a[:4], b[:2]), rtol=1e-5)
     assert distance(*dirty, a_valid, np.zeros(5, bool)) == np.inf
+
+
+@pytest.mark.parametrize("distance", [chamfer, discrete_frechet, vertex_distance])
+def test_equal_lines_have_a_gradient_of_zero(distance):
+    line = jnp.asarray([[0.0, 0.0], [1.0, 2.0], [4.0, 2.0]])
+    value, gradient = jax.value_and_grad(lambda a: distance(a, line).sum())(line)
+    assert value == 0.0
+    np.testing.assert_array_equal(gradient, jnp.zeros_like(line))

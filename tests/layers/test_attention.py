@@ -272,3 +272,12 @@ def test_module_names_a_width_that_does_not_split():
     x = jnp.zeros((2, 6))
     with pytest.raises(ValueError, match="dim 6 does not split over 4 heads"):
         MultiHeadAttention(6, 4).init(jax.random.key(0), x, x, x)
+
+
+@pytest.mark.usefixtures("either_way")
+def test_gradients_have_the_dtypes_of_what_they_belong_to():
+    query, key, value, _ = arrays(3, 5, 7)
+    with jax.enable_x64(True):
+        given = query.astype(jnp.float64), key, value
+        gradients = jax.grad(lambda *x: masked_attention(*x).sum(), (0, 1, 2))(*given)
+    assert [g.dtype for g in gradients] == [x.dtype for x in given]

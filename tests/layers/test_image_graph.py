@@ -136,3 +136,11 @@ def test_graph_attention_equals_loops(relation):
         exps = [math.exp(score if score > 0 else 0.2 * score) for score in scores]
         expected = sum(e * value[a, b, head] for e, (a, b) in zip(exps, cells, strict=True)) / sum(exps)
         np.testing.assert_allclose(out[i, j, head], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_gradients_have_the_dtypes_of_what_they_belong_to():
+    with jax.enable_x64(True):
+        given = jnp.ones((2, 3), jnp.float32), jnp.ones((4, 5, 3), jnp.float64)
+        valid = jnp.ones((4, 5), bool)
+        gradients = jax.grad(lambda w, x: mix_relations(("up", "row"), w, x, valid).sum(), (0, 1))(*given)
+    assert [g.dtype for g in gradients] == [x.dtype for x in given]

@@ -125,3 +125,16 @@ def test_non_finite_places_give_zero_and_finite_gradients(bad):
     np.testing.assert_array_equal(by_location, clean_location)
     assert not np.asarray(by_weight[4]).any()
     assert np.isfinite(by_weight).all()
+
+
+def test_gradients_have_the_dtypes_of_what_they_belong_to():
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        given = (
+            jnp.asarray(rng.normal(size=(12, 2, 3)), jnp.float64),
+            jnp.asarray(rng.random((5, 2, 1, 2, 2)), jnp.float32),
+            jnp.asarray(rng.random((5, 2, 1, 2)), jnp.float32),
+        )
+        attend = lambda value, *places: deformable_attention(value, ((3, 4),), *places).sum()  # noqa: E731
+        gradients = jax.grad(attend, (0, 1, 2))(*given)
+    assert [g.dtype for g in gradients] == [x.dtype for x in given]

@@ -134,3 +134,11 @@ def test_cells_are_those_with_a_point():
     np.testing.assert_allclose(cell_loss(jnp.asarray(logits), targets), expected, rtol=1e-6)
     nothing = jax.tree.map(jnp.zeros_like, targets)
     np.testing.assert_allclose(cell_loss(jnp.asarray(logits), nothing), np.log1p(np.exp(logits)).mean(), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("lines", "points"), [(0, POINTS), (LINES, 0), (0, 0)])
+def test_no_room_for_lines_or_points_costs_what_no_lines_cost(lines, points):
+    nothing = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None].repeat(2, 0), LaneLines.empty(lines, points))
+    padded = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None].repeat(2, 0), LaneLines.empty(LINES, POINTS))
+    got, expected = (value_and_gradient(predictions(), truth) for truth in (nothing, padded))
+    jax.tree.map(np.testing.assert_array_equal, got, expected)

@@ -147,3 +147,8 @@ def test_order_of_instances_does_not_matter(seed, random):
     np.testing.assert_array_equal(a.position, b.position)
     np.testing.assert_array_equal(a.frame_valid, b.frame_valid)
     np.testing.assert_array_equal(a.category, b.category)
+
+
+def test_a_sector_all_around_gives_every_instance_the_same_weight():
+    places = np.array([[-9.0, 0.0], [-3.0, -1e-6], [4.0, 5.0], [0.0, 0.0]], np.float32)
+    np.testing.assert_array_equal(ego_centric_weight(places, TrafficFlowPriorConfig(front_sector_deg=360.0)), 1.0)

@@ -40,7 +40,7 @@ def pad_lines(
 
 def vertex_distance(a: Float[ArrayT, "*b d"], b: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b"]:
     """Return the Euclidean distance between points; leading axes broadcast."""
-    return namespace(a, b).sqrt(_squared(a, b))
+    return _root(_squared(a, b))
 
 
 def discrete_frechet(a: Float[ArrayT, "*b n d"], b: Float[ArrayT, "*b m d"]) -> Float[ArrayT, "*b"]:
@@ -54,7 +54,7 @@ def discrete_frechet(a: Float[ArrayT, "*b n d"], b: Float[ArrayT, "*b m d"]) -> 
     a, b = xp.moveaxis(xp.asarray(a), -2, 0), xp.moveaxis(xp.asarray(b), -2, 0)
     # Minimum and maximum commute with the square, so one root at the end is enough.
     recursion: Any = _frechet_jax if xp is jnp else _frechet_numpy
-    return xp.sqrt(recursion(a, b))
+    return _root(recursion(a, b))
 
 
 def chamfer(
@@ -80,8 +80,17 @@ def chamfer(
 def _valid_mean(squared: Float[ArrayT, "*b n"], valid: Bool[ArrayT, "*b n"]) -> Float[ArrayT, "*b"]:
     xp = namespace(squared)
     count = valid.sum(-1)
-    total = xp.sqrt(xp.where(valid, squared, 0.0)).sum(-1)
+    total = _root(xp.where(valid, squared, 0.0)).sum(-1)
     return xp.where(count > 0, total / xp.maximum(count, 1), xp.inf)
+
+
+def _root(squared: Float[ArrayT, "*b"]) -> Float[ArrayT, "*b"]:
+    """Return the square root, with a gradient of 0 at 0, where that of `jnp.sqrt` is NaN."""
+    xp = namespace(squared)
+    if xp is np:
+        return xp.sqrt(squared)
+    some = squared > 0.0
+    return xp.where(some, xp.sqrt(xp.where(some, squared, 1.0)), squared)
 
 
 def _squared(a: Float[ArrayT, "*b d"], b: Float[ArrayT, "*b d"]) -> Float[ArrayT, "*b"]:

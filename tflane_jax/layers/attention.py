@@ -147,7 +147,7 @@ def _gradients(query, key, value, weights, out, gradient):
     to_logit = lax.optimization_barrier(to_logit.astype(query.dtype))
     to_query = jnp.einsum("hqk,hkd->hqd", to_logit, key)
     to_key = jnp.einsum("hqk,hqd->hkd", to_logit, query)
-    return to_query, to_key, to_value
+    return to_query.astype(query.dtype), to_key.astype(key.dtype), to_value.astype(value.dtype)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

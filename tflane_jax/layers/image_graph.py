@@ -88,7 +88,7 @@ def _mix_backward(relations, residuals, gradient):
             to_x = to_x + weight * back[SIDES[relation]]
             weight = weight * (1.0 - shifted(valid, SIDES[relation]).astype(x.dtype))[..., None]
         own = own + weight
-    return jnp.stack(to_weights), to_x + own * gradient, None
+    return jnp.stack(to_weights).astype(type_weights.dtype), (to_x + own * gradient).astype(x.dtype), None
 
 
 _mix.defvjp(lambda relations, *arrays: (_mix(relations, *arrays), arrays), _mix_backward)

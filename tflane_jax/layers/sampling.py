@@ -196,7 +196,8 @@ def _attend_backward(shapes, residuals, cotangent):
     start_of_sum = jnp.zeros(table.shape, jnp.promote_types(cotangent.dtype, jnp.float32))
     total, parts = lax.scan(lambda total, part: _step_backward(shapes, table, total, *part), start_of_sum, parts)
     by_x, by_y, by_weight = (x.reshape(-1, *weight.shape[1:])[: len(start)] for x in parts)
-    return total.reshape(value.shape).astype(value.dtype), None, jnp.stack([by_x, by_y], -1), by_weight
+    by_location = jnp.stack([by_x, by_y], -1).astype(location.dtype)
+    return total.reshape(value.shape).astype(value.dtype), None, by_location, by_weight.astype(weight.dtype)
 
 
 def _step_backward(shapes, table, total, start, location, weight, cotangent):

@@ -92,10 +92,10 @@ def lane_shape_targets(lines: LaneLines, *, shared_horizon: bool = True) -> Lane
     point_valid = lines.point_valid & lines.valid[..., None]
     valid = point_valid.any(-1)
     columns, rows = (jnp.where(point_valid, lines.points[..., i], 0.0) for i in range(2))
-    first = jnp.where(point_valid, rows, jnp.inf).min(-1)
-    last = jnp.where(point_valid, rows, -jnp.inf).max(-1)
+    first = jnp.where(point_valid, rows, jnp.inf).min(-1, initial=jnp.inf)
+    last = jnp.where(point_valid, rows, -jnp.inf).max(-1, initial=-jnp.inf)
     if shared_horizon:
-        first = jnp.broadcast_to(first.min(-1, keepdims=True), first.shape)
+        first = jnp.broadcast_to(first.min(-1, keepdims=True, initial=jnp.inf), first.shape)
     extent = jnp.where(valid[..., None], jnp.stack([first, last], -1), 0.0)
     return LaneShapeTargets(columns, rows, point_valid, extent, valid)
 
@@ -106,7 +106,7 @@ def lane_weights(targets: LaneShapeTargets, counted: Bool[Array, "*b l"]) -> Flo
     w_l = sqrt(N / N_l) / max_i sqrt(N / N_i) = sqrt(min_i N_i / N_l), over the counted lanes of the whole batch.
     """
     points = targets.point_valid.sum(-1).astype(jnp.float32)
-    least = jnp.where(counted, points, jnp.inf).min()
+    least = jnp.where(counted, points, jnp.inf).min(initial=jnp.inf)
     return jnp.sqrt(jnp.where(counted, least / jnp.maximum(points, 1.0), 0.0))
 
 

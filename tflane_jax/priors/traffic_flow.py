@@ -156,7 +156,8 @@ def ego_centric_weight(
     ahead, aside = (0, 1) if forward == "x" else (1, 0)
     bearing = xp.abs(xp.arctan2(position[..., aside], position[..., ahead]))
     distance = xp.sqrt((position**2).sum(-1))
-    off_axis = 1.0 - 0.5 * (bearing - half) / (math.pi - half)
+    # A sector of 360 degrees has nothing outside.
+    off_axis = 1.0 - 0.5 * (bearing - half) / ((math.pi - half) or 1.0)
     outside = off_axis / (1.0 + distance / config.distance_scale)
     return xp.where(bearing <= half, xp.ones_like(outside), outside)
 

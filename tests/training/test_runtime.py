@@ -5,9 +5,11 @@ import platform
 import subprocess
 import sys
 
+import jax
 import pytest
 
 from tests.shared import ROOT
+from tflane_jax.errors import UserError
 from tflane_jax.memory import huge_pages_for_children
 from tflane_jax.training import runtime
 
@@ -131,6 +133,12 @@ def faults(start, folder):
     return int(done.stdout.split()[-1])
 
 
+def test_64_bit_mode_is_refused():
+    """Half of a model's arrays would have another type than its parameters."""
+    with jax.enable_x64(True), pytest.raises(UserError, match=r"JAX_ENABLE_X64.*unset"):
+        runtime.configure_jax(keep_programs=False)
+
+
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the settings are glibc's")
 @pytest.mark.parametrize("start", ["worker", *(pytest.param(name, marks=pytest.mark.slow) for name in _OTHERS)])
 def test_memory_of_one_step_is_used_by_the_next(tmp_path, start):
@@ -141,6 +149,7 @@ def test_memory_of_one_step_is_used_by_the_next(tmp_path, start):
 
 HEAPS = """
 import ctypes
+from tflane_jax.errors import UserError
 from tflane_jax.memory import keep_freed_memory
 from tflane_jax.startup import in_another_thread
 
@@ -163,6 +172,7 @@ def test_compiling_leaves_no_gaps_in_the_heap_of_the_steps():
 LARGE = """
 import resource
 import numpy as np
+from tflane_jax.errors import UserError
 from tflane_jax.memory import keep_freed_memory
 
 def step():
@@ -187,6 +197,7 @@ def test_memory_of_a_large_step_is_used_by_the_next():
 
 
 KEPT = """
+from tflane_jax.errors import UserError
 from tflane_jax.memory import give_back_freed_memory, keep_freed_memory
 
 def resident():

@@ -192,7 +192,8 @@ def test_scenes_are_chosen_by_name_or_official_split(tmp_path):
         SceneFileDataset(SceneFileConfig(tmp_path, ("scene-7",)))
     assert chosen("--data", "nuscenes-scenes", "--root", tmp_path).scenes == ()
     assert chosen("--data", "nuscenes-scenes", "--root", tmp_path, "--split", "val").scenes == ("scene-0103",)
-    with pytest.raises(UserError, match="has no scene of nuScenes' split test"):
+    message = r"has no scene of nuScenes' split test: choose --split train or val, or leave it out to take all$"
+    with pytest.raises(UserError, match=message):
         chosen("--data", "nuscenes-scenes", "--root", tmp_path, "--split", "test")
 
 

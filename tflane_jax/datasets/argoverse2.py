@@ -162,16 +162,14 @@ class LogData:
         return Argoverse2Config(root, self.keyframes, self.openlane, self.example, self.loading, self.image)
 
 
-def split_folder(root: Path, split: Split, *, required: bool) -> Path:
-    """Return the folder of a split below `root`; `root` itself where it is not divided into splits.
+def _split_folder(choice: Choice) -> Path:
+    """Return the folder of a split below the root; the root itself where it is not divided into splits.
 
-    Args:
-        root: a dataset root (sensor/<split>/<log id>/), a folder of splits, a folder of logs, or one log.
-        split: train, val or test.
-        required: whether a folder without splits is an error, unless its own name is that of the split.
-
-    Raises UserError where `root` has splits but not this one, or none and one is required.
+    Raises UserError where the root has splits but not this one, or none although one was asked for, unless the root's
+    own name is that of the split.
     """
+    root, split, option = choice.root, choice.split, choice.option
+    assert root is not None
     places = [root / "sensor", root]
     present = [place / name for place in places for name in SPLITS if (place / name).is_dir()]
     for folder in present:
@@ -179,18 +177,22 @@ def split_folder(root: Path, split: Split, *, required: bool) -> Path:
             return folder
     if present:
         names = ", ".join(folder.name for folder in present)
-        raise UserError(f"{root} has no split {split}, only {names}: choose one with --split")
-    if required and root.is_dir() and root.name != split:
+        which = f"add {option} {names}" if len(present) == 1 else f"choose one with {option}"
+        raise UserError(f"{root} has no split {split}, only {names}: {which}")
+    if choice.split_given and root.is_dir() and root.name != split:
+        if option == "--split":
+            remedy = "leave --split out to take all of them, or "
+        else:
+            remedy = f"add {option} {root.name}, or " if root.name in SPLITS else ""
         raise UserError(
-            f"{root} is not divided into splits, so --split {split} cannot choose among its logs: leave --split out to "
-            f"take all of them, or name a folder that holds {split}/<log id>/{ANNOTATIONS}"
+            f"{root} is not divided into splits, so {option} {split} cannot choose among its logs: {remedy}name a "
+            f"folder that holds {split}/<log id>/{ANNOTATIONS}"
         )
     return root
 
 
 def _choose(choice: Choice) -> Argoverse2Config:
-    assert choice.root is not None
-    root, example = split_folder(choice.root, choice.split, required=choice.split_given), choice.configured.example
+    root, example = _split_folder(choice), choice.configured.example
     image = _recorded(choice.configured, root)
     if image is not None:  # recorded images take the place of drawn ones
         example = replace(example, cameras=None)

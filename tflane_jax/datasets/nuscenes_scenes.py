@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tflane_jax.datasets.base import ExampleConfig, FrameInfo, Split
+from tflane_jax.datasets.base import SPLITS, ExampleConfig, FrameInfo, Split
 from tflane_jax.datasets.data_source import Choice, DataSource, FolderCheck
 from tflane_jax.datasets.examples import make_example
 from tflane_jax.datasets.nuscenes_scene_files import find_scene_files, read_scene_file
@@ -112,10 +112,12 @@ def _choose(choice: Choice) -> SceneFileConfig:
     example = replace(choice.configured.example, cameras=None)
     if not choice.split_given:
         return SceneFileConfig(choice.root, example=example)
-    names = [path.stem for path in find_scene_files(choice.root)]
-    chosen = tuple(name for name in names if official_split(name, mini=False) == choice.split)
+    splits = {path.stem: official_split(path.stem, mini=False) for path in find_scene_files(choice.root)}
+    chosen = tuple(name for name, split in splits.items() if split == choice.split)
     if not chosen:
-        raise UserError(f"{choice.root} has no scene of nuScenes' split {choice.split}: leave --split out to take all")
+        there = " or ".join(split for split in SPLITS if split in splits.values())
+        remedy = f"{choice.option} {there}" + (", or leave it out to take all" if choice.option == "--split" else "")
+        raise UserError(f"{choice.root} has no scene of nuScenes' split {choice.split}: choose {remedy}")
     return SceneFileConfig(choice.root, chosen, example)
 
 

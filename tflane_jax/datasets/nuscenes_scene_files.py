@@ -14,7 +14,6 @@ Global metres; no pickle inside.
 from __future__ import annotations
 
 import json
-import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -30,6 +29,7 @@ from tflane_jax.datasets.nuscenes_map import flat
 from tflane_jax.datasets.plausible import LONGEST, SHORTEST, check_distance, check_motion, check_place
 from tflane_jax.errors import UserError
 from tflane_jax.files.fields import member, numbers, shown
+from tflane_jax.files.npz import read_npz
 from tflane_jax.geometry import invert_pose, transform_points, yaw_pose
 from tflane_jax.scene import LineType, RoadUser
 from tflane_jax.scene.logs import KeyFrame, LaneSegment, Log, Tracks, VectorMap
@@ -79,13 +79,7 @@ def read_scene_file(path: Path, *, categories: Mapping[str, RoadUser | None] = C
 
 def _content(path: Path) -> dict[str, Any]:
     """Return the checked arrays of a file: numbers are finite, and sizes fit."""
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            content = {key: file[key] for key in file.files}
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from None
-    except (ValueError, TypeError, zipfile.BadZipFile, EOFError, zlib.error) as error:
-        raise UserError(f"{path} is no npz file of plain arrays ({error})") from None
+    content: dict[str, Any] = dict(read_npz(path))
     where = str(path)
     for key in _TEXTS:
         if np.asarray(member(content, key, where)).dtype.kind != "U" or content[key].ndim != 1:

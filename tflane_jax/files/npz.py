@@ -61,7 +61,7 @@ def _check_sizes(parts: list[zipfile.ZipInfo], size: int) -> None:
         if (most := _MOST_HELD.get(part.compress_type)) is None:
             raise ValueError(f"{part.filename} is compressed in a way that numpy does not write")
         if part.file_size > most * part.compress_size:
-            raise ValueError(f"{part.filename} claims {part.file_size:.2g} bytes, which {part.compress_size} cannot hold")
+            raise ValueError(f"{part.filename} claims {part.file_size:.2g} bytes, packed in {part.compress_size}")
     if (needed := sum(part.file_size for part in parts)) > _MOST_MEMORY:
         raise ValueError(f"its arrays claim {needed:.2g} bytes")
 

@@ -14,7 +14,7 @@ from tflane_jax.ablations.paper.cost import core_minutes
 from tflane_jax.ablations.paper.table import PaperTable, Quoted, TableRow, longer, shortened
 from tflane_jax.ablations.published import page, record
 from tflane_jax.ablations.scores import is_measured
-from tflane_jax.ablations.store import stored_jobs
+from tflane_jax.ablations.store import run_key, stored_jobs
 from tflane_jax.ablations.table_run import run_table
 from tflane_jax.ablations.tables import TABLES
 from tflane_jax.cli import main
@@ -306,6 +306,23 @@ def test_runs_that_tables_share_cost_once():
     assert core_minutes([table, other_host]) == core_minutes([table]) + 3 * (2 + 20)
     assert core_minutes([table, replace(table, steps=9)]) == 2 * core_minutes([table])
     assert core_minutes([table.lengthened(4)]) == 4 * core_minutes([table])
+
+
+def test_the_cost_of_all_tables_is_that_of_the_runs_that_a_store_would_hold():
+    costs = {}
+    for table in TABLES.values():
+        configs = table.configs(table.hosts)
+        hosts = {name: run_key(config, {}) for name, config in configs.items()}
+        runs = {
+            run_key(config, {}, hosts.get(row.start)): table.minutes
+            for row, config in zip(table.rows, table.configs(table.rows).values(), strict=True)
+        }
+        runs |= dict.fromkeys(hosts.values(), table.host_minutes)
+        assert core_minutes([table]) == pytest.approx(table.seeds * sum(runs.values()))
+        for seed in range(table.seeds):
+            for key, minutes in runs.items():
+                costs[key, seed] = max(costs.get((key, seed), 0.0), minutes)
+    assert core_minutes(TABLES.values()) == pytest.approx(sum(costs.values()))
 
 
 @pytest.mark.parametrize("name", [name for name in TABLES if name.endswith("_as_written")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import IO
 
@@ -19,11 +20,14 @@ _MOST_MEMORY = 2**34
 _MOST_HELD = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 1032}
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a file by name; raises UserError for one that is missing, damaged or no .npz."""
+def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Return the arrays of a file by name; `names` are those wanted, of which some may be missing, None is for all.
+
+    Raises UserError for a file that is missing, damaged or no .npz.
+    """
     try:
         with path.open("rb") as stream:
-            return npz_arrays(stream)
+            return npz_arrays(stream, names)
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}") from None
     # A damaged archive may raise any error of zipfile, zlib, numpy or the parser of its headers.
@@ -31,8 +35,8 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{path} is no .npz file of plain arrays, or it is damaged ({error})") from None
 
 
-def npz_arrays(stream: IO[bytes]) -> dict[str, np.ndarray]:
-    """Return the arrays of an open file by name; members of the archive that are no .npy are left out.
+def npz_arrays(stream: IO[bytes], names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Return the arrays of an open file by name, see `read_npz`; members of the archive that are no .npy are left out.
 
     Raises ValueError for sizes that the file cannot hold; any exception of zipfile, zlib or numpy for damage.
     """
@@ -42,12 +46,14 @@ def npz_arrays(stream: IO[bytes]) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(stream) as archive:
         parts = [part for part in archive.infolist() if part.filename.endswith(".npy")]
         _check_sizes(parts, size)
-        for part in parts:
+        by_name = {part.filename.removesuffix(".npy"): part for part in parts}
+        wanted = {name: part for name, part in by_name.items() if names is None or name in names}
+        for part in wanted.values():
             _check_header(archive, part)
         arrays = {}
-        for part in parts:
+        for name, part in wanted.items():
             with archive.open(part) as content:
-                arrays[part.filename.removesuffix(".npy")] = npy.read_array(content, allow_pickle=False)
+                arrays[name] = npy.read_array(content, allow_pickle=False)
         return arrays
 
 
